@@ -61,7 +61,7 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
         >>> gradient = jax.grad(loss)(pose)
     """
     if pose.expression is not None:
-        avatar, pose = with_expression(avatar, pose)
+        avatar, pose = _with_expression(avatar, pose)
     joints = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     gaussians, transforms = avatar.gaussians, blend_transforms(avatar.skinning_weights, joints)
     if avatar.light is not None:
@@ -71,7 +71,7 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
     return skin_gaussians(gaussians, transforms, avatar.skinning)
 
 
-def with_expression(avatar: Avatar, pose: BodyPose) -> tuple[Avatar, BodyPose]:
+def _with_expression(avatar: Avatar, pose: BodyPose) -> tuple[Avatar, BodyPose]:
     """The avatar in T-pose with the face that a pose makes, and the pose without it but with the
     joints that it turns.
 

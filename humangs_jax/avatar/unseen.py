@@ -89,13 +89,13 @@ def with_guesses(
     rest, normals = inputs.canonical_vertices, inputs.canonical_normals
     if config.conventions.pixels != "person" or not on_vertices or normals is None:
         return outputs
-    shown = jnp.max(shown_by_view(inputs, config), axis=0)
+    shown = jnp.max(_shown_by_view(inputs, config), axis=0)
     chosen = lax.stop_gradient((shown, body_regions(body, rest)))
     new = guessed(outputs.gaussians, rest, normals, *chosen)
     return replace(outputs, gaussians=new)
 
 
-def shown_by_view(inputs: HumanGSInputs, config: HumanGSConfig) -> Float[Array, "v n"]:
+def _shown_by_view(inputs: HumanGSInputs, config: HumanGSConfig) -> Float[Array, "v n"]:
     """How well each photo shows each vertex: the cosine between its normal and the line of sight, 0
     where it is hidden, beyond the frame or beyond the mask, and in padding.
     """
@@ -187,7 +187,7 @@ def guessed(
     """The Gaussians of the n vertices with guesses where they are not shown.
 
     rest, normals: of the body in the T-pose, metres and unit. shown: cosines of the best photos,
-    see `shown_by_view`.
+    see `_shown_by_view`.
     """
     count = len(rest)
     sure = jnp.clip((shown - UNSEEN) / (SEEN - UNSEEN), 0, 1)

@@ -384,7 +384,7 @@ def side_by_side(
     if labels is not None:
         texts = [text for label in labels for text in (label, "", "")]
     sheet = tile(triples, labels=texts, headers=headers * (columns // 3), columns=columns)
-    legend = error_legend(sheet.shape[1], _text_height(truth.shape[2]))
+    legend = _error_legend(sheet.shape[1], _text_height(truth.shape[2]))
     write_png(path, np.concatenate([sheet, legend]), mark=DRAWN)
 
 
@@ -458,7 +458,7 @@ def error_colors(
     )
 
 
-def error_legend(width: int, text_height: int) -> Float[np.ndarray, "height width 3"]:
+def _error_legend(width: int, text_height: int) -> Float[np.ndarray, "height width 3"]:
     """A strip with the scale of `error_colors` and its ends in numbers."""
     legend = np.ones((2 * GAP + text_height, width, 3))
     left, right = width // 3, max(2 * width // 3, width // 3 + 2)

@@ -451,7 +451,7 @@ def _targets(
     reach = np.arange(-how.inwards, how.outwards + STEP / 2, STEP)
     for view in views:
         pixels, per_metre, within = view.seen(rest)
-        own = silhouette_distance(pixels, faces, view.mask.shape)
+        own = _silhouette_distance(pixels, faces, view.mask.shape)
         probed, _, _ = view.seen(rest + PROBE * normals)
         leaves = at(own, probed) < at(own, pixels) - LEAVES * PROBE * per_metre
         edge = np.flatnonzero(within & (np.abs(at(own, pixels)) < NEAR) & leaves)
@@ -492,7 +492,7 @@ def _crossing(
     return distance, found
 
 
-def silhouette_distance(
+def _silhouette_distance(
     pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "h w"]:
     """Signed distance to the edge of the silhouette of a surface, pixels; positive inside."""

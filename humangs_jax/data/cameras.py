@@ -271,7 +271,7 @@ def in_capture_convention(
     for camera in calibration.cameras:
         K, pose = camera.K.copy(), camera.cam_from_world.copy()
         K[:2, 2] += shift
-        pose[:3, :3] = nearest_rotation(pose[:3, :3]) @ turn.T
+        pose[:3, :3] = _nearest_rotation(pose[:3, :3]) @ turn.T
         pose[:3, 3] *= scale
         cameras.append(dataclasses.replace(camera, K=K, cam_from_world=pose))
     return dataclasses.replace(
@@ -279,7 +279,7 @@ def in_capture_convention(
     )
 
 
-def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     """The rotation nearest to a rounded one; a matrix that is further from one than rounding
     explains is left as it is.
     """
@@ -547,8 +547,8 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
         return np.stack([camera.cam_from_world for camera in calibration.cameras])
 
     # what the points and the axes of the cameras say
-    reprojection = mean_reprojection_error(converted)
-    depths, _ = axes_meeting(matrices(converted))
+    reprojection = _mean_reprojection_error(converted)
+    depths, _ = _axes_meeting(matrices(converted))
     distance = None
     if depths is not None:
         distance = float(np.median(np.abs(depths)))
@@ -589,8 +589,8 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
     """
     known = calibration.unit or 1.0
     matrices = np.stack([camera.cam_from_world for camera in calibration.cameras])
-    matrices[:, :3, :3] = [nearest_rotation(matrix[:3, :3]) for matrix in matrices]
-    depths, _ = axes_meeting(matrices)
+    matrices[:, :3, :3] = [_nearest_rotation(matrix[:3, :3]) for matrix in matrices]
+    depths, _ = _axes_meeting(matrices)
     distance = None
     if depths is not None:
         distance = float(np.median(np.abs(depths)))
@@ -613,7 +613,7 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
     return best, f"the unit is taken for {UNITS[best]}: {why} (--scale says otherwise)"
 
 
-def mean_reprojection_error(calibration: Calibration) -> float | None:
+def _mean_reprojection_error(calibration: Calibration) -> float | None:
     """Pixels between where the calibration's points were seen and where its cameras see them; None
     without points.
 
@@ -636,7 +636,7 @@ def mean_reprojection_error(calibration: Calibration) -> float | None:
     return float(np.concatenate(errors).mean())
 
 
-def axes_meeting(
+def _axes_meeting(
     poses: Float[np.ndarray, "v 4 4"],
 ) -> tuple[Float[np.ndarray, " v"] | None, Float[np.ndarray, " v"] | None]:
     """Depth of the point nearest to all optical axes before each camera, and its distance from each
@@ -661,7 +661,7 @@ def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:
     """How far axes pass the point where they meet before all cameras, as a share of its distance;
     infinite if none is.
     """
-    depths, misses = axes_meeting(poses)
+    depths, misses = _axes_meeting(poses)
     farthest = np.linalg.norm(poses[:, :3, 3], axis=-1).max()
     if (
         depths is None
@@ -678,7 +678,7 @@ def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> 
     """Whether another meaning of the matrices in the file would let the cameras look at one
     place.
     """
-    if axes_meeting(poses)[0] is None or np.isfinite(_miss(poses)):
+    if _axes_meeting(poses)[0] is None or np.isfinite(_miss(poses)):
         return []
     matrices = poses
     if convention == WORLD_FROM_CAM_OPENGL:

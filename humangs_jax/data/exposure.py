@@ -117,7 +117,7 @@ def points_of(
     def photo(i):
         return jax.tree.map(lambda x: taken(x, i), (poses, *per_view))
 
-    each = [seen_colors(capture.body, rest, *photo(i)) for i in range(capture.view_count)]
+    each = [_seen_colors(capture.body, rest, *photo(i)) for i in range(capture.view_count)]
     colors, seen = (np.stack(x) for x in zip(*each, strict=True))
     return colors, seen
 
@@ -350,7 +350,7 @@ def apply_gain(
 
 
 @jax.jit
-def seen_colors(
+def _seen_colors(
     body: BodyModel,
     rest: RestBody,
     pose: BodyPose,

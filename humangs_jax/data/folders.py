@@ -121,7 +121,7 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
     unused += [Unused(file, OWN) for file in pictures if is_own_picture(file)]
     own = {each.path for each in unused}
     pictures = [file for file in pictures if file not in own]
-    masks = masks_beside(pictures)
+    masks = _masks_beside(pictures)
     photos = [file for file in pictures if file not in masks]
     whole = len(set(masks.values())) == len(photos)  # else who knows which of them are meant
     if not whole:
@@ -153,7 +153,7 @@ def photos_in(folder: Path) -> dict[str, Path]:
             Path(entry.path) for entry in entries if is_photo(Path(entry.name)) and entry.is_file()
         ]
     files = [file for file in files if not is_own_picture(file)]
-    beside = masks_beside(files)
+    beside = _masks_beside(files)
     photos = [file for file in files if file not in beside]
     preferred = sorted(
         photos,
@@ -185,7 +185,7 @@ def photo_of_mask(name: str) -> str | None:
     return None if found is None else found["photo"]
 
 
-def masks_beside(pictures: Iterable[Path]) -> dict[Path, Path]:
+def _masks_beside(pictures: Iterable[Path]) -> dict[Path, Path]:
     """Mask -> photo, of pictures that are called like the mask of another one in the same
     folder.
     """

@@ -151,17 +151,17 @@ def _shift(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) ->
         small = resized(photo, *size), resized(own, *size)
     else:
         small = photo, own
-    whole, moves = boundary_moves(*small, reduced * unit)
+    whole, moves = _boundary_moves(*small, reduced * unit)
     if abs(whole) < LEAST * reduced * unit:
         return _Shift(0.0)
     moves = resized(moves.astype(np.float32), width, height) / reduced
-    votes = sector_votes(*small, whole, reduced * unit)
+    votes = _sector_votes(*small, whole, reduced * unit)
     return _Shift(
         whole / reduced, window, moves, unit, votes, _thin_parts(own, whole / reduced / unit)
     )
 
 
-def boundary_moves(
+def _boundary_moves(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], unit: float
 ) -> tuple[float, Float[np.ndarray, "h w"]]:
     """How far inside the mask's silhouette (pixels; negative: outside) the photo has its edges: on
@@ -191,7 +191,7 @@ def boundary_moves(
     return whole, ndimage.gaussian_filter(moves, SMOOTHING * unit)
 
 
-def sector_votes(
+def _sector_votes(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], whole: float, unit: float
 ) -> tuple[int, int]:
     """How many sectors of the silhouette have their edge about `whole` pixels inside of it, and how

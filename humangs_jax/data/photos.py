@@ -141,7 +141,7 @@ def read_description(file: Path) -> dict[str, Any]:
     body, views = members(description, file, body=str, views=list)
     if Path(body).suffix != ".npz":  # fits write it: it must not be a photo
         raise CaptureError(file, "body", f"expected the name of an npz file, got {shown(body)}")
-    check_inside(file, "body", body)
+    _check_inside(file, "body", body)
     check_background(description.get("background", "photo"), file)
     # the views, one at a time, so that errors name the view
     if not views:
@@ -156,13 +156,13 @@ def read_description(file: Path) -> dict[str, Any]:
             f"{field}.",
         )
         for key in VIEW_KEYS & {"image", "mask", "unknown"} & view.keys():
-            check_inside(
+            _check_inside(
                 file, f"{field}.{key}", expect(view[key], str, file, f"{field}.{key}"), photo=True
             )
     return description
 
 
-def check_inside(file: Path, field: str, name: str, photo: bool = False) -> None:
+def _check_inside(file: Path, field: str, name: str, photo: bool = False) -> None:
     """Raises: CaptureError if a path that `file` names leaves its folder."""
     with reading(f"{file}: {field}", "path", CaptureError):
         inside(file.parent, name, photo)
@@ -186,7 +186,7 @@ def write_description(
     write_json(folder / "capture.json", description | {"views": views})
 
 
-def is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
+def _is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
     """Whether the cameras of a capture are of a calibration; true where the capture does not say.
 
     In older captures `humangs start` wrote it into a file beside them.
@@ -316,7 +316,7 @@ def read_photos(
     if masks is not None and unknown is not None:
         images[unknown], masks[unknown] = 1, 0
     names = names_from_paths([view["image"] for view in views])
-    calibrated = is_calibrated(folder, description)
+    calibrated = _is_calibrated(folder, description)
     return Photos(images, masks, stack_cameras(cameras), frames, names, calibrated, unknown)
 
 

@@ -264,7 +264,7 @@ CROP_MARGIN = 0.04
 """The room on each side of the person, as a share of the crop's side."""
 
 
-def crop_boxes(masks: Float[np.ndarray, "v h w"] | None) -> list[tuple[int, int, int]] | None:
+def _crop_boxes(masks: Float[np.ndarray, "v h w"] | None) -> list[tuple[int, int, int]] | None:
     """The square (left, top, side) around the person in each mask, pixels.
 
     None if there are no masks, if one is empty, or if no square is smaller than its photo.
@@ -285,9 +285,9 @@ def crop_boxes(masks: Float[np.ndarray, "v h w"] | None) -> list[tuple[int, int,
 
 def cropped(capture: Capture, size: int) -> Capture:
     """The photos, each cut to a square around the person in its mask and resized to `size` pixels;
-    all as they are where there are no such squares (`crop_boxes`).
+    all as they are where there are no such squares (`_crop_boxes`).
     """
-    boxes = crop_boxes(capture.masks)
+    boxes = _crop_boxes(capture.masks)
     if boxes is None or capture.masks is None:
         return capture
     images, masks, cameras = _squares(capture.images, capture.masks, capture.cameras, boxes, size)
@@ -421,12 +421,12 @@ def to_network_views(
     resized to `size`.
 
     Intrinsics follow the pixels. Without masks only what the posed body covers will count as
-    foreground. crop: cut to the person where that is less than the photo, see `crop_boxes`.
+    foreground. crop: cut to the person where that is less than the photo, see `_crop_boxes`.
     displacement: of the body that carries the Gaussians, see `SubjectViews`.
     """
     boxes = None
     if crop:
-        boxes = crop_boxes(capture.masks)
+        boxes = _crop_boxes(capture.masks)
     if boxes is None:
         height, width = capture.images.shape[1:3]
         side = max(height, width)

@@ -315,7 +315,7 @@ def predict_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Pr
     return Predicted(images, alpha, tuple(range(len(images))))
 
 
-def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
+def _avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
     """One avatar, or a folder of them, PERSON.npz each; those that are not there are missing.
 
     Raises: ValueError for one avatar and several people; OSError.
@@ -343,7 +343,7 @@ def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
     return one_of
 
 
-def weights_method(variables: Variables, config: HumanGSConfig) -> Method:
+def _weights_method(variables: Variables, config: HumanGSConfig) -> Method:
     """Reconstruction from the inputs of a case; networks with a driver are run again for every
     view.
     """
@@ -461,16 +461,16 @@ def choose_method(
         name = "avatar"
         if not isinstance(avatar, Avatar):
             name = Path(avatar).name
-        return name, avatar_method(avatar, people)
+        return name, _avatar_method(avatar, people)
     if predictions is not None:
         return Path(predictions).name, predictions_method(predictions, people)
     if method is not None:
         return getattr(method, "__name__", "method"), method
     if weights is None:
-        return "shipped weights", weights_method(*shipped_weights())
+        return "shipped weights", _weights_method(*shipped_weights())
     if isinstance(weights, str | Path):
-        return Path(weights).name, weights_method(*load_weights(weights))
-    return "weights", weights_method(*weights)
+        return Path(weights).name, _weights_method(*load_weights(weights))
+    return "weights", _weights_method(*weights)
 
 
 def painted_body(inputs: Capture) -> Float[Array, "n 3"]:

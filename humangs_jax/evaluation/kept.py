@@ -67,13 +67,13 @@ class KeptScores:
         return person, False
 
 
-def tree_key(tree: Any) -> str:
+def _tree_key(tree: Any) -> str:
     """A checksum of the arrays of a pytree, and of its structure."""
     leaves, structure = jax.tree.flatten(tree)
     return checksum({str(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}, str(structure))
 
 
-def file_key(file: Path) -> str:
+def _file_key(file: Path) -> str:
     """A checksum of the bytes of a file; of one that is not there, that it is not."""
     if file.is_file():
         return file_checksum(file)
@@ -99,8 +99,8 @@ def _capture_key(capture: Capture) -> str:
     known = {
         name: np.asarray(array) for name, array in {**arrays, **moved}.items() if array is not None
     }
-    placed = tree_key((capture.cameras, capture.poses))
-    return checksum(known, placed, tree_key(capture.body), repr(capture.names))
+    placed = _tree_key((capture.cameras, capture.poses))
+    return checksum(known, placed, _tree_key(capture.body), repr(capture.names))
 
 
 def indices_key(indices: Mapping[str, Any] | None) -> str | None:
@@ -118,12 +118,12 @@ def body_key(body: BodyModel | str | Path | None) -> str | None:
     """A short checksum of a body that was given; None for the shipped one."""
     if body is None:
         return None
-    return (tree_key(body) if isinstance(body, BodyModel) else file_key(Path(body)))[:SHORT]
+    return (_tree_key(body) if isinstance(body, BodyModel) else _file_key(Path(body)))[:SHORT]
 
 
 def networks_key(networks: Mapping[str, Any]) -> list[str]:
     """Names and short checksums of loss networks, in order."""
-    return [f"{name} {tree_key(network)[:SHORT]}" for name, network in sorted(networks.items())]
+    return [f"{name} {_tree_key(network)[:SHORT]}" for name, network in sorted(networks.items())]
 
 
 def method_key(
@@ -147,23 +147,23 @@ def method_key(
             file for file in prediction_files(root, case, people).values() if file
         )
     if isinstance(avatar, Avatar):
-        return tree_key(avatar)[:SHORT], nothing
+        return _tree_key(avatar)[:SHORT], nothing
     if avatar is not None:
         place = Path(avatar)
         if place.is_dir():
-            return "avatars", lambda case: file_key(place / f"{case.name}.npz")
-        return file_key(place)[:SHORT], nothing
+            return "avatars", lambda case: _file_key(place / f"{case.name}.npz")
+        return _file_key(place)[:SHORT], nothing
     if isinstance(weights, str | Path):
-        return file_key(Path(weights))[:SHORT], nothing
+        return _file_key(Path(weights))[:SHORT], nothing
     if weights is None:
         variables, config = shipped_weights()
     else:
         variables, config = weights
-    return checksum({}, tree_key(variables), repr(config))[:SHORT], nothing
+    return checksum({}, _tree_key(variables), repr(config))[:SHORT], nothing
 
 
 def _files_key(files: Iterable[Path]) -> str:
-    return checksum({}, *(f"{file.name} {file_key(file)}" for file in files))
+    return checksum({}, *(f"{file.name} {_file_key(file)}" for file in files))
 
 
 def _source_key(method: Method) -> str:

@@ -106,7 +106,7 @@ COLUMNS |= {
 COLUMNS["patches"] = Column("patches", 1, "")
 
 
-class Gallery:
+class _Gallery:
     """The images of a page, made small as they come: truth, ours, error of those of the `limit`
     lowest PSNR; inputs of every person.
     """
@@ -156,7 +156,7 @@ def _data_url(image: np.ndarray, side: int) -> str:
     return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 
-def page_html(evaluation: dict[str, Any], notes: list[str], gallery: Gallery) -> str:
+def page_html(evaluation: dict[str, Any], notes: list[str], gallery: _Gallery) -> str:
     """The page as text. evaluation: what `Evaluation.to_json` gives."""
     shown = {evaluation["images"][row]["person"] for row in gallery.shots}
     data = evaluation | {
@@ -208,7 +208,7 @@ class Evaluation:
     """The predictions that were not found."""
     about: dict[str, Any]
     """What was compared, for reports."""
-    gallery: Gallery
+    gallery: _Gallery
     """The images of the page."""
 
     @functools.cached_property
@@ -403,7 +403,7 @@ def evaluate(
         }
         kept = KeptScores(Path(keep), said, key_of, ordered=page_images > 0)
     # one person at a time, so that memory holds the images of one
-    rows, missing, scored, gallery = [], [], [], Gallery(page_images)
+    rows, missing, scored, gallery = [], [], [], _Gallery(page_images)
     for index in bar(range(len(people.names)), desc="evaluate", unit="person", shown=progress):
         case = people.load(index)
         score = functools.partial(_score_person, case, predict, rules, networks, gallery, len(rows))
@@ -467,7 +467,7 @@ def _score_person(
     predict: Method,
     rules: EvaluationProtocol,
     networks: dict[str, Lpips],
-    gallery: Gallery,
+    gallery: _Gallery,
     first: int,
 ) -> dict[str, Any]:
     """What there is to say of a person, as JSON has it; its images go to the gallery. first: number

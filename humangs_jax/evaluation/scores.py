@@ -268,7 +268,7 @@ def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
     }
 
 
-def known_means(rows: Sequence[Row]) -> Row:
+def _known_means(rows: Sequence[Row]) -> Row:
     """Means of the scores over those that have them, such as images with patches; None for what
     none has.
     """
@@ -278,11 +278,11 @@ def known_means(rows: Sequence[Row]) -> Row:
 
 
 def _means_by(rows: Iterable[tuple[Any, Row]]) -> dict[Any, Row]:
-    """`known_means` of the rows that share a key, in the order of first appearance."""
+    """`_known_means` of the rows that share a key, in the order of first appearance."""
     groups: dict[Any, list[Row]] = {}
     for key, row in rows:
         groups.setdefault(key, []).append(row)
-    return {key: known_means(found) for key, found in groups.items()}
+    return {key: _known_means(found) for key, found in groups.items()}
 
 
 def _frame_means(rows: Sequence[Scored]) -> dict[tuple[str, int], Row]:
@@ -404,7 +404,7 @@ def _patch_means(x: Float[Array, "h w"], side: int) -> Float[Array, "y x"]:
 
 
 @jax.jit
-def alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict[str, Scalar]:
+def _alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict[str, Scalar]:
     """iou and semi-transparent foreground of a rendering's coverage."""
     return {"iou": silhouette_iou(alpha, mask), "semi_transparent": semi_transparent(alpha, mask)}
 
@@ -420,7 +420,7 @@ _lpips = jax.jit(_precise_lpips)
 _lpips_of_patches = jax.jit(jax.vmap(_precise_lpips, in_axes=(None, 0, 0)))
 
 
-def score_image(
+def _score_image(
     predicted: Float[np.ndarray, "h w 3"],
     truth: Float[np.ndarray, "h w 3"],
     mask: Float[np.ndarray, "h w"] | None,
@@ -459,7 +459,7 @@ def score_image(
     if mask is not None:
         row["foreground"] = np.mean(mask)
         if alpha is not None:
-            row |= alpha_scores(_padded(alpha), _padded(mask))
+            row |= _alpha_scores(_padded(alpha), _padded(mask))
     # the person alone, and patches of the person
     if not empty:
         frame = [_padded(x) for x in (predicted, truth, mask, boundary_band(mask))]
@@ -541,7 +541,7 @@ def score_views(
     alpha: Float[np.ndarray, "v h w"] | None = None,
     networks: Networks | None = None,
 ) -> Iterator[Row]:
-    """The scores of each view of a capture; see `score_image`. predicted: on the protocol's
+    """The scores of each view of a capture; see `_score_image`. predicted: on the protocol's
     background.
 
     Raises: ValueError if the sizes differ, if a value is not finite, or if the protocol needs masks
@@ -566,7 +566,7 @@ def score_views(
             shown = np.where(truth.unknown[i][..., None], image, shown)
             if opacity is not None:
                 opacity = np.where(truth.unknown[i], 0, opacity)
-        yield score_image(shown, image, mask, opacity, protocol, networks or {})
+        yield _score_image(shown, image, mask, opacity, protocol, networks or {})
 
 
 def on_background(

@@ -324,7 +324,7 @@ def learned_update(
     chosen = [photos[i * len(photos) // used] for i in range(used)]
     for _ in range(iterations):
         each = [photo_signals(parameters, avatar, photo, splat) for photo in chosen]
-        parameters, values, hidden, overflow = iteration_by(
+        parameters, values, hidden, overflow = _iteration_by(
             load_refiner(), parameters, values, start, hidden, overflow, each, graph, avatar
         )
     return parameters, overflow
@@ -337,7 +337,7 @@ def side_by_side(parameters: UnconstrainedGaussians) -> Float[Array, "g 14"]:
 
 
 @compiled
-def iteration_by(
+def _iteration_by(
     variables: PyTree,
     parameters: UnconstrainedGaussians,
     values: Float[Array, "g 14"],
@@ -363,43 +363,43 @@ def photo_signals(
     splat: with `visibility`.
     """
     image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat)
-    gradient, _ = pulled(pull_back, squared_errors(image, photo))
-    foreground, _ = pulled(pull_back, foreground_errors(image, photo))
-    _, pixels = pulled(pull_back, colors_alone(image))
-    return signals_from(gradient, foreground, pixels, rendering, photo), rendering.overflow
+    gradient, _ = pulled(pull_back, _squared_errors(image, photo))
+    foreground, _ = pulled(pull_back, _foreground_errors(image, photo))
+    _, pixels = pulled(pull_back, _colors_alone(image))
+    return _signals_from(gradient, foreground, pixels, rendering, photo), rendering.overflow
 
 
 @compiled
-def squared_errors(image: Image, photo: Photo) -> Image:
+def _squared_errors(image: Image, photo: Photo) -> Image:
     """Gradient of the sum of squared errors with respect to the image."""
     rgb = jnp.where(photo.counted[..., None], image[0] - photo.image, 0)
     return 2 * rgb, 2 * jnp.where(photo.counted, image[1] - photo.mask, 0)
 
 
 @compiled
-def foreground_errors(image: Image, photo: Photo) -> Image:
+def _foreground_errors(image: Image, photo: Photo) -> Image:
     """Gradient of the squared errors of colors in the foreground alone: what stands before the
     background should fade, not take its color.
     """
-    rgb, alpha = squared_errors(image, photo)
+    rgb, alpha = _squared_errors(image, photo)
     return rgb * photo.mask[..., None], jnp.zeros_like(alpha)
 
 
 @compiled
-def colors_alone(image: Image) -> Image:
+def _colors_alone(image: Image) -> Image:
     """Gradient of the sum of all colors with respect to the image."""
     return jnp.ones_like(image[0]), jnp.zeros_like(image[1])
 
 
 @compiled
-def signals_from(
+def _signals_from(
     gradient: UnconstrainedGaussians,
     foreground: UnconstrainedGaussians,
     pixels: Float[Array, " g"],
     rendering: Rendering,
     photo: Photo,
 ) -> Signals:
-    """Signals from `squared_errors`, `foreground_errors` and `colors_alone`, each pulled back to
+    """Signals from `_squared_errors`, `_foreground_errors` and `_colors_alone`, each pulled back to
     the Gaussians.
     """
     assert rendering.visibility is not None

@@ -323,11 +323,11 @@ def search(task: Task, start: Candidate, each: Comparison) -> Iterator[Candidate
     of the start with photos.
     """
     held_photo = len(task.photos) >= HELD_OUT_PHOTOS and task.config.held_out > 0
-    method = search_by_photo if held_photo else search_by_blocks
+    method = _search_by_photo if held_photo else _search_by_blocks
     yield from method(task, start, np.asarray(each.loss))
 
 
-def search_by_blocks(
+def _search_by_blocks(
     task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
 ) -> Iterator[Candidate]:
     """The held-out pixels choose the best state. Where there are none, the loss on all pixels
@@ -360,7 +360,7 @@ def search_by_blocks(
         yield found._replace(kept=kept)
 
 
-def search_by_photo(
+def _search_by_photo(
     task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
 ) -> Iterator[Candidate]:
     """A trial without one photo, then a fit of all photos as the trial says. losses: of the

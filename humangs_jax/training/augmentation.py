@@ -108,7 +108,7 @@ def augment_views(
         views,
         images=images,
         masks=masks,
-        cameras=augment_cameras(camera_key, views.cameras, views.translations + pelvis, config),
+        cameras=_augment_cameras(camera_key, views.cameras, views.translations + pelvis, config),
         rotations=views.rotations + math.radians(config.pose_degrees) * normal(pose_key, rotations),
         translations=views.translations
         + config.body_metres * normal(body_key, views.translations[0]),
@@ -155,7 +155,7 @@ def _largest_near(images: Float[Array, "v h w"]) -> Float[Array, "v h w"]:
     return images
 
 
-def augment_cameras(
+def _augment_cameras(
     key: Key, cameras: Camera, centers: Float[Array, "v 3"], config: Augmentation
 ) -> Camera:
     """Cameras that are turned about centres (v, 3) of the world, and shifted."""

@@ -89,10 +89,10 @@ def captured_people(
     """Capture folders whose parameters belong to `body`; images that are decoded once serve all
     stages.
     """
-    return cached_people(CaptureCache(folders, body, body_file=body_file))
+    return _cached_people(CaptureCache(folders, body, body_file=body_file))
 
 
-def cached_people(cache: PeopleCache) -> SourceFactory:
+def _cached_people(cache: PeopleCache) -> SourceFactory:
     """People on disk; images that are decoded once serve all stages. Their depths are unknown."""
 
     def make(config: TrainConfig) -> Source:
@@ -126,7 +126,7 @@ def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> S
         if split is not None and (data / MANIFEST).is_file():
             folders = imported(f"{SYNTHETIC}.writer:find_people")(data, split)
         return captured_people(folders, body.model, body.file)
-    return cached_people(PeopleCache(open_people(data, body)))
+    return _cached_people(PeopleCache(open_people(data, body)))
 
 
 def training_people(

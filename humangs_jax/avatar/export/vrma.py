@@ -35,7 +35,7 @@ VRM_FINGERS = {"pinky": "Little"}
 """Fingers that VRM calls otherwise."""
 
 
-def bone_names() -> dict[str, str]:
+def _bone_names() -> dict[str, str]:
     """VRM's name of each joint of ours that it has."""
     names = dict(BONES)
     for side in ("left", "right"):
@@ -74,7 +74,7 @@ def write_vrma(
         nodes.append(node | ({"children": children} if children else {}))
 
     times = writer.array("SCALAR", np.arange(len(motion.translations)) / motion.fps, bounds=True)
-    rotations, names = np.asarray(motion.rotations), bone_names()
+    rotations, names = np.asarray(motion.rotations), _bone_names()
     quats = continuous(np.asarray(quaternion.from_axis_angle(motion.rotations)))
     root = avatar.parents.index(-1)
     # joints that never move need no track, except the root

@@ -141,10 +141,10 @@ def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
         raise CaptureError(file, f"{name}.imgSize", "missing")
 
     calibration = read_calibration(file, no_size)
-    return checked_cameras(in_capture_convention(calibration, 1.0, "+y", "integer"))
+    return _checked_cameras(in_capture_convention(calibration, 1.0, "+y", "integer"))
 
 
-def checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
+def _checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
     """Cameras of known sizes, rigid, no farther than `FARTHEST` from the origin, with names that
     can be those of folders.
 
@@ -189,7 +189,7 @@ def numbered(folder: Path) -> dict[int, Path]:
     return {int(found[1]): folder / name for name, found in matches.items() if found}
 
 
-def read_missing(file: Path) -> set[tuple[str, int]]:
+def _read_missing(file: Path) -> set[tuple[str, int]]:
     """(camera, frame) of the photos that the authors list as missing; both kinds of slashes.
 
     Empty without the file.
@@ -208,7 +208,7 @@ def read_missing(file: Path) -> set[tuple[str, int]]:
     return found
 
 
-def video_subject(
+def _video_subject(
     name: Path,
     cameras: Sequence[CalibratedCamera],
     photos: Sequence[Mapping[int, T]],
@@ -269,16 +269,16 @@ def video_subject(
     )
 
 
-def folder_subject(
+def _folder_subject(
     name: Path,
     cameras: Sequence[CalibratedCamera],
     folders: Sequence[tuple[Path, Path]],
     parameters: BodyParameters,
     listed: Set[tuple[str, int]] = frozenset(),
 ) -> Subject:
-    """`video_subject` of files in folders of each camera's photos and masks."""
+    """`_video_subject` of files in folders of each camera's photos and masks."""
     photos, masks = ([numbered(folder) for folder in part] for part in zip(*folders, strict=True))
-    return video_subject(name, cameras, photos, masks, on_white, parameters, listed)
+    return _video_subject(name, cameras, photos, masks, on_white, parameters, listed)
 
 
 def on_white(
@@ -305,7 +305,7 @@ def _cut_out(
     return np.where(person[..., None], image, np.float32(1)), person.astype(np.float32)
 
 
-class FolderLayout(NamedTuple):
+class _FolderLayout(NamedTuple):
     """Where the files of a data set are, relative to its folder."""
 
     calibration: str
@@ -316,19 +316,19 @@ class FolderLayout(NamedTuple):
     """The folder of its masks, with NAME for its name."""
 
 
-THUMAN4 = FolderLayout("calibration.json", "images/NAME", "masks/NAME")
-AVATARREX = FolderLayout("calibration_full.json", "NAME", "NAME/mask/pha")
+THUMAN4 = _FolderLayout("calibration.json", "images/NAME", "masks/NAME")
+AVATARREX = _FolderLayout("calibration_full.json", "NAME", "NAME/mask/pha")
 
 
-def find_subjects(layout: FolderLayout, folder: str | Path) -> tuple[Path, ...]:
+def _find_subjects(layout: _FolderLayout, folder: str | Path) -> tuple[Path, ...]:
     """The subjects in a folder, sorted, or the folder itself; empty if there are none."""
     above = layout.photos.removesuffix("NAME")
-    return subfolders(
+    return _subfolders(
         folder, lambda path: (path / layout.calibration).is_file() and (path / above).is_dir()
     )
 
 
-def subfolders(
+def _subfolders(
     folder: str | Path, is_one: Callable[[Path], bool], depth: int = 1
 ) -> tuple[Path, ...]:
     """The folder itself, or those up to `depth` folders below that are a subject, sorted."""
@@ -339,7 +339,7 @@ def subfolders(
     return tuple(sorted(path for path in below if is_one(path)))
 
 
-def open_subject(layout: FolderLayout, folder: str | Path, body: FileBody) -> Subject:
+def _open_subject(layout: _FolderLayout, folder: str | Path, body: FileBody) -> Subject:
     """One subject; nothing but calibration, poses and names of files is read.
 
     Raises: CaptureError naming file and key.
@@ -351,20 +351,20 @@ def open_subject(layout: FolderLayout, folder: str | Path, body: FileBody) -> Su
         return folder / part.replace("NAME", camera.name)
 
     places = [(place(layout.photos, camera), place(layout.masks, camera)) for camera in cameras]
-    return folder_subject(
+    return _folder_subject(
         folder,
         cameras,
         places,
         read_parameters(folder / PARAMETERS, body),
-        read_missing(folder / MISSING),
+        _read_missing(folder / MISSING),
     )
 
 
 find_thuman4, open_thuman4 = (
-    functools.partial(do, THUMAN4) for do in (find_subjects, open_subject)
+    functools.partial(do, THUMAN4) for do in (_find_subjects, _open_subject)
 )
 find_avatarrex, open_avatarrex = (
-    functools.partial(do, AVATARREX) for do in (find_subjects, open_subject)
+    functools.partial(do, AVATARREX) for do in (_find_subjects, _open_subject)
 )
 
 
@@ -382,7 +382,7 @@ def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
     """The sequences in a folder (of one actor or of several), sorted, or the folder itself; empty
     if there are none.
     """
-    return subfolders(
+    return _subfolders(
         folder,
         lambda path: any((path / scale / CALIBRATION).is_file() for scale in SCALES),
         depth=2,
@@ -396,15 +396,15 @@ def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
     """
     folder = Path(folder)
     scale = next((s for s in SCALES if (folder / s / CALIBRATION).is_file()), SCALES[0])
-    cameras = read_csv_cameras(folder / scale / CALIBRATION)
+    cameras = _read_csv_cameras(folder / scale / CALIBRATION)
     places = [
         (folder / scale / "rgbs" / camera.name, folder / scale / "masks" / camera.name)
         for camera in cameras
     ]
-    return folder_subject(folder, cameras, places, read_parameters(folder / PARAMETERS, body))
+    return _folder_subject(folder, cameras, places, read_parameters(folder / PARAMETERS, body))
 
 
-def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
+def _read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
     """The cameras of a csv. Raises: CaptureError naming file, camera and column."""
     with reading(file, "csv file", CaptureError):
         rows = list(csv.DictReader(io.StringIO(checked_text(file))))
@@ -446,7 +446,7 @@ def read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
         cameras.append(CalibratedCamera(name, K, pose_matrix(turn, -turn @ center), width, height))
     if not cameras:
         raise CaptureError(file, "", f"no camera: expected the columns name,{','.join(COLUMNS)}")
-    return checked_cameras(Calibration("ActorsHQ", file, tuple(cameras), False, "half", "+y"))
+    return _checked_cameras(Calibration("ActorsHQ", file, tuple(cameras), False, "half", "+y"))
 
 
 # DNA-Rendering
@@ -460,7 +460,7 @@ def find_dna_rendering(folder: str | Path) -> tuple[Path, ...]:
     return tuple(sorted(visible(Path(folder).glob("main/*.smc"))))
 
 
-class Smc:
+class _Smc:
     """An HDF5 file whose every value is checked for its size before it is read.
 
     Raises: CaptureError naming file and key.
@@ -531,7 +531,7 @@ class Smc:
 def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
     """One sequence of its main file. Raises: CaptureError naming file and key."""
     main = Path(main)
-    photos, notes = Smc(main), Smc(main.parent.parent / "annotations" / f"{main.stem}_annots.smc")
+    photos, notes = _Smc(main), _Smc(main.parent.parent / "annotations" / f"{main.stem}_annots.smc")
     # cameras are spread over groups of two kinds
     places = {
         int(name): group for group in GROUPS for name in photos.names(group) if name.isdecimal()
@@ -560,15 +560,15 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
 
     # annotated cameras in the convention of captures
     calibration = Calibration("DNA-Rendering", notes.path, tuple(cameras), False, "integer", "+y")
-    cameras = checked_cameras(in_capture_convention(calibration, 1.0, "+y", "integer"))
-    return video_subject(main, cameras, shown, masks, read, parameters, digits=6)
+    cameras = _checked_cameras(in_capture_convention(calibration, 1.0, "+y", "integer"))
+    return _video_subject(main, cameras, shown, masks, read, parameters, digits=6)
 
 
 def _colors(image: Any) -> Float[np.ndarray, "h w 3"]:
     return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
 
 
-def _parameters(notes: Smc, body: FileBody) -> BodyParameters:
+def _parameters(notes: _Smc, body: FileBody) -> BodyParameters:
     poses = notes.numbers("SMPLx/fullpose", (None, len(body.model.parents), 3), LARGEST_ANGLE)
     translations = notes.numbers("SMPLx/transl", (len(poses), 3), FARTHEST)
     rotations = poses.copy()
@@ -582,7 +582,7 @@ def _parameters(notes: Smc, body: FileBody) -> BodyParameters:
     )
 
 
-def _camera(notes: Smc, number: int, photos: Smc, first: str | None) -> CalibratedCamera:
+def _camera(notes: _Smc, number: int, photos: _Smc, first: str | None) -> CalibratedCamera:
     at = f"Camera_Parameter/{number:02d}"
     K, pose = notes.numbers(f"{at}/K", (3, 3)), notes.numbers(f"{at}/RT", (4, 4))
     lens = brown_conrady(notes.array(f"{at}/D").reshape(-1), notes.path, f"{at}/D")

@@ -135,14 +135,14 @@ def open_scene_list(
             size = max(read_checked(image_size, first))
 
     def opened(name, scene):
-        return functools.partial(open_scene, file, name, scene, body)
+        return functools.partial(_open_scene, file, name, scene, body)
 
     return tuple(
         Person(f"{file}: {name}", opened(name, scene), size) for name, scene in scenes.items()
     )
 
 
-def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) -> Subject:
+def _open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) -> Subject:
     """One scene of a list in metres. Images that are not there are left out and counted.
 
     Raises: CaptureError.
@@ -188,7 +188,7 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
     )
 
 
-def scene_frames(file: Path, name: str, scene: Mapping[str, Any]) -> list[SceneFrame]:
+def _scene_frames(file: Path, name: str, scene: Mapping[str, Any]) -> list[SceneFrame]:
     """The frames of a scene, checked. Raises: CaptureError naming file and key."""
     views, (frames,) = [], members(scene, file, name, frames=list)
     for i, frame in enumerate(frames):
@@ -217,7 +217,7 @@ def _present(
     """Frames whose image and arrays are there, and how many are not."""
     views, missing = [], {"no image": 0, "no smpl_path": 0}
     is_there = functools.lru_cache(None)(lambda path: _inside(file, name, path).is_file())
-    for view in scene_frames(file, name, scene):
+    for view in _scene_frames(file, name, scene):
         if not is_there(view.arrays):
             missing["no smpl_path"] += 1
         elif not is_there(view.image):
@@ -242,10 +242,10 @@ def _read_view(
         return image, read_checked(read_grey, _inside(file, name, view.mask))
     if alpha is not None:
         return image * alpha[..., None] + (1 - alpha[..., None]), alpha
-    return image, not_white(image).astype(np.float32)
+    return image, _not_white(image).astype(np.float32)
 
 
-def not_white(image: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+def _not_white(image: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     """Pixels of the person in an image on white: those below `WHITE`, and what they enclose."""
     from scipy.ndimage import binary_fill_holes
 

@@ -84,7 +84,7 @@ def smallest_rotation(
     return smallest_turns(start / lengths[0], end / lengths[1], opposite=1e-24)
 
 
-def box_middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+def _box_middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     """Middle of the bounding box."""
     return 0.5 * (points.min(axis=0) + points.max(axis=0)).astype(np.float64)
 
@@ -103,7 +103,7 @@ def scan_alignment(
     upright.
     """
     R = smallest_rotation(neck - pelvis, np.asarray([0.0, 1.0, 0.0]))
-    return calibration.pose_matrix(R, -R @ box_middle(scan))
+    return calibration.pose_matrix(R, -R @ _box_middle(scan))
 
 
 def video_alignment(
@@ -113,7 +113,7 @@ def video_alignment(
     frame 0 to the origin.
     """
     R = smallest_rotation(neck - pelvis, np.asarray([0.0, 1.0, 0.0]))
-    return calibration.pose_matrix(R, -box_middle(body @ R.T))
+    return calibration.pose_matrix(R, -_box_middle(body @ R.T))
 
 
 def intrinsics(size: int) -> Float[np.ndarray, "3 3"]:
