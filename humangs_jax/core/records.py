@@ -63,7 +63,7 @@ class ArrayField(NamedTuple):
         return tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in self.axes)
 
     def checks(self, array: Any, label: str) -> dict[str, tuple[Any, Values]]:
-        """Returns the array and its parts with the values that each may have, for `check_values`."""
+        """Returns the array and its parts, with the values each may have, for `check_values`."""
         if array is None or self.values is None:
             return {}
         found = {label: (array, self.values)}

@@ -22,7 +22,7 @@ from humangs_jax.rendering.splat_config import DEFAULT_CONFIG
 from humangs_jax.rendering.splatting import render
 from humangs_jax.rendering.tiling import TileGrid, count_pairs, footprints_by
 from humangs_jax.scenes import mcmc
-from humangs_jax.scenes.fitting import _drawn, begin_scene
+from humangs_jax.scenes.steps import begin_scene, drawn_gaussians
 
 
 def paper(o, n):
@@ -171,7 +171,7 @@ def test_unused_slots_meet_no_tile_and_change_no_pixel():
     parameters, _ = slots([0.8, 0.6, 0.7])
     few = constrain(parameters)
     state = begin_scene(few, 64)
-    many = _drawn(state.parameters, state.used)
+    many = drawn_gaussians(state.parameters, state.used)
     K = jnp.asarray([[100.0, 0, 16], [0, 100.0, 16], [0, 0, 1]])
     view = orbit(jnp.zeros(3), 2.0, jnp.zeros(1), 0.0, K, 32, 32)[0]
     pairs = [
