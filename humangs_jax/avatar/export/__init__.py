@@ -51,58 +51,75 @@ class ExportFormat(Format):
 
 EXPORTS = Formats(
     ply=ExportFormat(
-        *("3DGS", f"{HERE}.splats:write_ply", (".ply",)),
-        **{
-            "up": "-y",
-            "rest_fields": True,
-            "reader": f"{HERE}.splats:read_ply",
-            "magic": (b"ply",),
-        },
+        "3DGS",
+        f"{HERE}.splats:write_ply",
+        (".ply",),
+        up="-y",
+        rest_fields=True,
+        reader=f"{HERE}.splats:read_ply",
+        magic=(b"ply",),
     ),
     splat=ExportFormat(
-        *("antimatter15's viewer and others", f"{HERE}.splats:write_splat", (".splat",)),
-        **{"up": "-y", "reader": f"{HERE}.splats:read_splat"},
+        "antimatter15's viewer and others",
+        f"{HERE}.splats:write_splat",
+        (".splat",),
+        up="-y",
+        reader=f"{HERE}.splats:read_splat",
     ),
     spz=ExportFormat(
-        *("Niantic's, compressed", f"{HERE}.spz:write_spz", (".spz",)),
-        **{
-            "backwards": True,
-            "versions": (3, 4),
-            "reader": f"{HERE}.spz:read_spz",
-            "magic": (b"\x1f\x8b\x08", b"NGSP"),
-        },
+        "Niantic's, compressed",
+        f"{HERE}.spz:write_spz",
+        (".spz",),
+        backwards=True,
+        versions=(3, 4),
+        reader=f"{HERE}.spz:read_spz",
+        magic=(b"\x1f\x8b\x08", b"NGSP"),
     ),
     glb=ExportFormat(
-        *("glTF 2.0 with KHR_gaussian_splatting", f"{HERE}.splats:write_glb", (".glb",)),
-        **{"reader": f"{HERE}.splats:read_glb", "magic": (b"glTF",)},
+        "glTF 2.0 with KHR_gaussian_splatting",
+        f"{HERE}.splats:write_glb",
+        (".glb",),
+        reader=f"{HERE}.splats:read_glb",
+        magic=(b"glTF",),
     ),
     mesh=ExportFormat(
-        *(
-            "with --mesh the body with texture, skin and motion",
-            f"{HERE}.mesh:write_animation",
-            (".glb",),
-        ),
-        **{"mesh": True, "animated": True},
+        "with --mesh the body with texture, skin and motion",
+        f"{HERE}.mesh:write_animation",
+        (".glb",),
+        mesh=True,
+        animated=True,
     ),
     vrma=ExportFormat(
-        *("the motion alone, for VRM characters", f"{HERE}.vrma:write_vrma", (".vrma",)),
-        **{"mesh": True, "animated": True},
+        "the motion alone, for VRM characters",
+        f"{HERE}.vrma:write_vrma",
+        (".vrma",),
+        mesh=True,
+        animated=True,
     ),
     obj=ExportFormat(
-        *("the body as a textured mesh in a pose", f"{HERE}.mesh:write_poses", (".obj",)),
-        **{"mesh": True, "beside": (".mtl", ".png")},
+        "the body as a textured mesh in a pose",
+        f"{HERE}.mesh:write_poses",
+        (".obj",),
+        mesh=True,
+        beside=(".mtl", ".png"),
     ),
 )
 """By name; a suffix has at most one format of Gaussians and one of meshes."""
 
 READ_ONLY = Formats(
     sog=ExportFormat(
-        *("PlayCanvas' SOG, a bundle", "", (".sog",)),
-        **{"up": "-y", "reader": f"{HERE}.sog:read_sog"},
+        "PlayCanvas' SOG, a bundle",
+        "",
+        (".sog",),
+        up="-y",
+        reader=f"{HERE}.sog:read_sog",
     ),
     checkpoint=ExportFormat(
-        *("gsplat's checkpoints", "", (".pt", ".pth", ".ckpt")),
-        **{"up": "-y", "reader": f"{HERE}.splats:read_checkpoint"},
+        "gsplat's checkpoints",
+        "",
+        (".pt", ".pth", ".ckpt"),
+        up="-y",
+        reader=f"{HERE}.splats:read_checkpoint",
     ),
 )
 """Formats of Gaussians that are read and not written."""
