@@ -263,7 +263,6 @@ def test_what_cannot_be_meant_is_one_line_before_the_work(
 
 FOLDERS = {
     "export three.npz --out new/deep/a.ply": "new/deep/a.ply",
-    "export three.npz --out new/deep/a.obj": "new/deep/a.obj",
     "export three.npz --html new/deep/page.html": "new/deep/page.html",
     "export three.npz --motion steps.npz --out new/deep/a.ply --frames :": "new/deep/a_0003.ply",
 }

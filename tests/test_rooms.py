@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import rooms
 
 ROOT = Path(__file__).parents[1]
@@ -13,6 +14,7 @@ MOST_LEFT_OUT = 36
 ALONE = """
 import pathlib, sys
 sys.path.insert(0, "tests")
+import pytest
 import rooms
 
 sys.meta_path.insert(0, rooms.HiddenWings())
@@ -29,6 +31,7 @@ print("alone")
 """
 
 
+@pytest.mark.slow
 def test_every_module_of_the_core_is_imported_with_the_wings_hidden():
     done = subprocess.run([sys.executable, "-c", ALONE], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout.endswith("alone\n"), done.stderr[-2000:]

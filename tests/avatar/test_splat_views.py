@@ -42,6 +42,7 @@ def rendered(monkeypatch, *words):
     cli.main()
 
 
+@pytest.mark.slow
 def test_a_circle_shows_the_whole_scene_upright(tmp_path, monkeypatch, capsys):
     hg.save_gaussians(tmp_path / "a.ply", ball())
     out = tmp_path / "views"

@@ -148,6 +148,7 @@ def white(case, background):
     return Predicted(np.ones_like(case.truth.images), None, tuple(range(case.truth.view_count)))
 
 
+@pytest.mark.slow
 def test_scores_of_other_photos_views_or_people_are_never_taken_for_kept_ones(people, tmp_path):
     (ann, _), (bob, _) = people["ann"], people["bob"]
     brighter = dataclasses.replace(ann, images=np.clip(ann.images + 0.1, 0, 1))
@@ -464,6 +465,7 @@ def test_avatars_and_weights_are_drawn_on_the_protocols_background(tmp_path):
         assert nobody.means["iou"].mean == 0
 
 
+@pytest.mark.slow
 def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, monkeypatch, capsys):
     """Where its files are as they were."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -51,6 +51,7 @@ def test_scores_by_task_are_means_over_views():
     assert found == pytest.approx(float(expected), rel=1e-5) and found > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", [quality.evaluation_views, bodies.evaluation_bodies])
 def test_wrong_options_are_one_line(function, capsys):
     for said, option in {

@@ -167,6 +167,7 @@ def test_pooled_points_are_fewer_tokens_and_every_vertex_keeps_its_own_place():
     assert len(np.unique(np.asarray(features).round(5), axis=0)) == VERTICES
 
 
+@pytest.mark.slow
 def test_a_group_token_moves_only_its_group():
     config, inputs = small_system("gst"), photos("gst")
     variables = random_variables(config)
@@ -233,6 +234,7 @@ def test_a_seen_texel_has_the_color_of_the_pixel_that_sees_it_best_and_every_mea
     np.testing.assert_array_equal(opaque[1:], seen[1:])
 
 
+@pytest.mark.slow
 def test_unseen_texels_are_filled_from_their_neighbours():
     colors, seen = np.zeros((4, 4, 3), np.float32), np.zeros((4, 4), bool)
     colors[0, 0], colors[3, 3] = 0.8, 0.2

@@ -225,6 +225,7 @@ def test_a_network_that_draws_pixels_makes_no_avatar():
 # --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DRIVEN)
 def test_a_frame_has_its_own_gaussians_and_untrained_corrections_are_none(name):
     frame, outputs = driven(name)
@@ -249,6 +250,7 @@ def test_a_frame_has_its_own_gaussians_and_untrained_corrections_are_none(name):
     )  # the driver's; those of the decoder come first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["giga", "animatable"])
 def test_texels_lie_on_the_surface_and_empty_ones_are_transparent(name):
     body = mapped_tube(small(name))
@@ -270,6 +272,7 @@ def test_texels_lie_on_the_surface_and_empty_ones_are_transparent(name):
     np.testing.assert_allclose(avatar.skinning_weights[covered], expected[covered], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_texture_is_what_the_photos_show():
     inputs = inputs_of("giga")
     red = replace(
@@ -284,6 +287,7 @@ def test_the_texture_is_what_the_photos_show():
     np.testing.assert_allclose(outputs.scene.texture.colors[~seen], 0.5)
 
 
+@pytest.mark.slow
 def test_animatable_reads_no_photo_and_a_place_in_the_world_is_no_pose():
     inputs = inputs_of("animatable")
     frame, _ = driven("animatable")
@@ -301,6 +305,7 @@ def test_animatable_reads_no_photo_and_a_place_in_the_world_is_no_pose():
     close(turned.gaussians, straight.gaussians)
 
 
+@pytest.mark.slow
 def test_corrections_are_bounded_and_zeros_are_none():
     gaussians = driven("giga")[1].gaussians
     correct = jax.jit(
@@ -315,6 +320,7 @@ def test_corrections_are_bounded_and_zeros_are_none():
     np.testing.assert_allclose(jnp.linalg.norm(offsets, axis=1), 0.1 * 3**0.5, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_corrections_turn_gaussians_about_the_axes_of_the_body():
     """A quarter turn about z takes a Gaussian that is long along y to one that is long along x,
     however it was written.
@@ -337,6 +343,7 @@ def test_corrections_turn_gaussians_about_the_axes_of_the_body():
     np.testing.assert_allclose(jnp.abs(long), [1, 0, 0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_texels_attend_by_scaled_products():
     """Products grow with the width; their softmax must not: of random features it stays far from
     one token.
@@ -353,6 +360,7 @@ def test_texels_attend_by_scaled_products():
     np.testing.assert_allclose(seen[0, 0, 0], [share, 0, 1 - share, 0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_sharper_softmax_of_views_takes_the_color_of_the_best_one():
     """Texels that two photos see, one red and one green: their weights are exp(sharpness *
     cosine).
@@ -433,6 +441,7 @@ def test_a_target_is_drawn_from_the_two_photos_nearest_to_it():
         nearest_pair(replace(scene, present=scene.present[:1]), centers[0])
 
 
+@pytest.mark.slow
 def test_depths_come_from_what_two_photos_have_in_common():
     """With the learned scores at 0 a photo's depths depend on the nearest other photo, and on no
     third one.

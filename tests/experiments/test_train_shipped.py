@@ -29,6 +29,7 @@ def test_the_shipped_weights_have_a_name(given, expected):
     assert tyro.cli(command, args=["--init-weights", given]) == expected
 
 
+@pytest.mark.slow
 def test_the_mean_of_the_first_and_the_trained_weights(tmp_path):
     random = np.random.default_rng(0)
     first, last = (

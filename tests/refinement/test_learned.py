@@ -132,6 +132,7 @@ def test_parameters_side_by_side_and_back(scene):
     jax.tree.map(np.testing.assert_array_equal, unstacked(values, parameters), parameters)
 
 
+@pytest.mark.slow
 def test_pixels_are_the_sums_of_the_weights(scene):
     signals, rendering = signals_of(scene), drawn(scene, scene[2])
     per_person = PERSON / float(scene[1].mask.sum())

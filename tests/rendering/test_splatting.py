@@ -111,6 +111,7 @@ def test_equals_the_reference_with_all_gradients(seed, functions):
         assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(expected[1]))
 
 
+@pytest.mark.slow
 def test_features_are_drawn_beside_the_colors():
     """With gradients of all, as the reference has them."""
     rng = np.random.default_rng(4)
@@ -136,7 +137,8 @@ def test_features_are_drawn_beside_the_colors():
         render(random_gaussians(13, np.float32), camera(np.float32), features=jnp.zeros((31, 5)))
 
 
-@pytest.mark.parametrize("most", [pytest.param(60, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("most", [60, 1])
 def test_an_image_in_bands_is_the_image(most):
     gaussians, view = random_gaussians(3, np.float32), camera(np.float32)
     whole, banded = render(gaussians, view), render_in_bands(gaussians, view, most_pairs=most)
@@ -230,6 +232,7 @@ def test_float32_differs_only_by_rounding_and_by_decisions():
     assert ours[0].rgb.dtype == np.float32
 
 
+@pytest.mark.slow
 def test_coincident_depths_are_drawn_by_index():
     with jax.enable_x64(True):
         gaussians = random_gaussians(10)

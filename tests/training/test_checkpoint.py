@@ -125,6 +125,7 @@ def test_what_cannot_be_written_is_one_line_that_names_the_folder(tmp_path, monk
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path, same, caplog):
     first = Checkpoints(tmp_path / "whole", keep=3)
     for step in (1, 2, 3):

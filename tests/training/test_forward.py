@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import replace
@@ -59,6 +60,7 @@ def drawn_for_training(gaussians, targets):
     return jax.jit(lambda posed: draw_posed(posed, targets, white, CONFIG))(batched(gaussians))
 
 
+@pytest.mark.slow
 def test_the_spread_of_rays_does_not_depend_on_harmonics():
     """It is that of the depths: drawn as a color, a depth would get harmonics added, and be cut at
     0.

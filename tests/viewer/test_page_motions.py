@@ -413,6 +413,7 @@ def compare(tmp_path, caplog, files):
         assert bool(page["said"]) == bool(said) and page["said"] in said, (case, page["said"], said)
 
 
+@pytest.mark.slow
 def test_the_page_reads_skeletons_as_python_does(tmp_path, caplog):
     compare(
         tmp_path, caplog, {case: ("dance.bvh", text.encode()) for case, text in skeletons().items()}
