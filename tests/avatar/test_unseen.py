@@ -143,7 +143,7 @@ def line(*places):
 
 
 def test_a_guess_comes_from_the_nearest_source_or_its_mirror_image():
-    regions = line(0.2, 0.25, -0.24, 0.6, 5.0)
+    regions = line(0.2, 0.25, -0.24, 0.6, 1.2)
     values = jnp.asarray([[1.0], [0.0], [0.0], [7.0], [0.0]])
     need, sure = jnp.asarray([0.0, 1, 1, 0, 1]), jnp.asarray([1.0, 0, 0, 1, 0])
     found = np.asarray(attended(values, need, sure, regions))[:, 0]

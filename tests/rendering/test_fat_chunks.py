@@ -2,7 +2,6 @@
 lists made by hand.
 """
 
-import functools
 from unittest import mock
 
 import jax
@@ -13,12 +12,10 @@ import pytest
 from compositing_rounding import analyse
 from hypothesis import given
 from hypothesis import strategies as st
-from splat_scenes import camera, random_gaussians
 
-from humangs_jax.rendering import compositing, tiling
-from humangs_jax.rendering.projection import project_gaussians
+from humangs_jax.rendering import compositing
 from humangs_jax.rendering.splat_config import SplatConfig
-from humangs_jax.rendering.tiling import TileGrid, TileLists, sort_into_tiles
+from humangs_jax.rendering.tiling import TileGrid, TileLists
 
 EXACT = 1e-10
 """In float64, relative to the largest entry.
@@ -53,25 +50,6 @@ def by_hand(seed, lengths, dtype, grid=GRID, opacities=(0.05, 1.0)):
         *(jnp.asarray(a, jnp.int32) for a in (items, np.cumsum(counts) - counts, counts))
     )
     return jnp.asarray(splats, dtype), lists
-
-
-@functools.partial(jax.jit, static_argnums=(1, 2))
-def from_scene(gaussians, grid, config):
-    """Splats and lists as the renderer makes them."""
-    g, dtype = gaussians.means.shape[0], gaussians.means.dtype
-    projected = project_gaussians(gaussians, camera(dtype, grid.width, grid.height), config)
-    order = tiling.depth_order(jnp.where(projected.visible, projected.depths, jnp.inf))
-    ellipses = jax.tree.map(
-        lambda plane: plane[order], tiling.footprints_by(projected, gaussians.opacities, config)
-    )
-    pairs = tiling.emit_pairs(ellipses, grid, g * grid.tiles, g * grid.tiles)
-    features = jnp.concatenate(
-        [gaussians.colors, jnp.where(projected.visible, projected.depths, 0.0)[:, None]], axis=-1
-    )
-    splats = compositing.pack_splats(projected, gaussians.opacities, features, config.alpha_min)[
-        order
-    ]
-    return splats, sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, g)
 
 
 def cotangents(grid, dtype):
@@ -173,20 +151,6 @@ def test_equals_the_other_schedule(dtype, tile_size, per_step):
             K < ended[1] < 3 * K and ended[1] % K != 0
         )  # the whole tile ends inside a chunk that is not its first
         assert not ours[0][0].any() and (ours[1][0] == 1).all()  # the empty list
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("dtype", "seed"), [(np.float64, 0), (np.float32, 1), (np.float32, 2)])
-def test_equals_the_other_schedule_on_scenes(dtype, seed):
-    with jax.enable_x64(dtype == np.float64):
-        config = SplatConfig(tile_size=8, block=4, chunk=4)
-        splats, lists = from_scene(random_gaussians(seed, dtype, 6 * K), GRID, config)
-        assert lists.counts.max() > 2 * K
-        if dtype == np.float32:
-            assert_equal_in_float32(splats, lists, GRID, None, PER_STEP)
-        else:
-            ours, expected = run(FAT, splats, lists, GRID, None, PER_STEP), run(THIN, splats, lists)
-            assert_equal(ours, expected, lists.counts)
 
 
 @pytest.mark.slow

@@ -182,16 +182,6 @@ def test_faces_smaller_than_pixels_equal_rays():
     check_against_rays(draw(vertices, faces, camera, RasterConfig()), vertices, faces, camera)
 
 
-def test_strong_perspective_equals_rays():
-    """A floor from under the camera to far away: weights linear in the image would be wrong by more
-    than half.
-    """
-    vertices = np.array([[-40, 1, 0.3], [40, 1, 0.3], [-40, 1, 60], [40, 1, 60]], np.float32)
-    faces = np.array([[0, 1, 2], [1, 3, 2]])
-    camera = Camera.from_opencv([[20, 0, 16.2], [0, 20, 4.3], [0, 0, 1]], np.eye(4), WIDTH, HEIGHT)
-    check_against_rays(draw(vertices, faces, camera), vertices, faces, camera)
-
-
 @pytest.mark.slow
 def test_float64():
     with jax.enable_x64(True):
@@ -247,19 +237,6 @@ def test_sheet_has_no_holes(seed, jitter, spacing):
     faces[::2] = faces[::2, ::-1]  # neither winding nor the first corner may matter
     fragments = draw(vertices, faces, flat_camera(), RasterConfig())
     assert (np.asarray(fragments.face_ids) >= 0).all()
-
-
-def test_fans_of_slivers_have_no_holes():
-    """Two hundred thin faces around a vertex at, or next to, a pixel centre."""
-    around = np.linspace(0, 2 * np.pi, 200, endpoint=False)
-    i = np.arange(200)
-    faces = np.stack([np.full(200, 200), i, (i + 1) % 200], -1)
-    for center in ([16.5, 10.5], [16.5 + 1e-6, 10.5 - 2e-6], [16.4999, 10.50003], [16.0, 10.0]):
-        rim = np.array([16.5, 10.5]) + 60 * np.stack([np.cos(around), np.sin(around)], -1)
-        points = np.concatenate([rim, [center]])
-        vertices = np.concatenate([points, np.ones((201, 1))], -1).astype(np.float32)
-        fragments = draw(vertices, faces, flat_camera(), RasterConfig())
-        assert (np.asarray(fragments.face_ids) >= 0).all()
 
 
 # ---------------------------------------------------------------------------------------------
@@ -352,13 +329,6 @@ def test_faces_without_area_cover_nothing():
     )
     ids = np.asarray(draw(vertices, np.arange(120).reshape(40, 3), flat_camera()).face_ids)
     assert (ids == -1).all()
-
-
-def test_huge_faces_cover_everything():
-    vertices = np.float32([[-1e5, -1e5, 1], [3e5, -1e5, 1], [-1e5, 3e5, 1]])
-    fragments = draw(vertices, np.array([[0, 1, 2]]), flat_camera())
-    assert (np.asarray(fragments.face_ids) == 0).all()
-    np.testing.assert_allclose(fragments.depth, 1, rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -9,18 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.training import random_networks, settings, written_subject
-from humangs_jax.body.library import load_body
-from humangs_jax.core.pytree import replace
-from humangs_jax.data.loading import CaptureCache, CaptureSource
-from humangs_jax.data.views import gaussian_body
+from experiments.training import random_networks
 from humangs_jax.losses.losses import FAR_SURFACE, loss_terms
-from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Drawn
 from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.training.config import LossConfig, TrainConfig
-from humangs_jax.training.forward import draw_targets, reconstruct_example, white_backgrounds
-from humangs_jax.training.step import subject_loss
 
 OWN = 1e-7
 """Central differences of step h: h^2 of truncation and 1e-16 / h of rounding; terms with corners
@@ -108,44 +101,6 @@ def own_case(names, side=SIDE):
     return values, point
 
 
-def network_case(names, folder):
-    """(values, point) of the smallest network's training step. The point is its parameters."""
-    config = settings("tiny", SIDE, 2, TARGETS)
-    model = config.model.with_conventions(body_vertices=VERTICES).with_runtime(token_capacity=0)
-    config = dataclasses.replace(config, model=model, loss=loss_of(names))
-    networks, key, body = random_networks(config), jax.random.key(0), load_body()
-    person = written_subject(folder, config, body)
-    example = CaptureSource(CaptureCache([person], body), config.views, SIDE, SIDE).example(0, 0, 2)
-    rng = np.random.default_rng(2)
-
-    def wide(tree):
-        cast = lambda x: x.astype(np.float64) if np.issubdtype(x.dtype, np.floating) else x
-        return jax.tree.map(lambda x: jnp.asarray(cast(np.asarray(x))), tree)
-
-    variables = wide(init_humangs(key, model))
-    body, example = wide(gaussian_body(body, model)), wide(example)
-    batch_stats = variables["batch_stats"]
-    # a fresh network has zeros, to which nothing upstream of them has a derivative
-    point = jax.tree.map(lambda x: x + 0.05 * rng.normal(size=x.shape), variables["params"])
-
-    @jax.jit
-    def depths(point):
-        variables, targets = {"params": point, "batch_stats": batch_stats}, example.targets
-        outputs, _ = reconstruct_example(variables, body, example.inputs, config, True)
-        given = body, example.inputs, targets, white_backgrounds(targets), config
-        return draw_targets(variables, outputs, *given).rendering.depth
-
-    depth = depths(point)
-    surface = depth + FAR_SURFACE * rng.uniform(-1.5, 1.5, depth.shape)
-    example = replace(example, targets=replace(example.targets, depths=surface))
-
-    def values(point):
-        _, (_, terms) = subject_loss(point, batch_stats, body, example, key, config, networks)
-        return terms
-
-    return values, point
-
-
 @pytest.mark.slow
 def test_terms_on_their_own_inputs():
     with jax.enable_x64(True):
@@ -160,13 +115,3 @@ def test_terms_with_networks_of_their_own():
             *own_case(list(NETWORKS)), list(NETWORKS), directions=1, steps=(1e-6, 1e-8)
         )
     assert set(errors) == set(NETWORKS) and all(error < WHOLE for error in errors.values()), errors
-
-
-@pytest.mark.slow
-def test_terms_of_the_whole_network(tmp_path):
-    """Without those that need another network: minutes of convolutions in float64."""
-    with jax.enable_x64(True):
-        errors = agreement(
-            *network_case(PLAIN, tmp_path), PLAIN, directions=1, steps=(1e-6, 1e-8, 1e-9)
-        )
-    assert set(errors) == set(PLAIN) and all(error < WHOLE for error in errors.values()), errors
