@@ -54,14 +54,14 @@ from humangs_jax.io.atomic import (
 from humangs_jax.io.decoded import decoded_once, forget_decoded
 from humangs_jax.io.reading import read_json
 from humangs_jax.network.weights import load_weights
-from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.config import ITERATIONS_ALONE, RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
 from humangs_jax.viewer.page import write_page
 
-ITERATIONS_ALONE = RefineConfig(steps=0, seconds=None, image_size=512)
-"""Refinement where nothing is asked for: some seconds, however large the photos."""
 IGNORE = "ignore"
 """As `cameras`: the calibration in the folder of photos is not used."""
+BEGIN_ANEW = "--overwrite (in Python overwrite=True) begins anew"
+"""What to do about a body of an earlier run."""
 
 
 class MissingError(ValueError):
@@ -269,7 +269,7 @@ class FromPhotos:
         for name, value in self._decisive().items():
             if name in earlier and earlier[name] != value:
                 how = "without it" if earlier[name] is None else f"with {earlier[name]}"
-                problem = f": the body in {self.out} was made {how}: --overwrite begins anew"
+                problem = f": the body in {self.out} was made {how}: {BEGIN_ANEW}"
                 raise ArgumentError(name, problem)
 
     def _go_on(self, material: PhotoFolder) -> Iterator[Step]:
@@ -279,14 +279,14 @@ class FromPhotos:
             self._check_same_options(read_json(self.out / START_MARK))
             with stage("reading the fit of an earlier run"):
                 capture = with_hidden_parts(load_capture(self.out, fit_masks=self.fit_masks))
-            yield Step(f"{self.out} has a body: going on from there (--overwrite begins anew)")
+            yield Step(f"{self.out} has a body: going on from there ({BEGIN_ANEW})")
             yield from self._finish(capture, None)
             return
         if self.overwrite:
             deleted = contents(self.out)
             if deleted:
-                told = f"once the work is done, {self.out} is replaced; this is deleted: {deleted}"
-                yield Step(f"--overwrite: {told}")
+                replaced = f"once the work is done, {self.out} is replaced"
+                yield Step(f"{replaced}; this is deleted: {deleted}")
         # without cameras the person gives them
         if material.cameras is None and detection.available():
             material = yield from self._photos_alone(material)
@@ -430,8 +430,8 @@ class FromPhotos:
                 also=self.mark(),
             )
         # the folder scan has named these files already
-        told = {each.path for each in material.unused}
-        unused = tuple(each for each in report.unused if each.path not in told)
+        named = {each.path for each in material.unused}
+        unused = tuple(each for each in report.unused if each.path not in named)
         yield Step(str(dataclasses.replace(report, unused=unused)))
         # keypoints of the photos before the import do not fit those after it
         images, keypoints = self.out / "images", material.keypoints

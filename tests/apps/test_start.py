@@ -317,8 +317,8 @@ def test_a_body_that_other_options_made_is_not_taken(mine, detected, capsys):
     Path("me/body.npz").touch()
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.8"]) == cli.BAD_USAGE
     assert (
-        "--height: the body in me was made with 1.7: --overwrite begins anew"
-        in capsys.readouterr().err
+        "--height: the body in me was made with 1.7: --overwrite (in Python"
+        " overwrite=True) begins anew" in capsys.readouterr().err
     )
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.7"]) == cli.BAD_DATA
     assert "begins anew" not in capsys.readouterr().err  # it goes on, to a capture without photos
