@@ -15,7 +15,6 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.model import BodyModel
 from humangs_jax.capture.fitting.refine import posed_vertices
-from humangs_jax.cli.options import ITERATIONS_ALONE
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.hidden import with_hidden_parts
@@ -23,7 +22,7 @@ from humangs_jax.data.view_choice import view_quality
 from humangs_jax.data.views import to_network_views
 from humangs_jax.evaluation.cases import predict_views
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.config import ITERATIONS_ALONE
 from humangs_jax.refinement.refine import refine
 from humangs_jax.synthetic.subject import make_subject, pose_subject
 from humangs_jax.synthetic.writer import View, capture_views, sample_pose
@@ -114,7 +113,7 @@ def measured(start: Start, seed: int, kind: str) -> dict[str, dict[str, float]] 
         avatar = refine(
             reconstruct(start.variables, start.config, photos),
             photos,
-            dataclasses.replace(RefineConfig(**ITERATIONS_ALONE), head_steps=0),
+            dataclasses.replace(ITERATIONS_ALONE, head_steps=0),
         )
         known = np.zeros_like(covered) if photos.unknown is None else photos.unknown
         result[state] = {

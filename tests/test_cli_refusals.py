@@ -115,7 +115,8 @@ BAD_USAGE = {
     "demo --size 0": "--size 0: expected 16 to 8,192",
     "synth --size 100000": "--size 100000: expected 128, 256 or 512",
     "refine me.npz me --image-size 0": "--image-size 0: expected 16 to 8,192",
-    "refine nobody.npz someone --limit 0s": "--limit '0s': expected how long",
+    "refine nobody.npz someone --refine 0s": "--refine '0s': expected how long",
+    "refine nobody.npz someone --limit 15s": "--limit: is called --refine now",
     "refine me.npz someone --out me.npz": "--out me.npz: is read by this command",
     "animate me.npz --azimuth nan": "--azimuth nan: expected -36,000 to 36,000",
     "animate me.npz --background blu": "--background 'blu': expected a color",
@@ -232,7 +233,8 @@ BAD_USAGE = {
     ),
     "fit someone": "body.npz exists: --overwrite replaces it",
     FIT: "body.npz exists: --overwrite replaces it",
-    "fit someone --bare": "--tight-clothes is for --refine, not for --keypoints",
+    "fit someone --refine --bare": "--bare: is called --tight-clothes now",
+    "fit someone --tight-clothes": "--tight-clothes is for --refine, not for --keypoints",
     "fit someone --refine --smoothness 0.1": "--smoothness is for --keypoints, not for --refine",
     f"{FIT} --smoothness -1 --out new": "--smoothness -1: expected at least 0",
 }
@@ -280,7 +282,7 @@ def test_the_folder_of_results_is_made(line, things, tmp_path, monkeypatch, huma
 def places(command):
     """The options of a command that say where a file goes, with a suffix that it may have."""
     hints = get_type_hints(command, include_extras=True)
-    found = {name: marks_in(hint, options.Place) for name, hint in hints.items()}
+    found = {name: marks_in(hint, options.OutputPath) for name, hint in hints.items()}
     return {
         name: place.suffixes[0]
         for name, marks in found.items()

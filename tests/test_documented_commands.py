@@ -98,7 +98,7 @@ QUICK = (
 SLOW = (
     "check me --out check.png",
     "reconstruct CAPTURE --out avatar.npz",
-    "refine avatar.npz CAPTURE --limit 15s --out sharp.npz",
+    "refine avatar.npz CAPTURE --refine 15s --out sharp.npz",
     "export avatar.npz --out person.glb --mesh --motion dance.bvh",
     "export avatar.npz --out person.obj",
     "render avatar.npz --out views --views 8 --exr --channels rgba,z,position,normal,part",

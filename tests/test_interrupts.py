@@ -169,7 +169,7 @@ def test_an_interrupt_during_an_import_waits_for_it(tmp_path):
 
 WORKS = {
     "new.npz": ("reconstruct", "me"),
-    "refined.npz": ("refine", "me.npz", "me", "--limit", "3steps", "--image-size", "64"),
+    "refined.npz": ("refine", "me.npz", "me", "--refine", "3steps", "--image-size", "64"),
     "views": ("render", "me.npz", "--views", "3", "--size", "64", "--exr"),
     "demo": ("demo", "--size", "32", "--refine", "0"),
     "people": (

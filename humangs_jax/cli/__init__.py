@@ -154,8 +154,8 @@ def _prepare(verbose: bool) -> None:
     enable_compile_cache()
 
 
-RENAMED = {"fit": {"--bare": "--tight-clothes"}}
-"""Options of commands by the names that they had, which are still taken."""
+RENAMED = {"fit": {"--bare": "--tight-clothes"}, "refine": {"--limit": "--refine"}}
+"""Options of commands by the names that they had: an error says what they are called now."""
 
 
 def _parsed(arguments: list[str]) -> Command:
@@ -174,7 +174,6 @@ def _parsed(arguments: list[str]) -> Command:
     from humangs_jax.cli.parsing import parsed
 
     name, *options = arguments
-    options = [RENAMED.get(name, {}).get(word, word) for word in options]
     if name == "--tyro-print-completion" or name == "--tyro-write-completion":
         import tyro
 
@@ -192,6 +191,9 @@ def _parsed(arguments: list[str]) -> Command:
     known = option_names(command) | {"--help"}
     for word in options:
         option = word.split("=")[0].replace("_", "-")
+        renamed = RENAMED.get(name, {}).get(option)
+        if renamed is not None:
+            raise UsageError(f"{option}: is called {renamed} now")
         if option.startswith("--") and option not in known:
             near = difflib.get_close_matches(option, known, n=1)
             hint = f": did you mean {near[0]}?" if near else ""

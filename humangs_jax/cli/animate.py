@@ -12,8 +12,8 @@ from humangs_jax.avatar.export import EXPORTS, OTHERS, READ_ONLY, VIDEOS
 from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.cli.options import (
     WHOLE,
+    OutputPath,
     PartOfMotion,
-    Place,
     Preset,
     UsageError,
     chosen_settings,
@@ -25,8 +25,6 @@ from humangs_jax.core.configuration import LARGEST, Range, at_least
 from humangs_jax.core.registry import FOLDER, alternatives
 from humangs_jax.data.formats import CAMERAS, MOTIONS
 
-TURN_SECONDS = 4.0
-"""A turntable as a video turns once in this time."""
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.body.model import BodyPose
@@ -37,13 +35,10 @@ RATE = Range(0.01, 1000.0)
 """Range of frames per second."""
 FINITE = at_least(-LARGEST)
 """Range of any number."""
-VIDEO = Place(VIDEOS.suffixes, folder=True)
-_SUFFIXES = alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).suffixes)
-MOTION_OR_VIDEO = (
-    f"{MOTIONS.listed()}; or a video, whose motion is kept beside it as NAME.motion.npz. Default:"
-    " the shipped walk."
-)
+VIDEO = OutputPath(VIDEOS.suffixes, folder=True)
+"""Where images or a video go."""
 FROM_THE_SIDE = FrameSettings(azimuth=20.0)
+"""What `humangs animate` shows by default."""
 SPLATS = {
     suffix: each
     for each in (*EXPORTS.values(), *READ_ONLY.values())
@@ -51,14 +46,6 @@ SPLATS = {
     for suffix in each.suffixes
 }
 """Files of Gaussians, and the axis that points up in them."""
-OF_A_FILE = (
-    "Cameras of a file: of Gaussians in its world, of an avatar around a person who stands on the"
-    " floor."
-)
-PATH = (
-    "Cameras of a file instead: one stands still, several are a path over the whole motion, around"
-    " a person on the floor."
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,14 +62,30 @@ class Animate:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[FrameSettings] = FROM_THE_SIDE
-    motion: Annotated[Path | None, arg(help=MOTION_OR_VIDEO)] = None
+    motion: Annotated[
+        Path | None,
+        arg(
+            help=(
+                f"{MOTIONS.listed()}; or a video, whose motion is kept beside it as"
+                " NAME.motion.npz. Default: the shipped walk."
+            )
+        ),
+    ] = None
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
     out: Annotated[Path, VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path(
         "animation.mp4"
     )
     turn: Annotated[float, FINITE] = 0.0
     """Degrees that the camera travels around the avatar during the motion."""
-    camera: Annotated[Path | None, arg(help=f"{PATH} {CAMERAS.listed()}")] = None
+    camera: Annotated[
+        Path | None,
+        arg(
+            help=(
+                "Cameras of a file instead: one stands still, several are a path over the whole"
+                f" motion, around a person on the floor. {CAMERAS.listed()}"
+            )
+        ),
+    ] = None
     follow: Annotated[
         bool,
         off("follow the person: the camera stands still and sees everywhere that the person goes"),
@@ -103,8 +106,8 @@ class Animate:
 
     def run(self) -> None:
         if self.camera is not None:
-            said = ["turn"] * (self.turn != 0) + ["no-follow"] * (not self.follow)
-            _require_no_circle("--camera", self.shot, FROM_THE_SIDE, said)
+            given = ["turn"] * (self.turn != 0) + ["no-follow"] * (not self.follow)
+            _require_no_circle("--camera", self.shot, FROM_THE_SIDE, given)
         # an output that cannot be written is refused before anything is read
         with stage("starting"):
             from humangs_jax.avatar.attach_face import with_face_for
@@ -157,8 +160,8 @@ class Animate:
 
         if self.motion is None or not is_video(self.motion):
             return self.part.load(self.motion, avatar.rest_joints)
-        for name, value in vars(self.part).items():
-            if value is not None and name != "person":
+        for name in self.part.given():
+            if name != "person":
                 raise UsageError(f"{option_of(name)}: is for files of motions, not for a video")
         import numpy as np
 
@@ -182,11 +185,24 @@ class Render:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`; or Gaussians: .ply, .splat, .spz or .glb."""
     shot: OmitArgPrefixes[FrameSettings]
-    camera: Annotated[Path | None, arg(help=f"{OF_A_FILE} {CAMERAS.listed()}")] = None
+    camera: Annotated[
+        Path | None,
+        arg(
+            help=(
+                "Cameras of a file: of Gaussians in its world, of an avatar around a person who"
+                f" stands on the floor. {CAMERAS.listed()}"
+            )
+        ),
+    ] = None
     out: Annotated[
         Path,
         VIDEO,
-        arg(help=f"Folder for view_000.png and so on, or a video of a turn: {_SUFFIXES}"),
+        arg(
+            help=(
+                "Folder for view_000.png and so on, or a video of a turn:"
+                f" {alternatives(VIDEOS.where(lambda each: each.suffixes != (FOLDER,)).suffixes)}"
+            )
+        ),
     ] = Path("views")
     pose: Literal["t", "a"] = "t"
     """T-pose, or A-pose with the arms down (circle only)."""
@@ -214,7 +230,7 @@ class Render:
         if views is None:
             views = 8
             if video:
-                views = max(2, round(TURN_SECONDS * self.fps))
+                views = max(2, round(4.0 * self.fps))  # a turn of 4 seconds
         if video and self.exr:
             raise UsageError(f"--exr: {self.out} is a video: expected a folder")
         self._require_one_kind_of_cameras()
@@ -287,15 +303,15 @@ class Render:
 
     def _render_gaussians(self, views: int) -> None:
         # options that need a skeleton do not apply
-        said = {
+        given = {
             "pose": self.pose != "t",
             "capture": self.capture,
             "exr": self.exr,
             "prune": self.shot.prune,
         }
-        wrong = [name for name, given in said.items() if given]
-        if wrong:
-            raise UsageError(f"--{wrong[0]}: {self.avatar} is no avatar, which this needs")
+        for option, value in given.items():
+            if value:
+                raise UsageError(f"--{option}: {self.avatar} is no avatar, which this needs")
         if self.camera is not None and self.out.suffix:
             raise UsageError("--camera: expected a folder as --out")
         with stage("starting"):
@@ -333,21 +349,21 @@ class Render:
 
         Raises: UsageError naming the first option.
         """
-        said = ["views"] * (self.views is not None)
+        given = ["views"] * (self.views is not None)
         if self.capture is not None:
-            said += ["camera"] * (self.camera is not None) + ["pose"] * (self.pose != "t")
-            said += [
+            given += ["camera"] * (self.camera is not None) + ["pose"] * (self.pose != "t")
+            given += [
                 name
                 for name in ("size", "width", "height")
                 if getattr(self.shot, name) != getattr(FrameSettings(), name)
             ]
-            _require_no_circle("--capture", self.shot, FrameSettings(), said)
+            _require_no_circle("--capture", self.shot, FrameSettings(), given)
             if self.out.suffix:
                 raise UsageError(
                     f"--out {self.out}: expected a folder: the views of a capture are no video"
                 )
         elif self.camera is not None:
-            _require_no_circle("--camera", self.shot, FrameSettings(), said)
+            _require_no_circle("--camera", self.shot, FrameSettings(), given)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -405,22 +421,17 @@ def _pruned(
     return seen
 
 
-ON_A_CIRCLE = ("azimuth", "elevation", "distance", "fov")
-"""Fields of a shot that say where cameras on a circle stand."""
-
-
-def _require_no_circle(
-    option: str, shot: FrameSettings, usual: FrameSettings, said: list[str]
-) -> None:
-    """Refuse options of a circle of cameras beside an option that brings cameras. said: names of
-    further options that are given.
+def _require_no_circle(option: str, shot: FrameSettings, usual: FrameSettings, given: list[str]) -> None:
+    """Refuse options of a circle of cameras beside an option that brings cameras. given: names of
+    further options that do not go with it.
 
     Raises: UsageError naming the first.
     """
-    said = [name for name in ON_A_CIRCLE if getattr(shot, name) != getattr(usual, name)] + said
-    if said:
+    where = ("azimuth", "elevation", "distance", "fov")
+    refused = [name for name in where if getattr(shot, name) != getattr(usual, name)] + given
+    if refused:
         own = "cameras and poses" if option == "--capture" else "cameras"
-        raise UsageError(f"--{said[0]}: not with {option}, which has the {own}")
+        raise UsageError(f"--{refused[0]}: not with {option}, which has the {own}")
 
 
 def _counted(count: int, word: str) -> str:

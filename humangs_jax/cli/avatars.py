@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.avatar.export import EXPORTS, ExportFormat, Up, chosen_format, files_beside
+from humangs_jax.avatar.export import EXPORTS, Up, chosen_format, files_beside
 from humangs_jax.cli.options import (
     AVATAR,
     WHOLE,
+    OutputPath,
     PartOfMotion,
-    Place,
     Preset,
     Side,
     UsageError,
@@ -37,10 +37,8 @@ if TYPE_CHECKING:
     from humangs_jax.data.prepared import PreparedCapture
 
 
-_USUAL_UP = (
-    f"-y for {alternatives(EXPORTS.where(lambda each: each.up == '-y').suffixes)}, as their viewers"
-    " expect, else y."
-)
+_DOWN = alternatives(EXPORTS.where(lambda each: each.up == "-y").suffixes)
+"""Suffixes of files in which y points down."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +52,7 @@ class Demo:
         "humangs demo --out demo_out",
         "humangs demo --refine 0 --preset realtime",
     )
-    out: Annotated[Path, Place()] = Path("demo_out")
+    out: Annotated[Path, OutputPath()] = Path("demo_out")
     """Folder for the images, the video, the avatar and report.json."""
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
@@ -71,15 +69,11 @@ class Demo:
     """
 
     def run(self) -> None:
-        limits = first_refinement("15s" if self.refine is None else self.refine)
+        refine = first_refinement("15s" if self.refine is None else self.refine)
         with stage("starting"):
             from humangs_jax.apps.demo import run_demo, summary
-            from humangs_jax.refinement.config import RefineConfig
 
         settings = chosen_settings(self.preset, None)
-        refine = None
-        if limits is not None:
-            refine = RefineConfig(**limits)
         if settings is not None and self.refine is None:
             refine = settings.refinement
         report = run_demo(self.out, self.weights, self.size, refine, settings)
@@ -147,7 +141,7 @@ class Reconstruct:
     """Check first whether photos, cameras and poses belong together."""
 
     def run(self) -> None:
-        limits = first_refinement(self.refine)
+        how = first_refinement(self.refine)
         part, parts = shard_of(self.shard)
         if not self.captures:
             raise UsageError("CAPTURES: expected at least one folder with capture.json")
@@ -160,18 +154,14 @@ class Reconstruct:
             raise UsageError(
                 f"--shard {self.shard}: expected several captures, or a folder of them"
             )
-        require_place(out, "--out", Place() if several else AVATAR)
+        require_place(out, "--out", OutputPath() if several else AVATAR)
         with stage("starting"):
             from humangs_jax.avatar.reconstruct import BATCH, reconstruct_batch
             from humangs_jax.avatar.unseen import guess_line
             from humangs_jax.data.capture import capture_checksum
             from humangs_jax.network.weights import load_weights
-            from humangs_jax.refinement.config import RefineConfig
 
             settings = chosen_settings(self.preset, self.config)
-        how = None
-        if limits is not None:
-            how = RefineConfig(**limits)
         if self.refine is None and settings is not None:
             how = settings.refinement
         if several:
@@ -204,9 +194,9 @@ class Reconstruct:
             variables, config = load_weights(self.weights)
         if settings is not None:
             config = settings.network(config)
-        said = {"tokens": self.tokens, "dtype": self.dtype}
+        runtime = {"tokens": self.tokens, "dtype": self.dtype}
         config = config.with_runtime(
-            **{name: value for name, value in said.items() if value != "as_trained"}
+            **{name: value for name, value in runtime.items() if value != "as_trained"}
         )
         failed = []
         with stage("reconstructing"):
@@ -249,15 +239,15 @@ class Reconstruct:
         from humangs_jax.network.weights import shipped_checksum
 
         apart = ("captures", "out", "batch", "shard", "check")
-        said = {name: str(value) for name, value in vars(self).items() if name not in apart}
-        said["version"] = __version__
+        made_with = {name: str(value) for name, value in vars(self).items() if name not in apart}
+        made_with["version"] = __version__
         if self.weights is None:
-            said["weights"] += f" ({shipped_checksum()[:SHORT]})"
+            made_with["weights"] += f" ({shipped_checksum()[:SHORT]})"
         for name in ("weights", "config"):  # other contents under the same name are other settings
             file = getattr(self, name)
             if file is not None and file.is_file():
-                said[name] += f" ({file_checksum(file)[:SHORT]})"
-        begin_set(out, AVATARS, {SETTINGS: said})
+                made_with[name] += f" ({file_checksum(file)[:SHORT]})"
+        begin_set(out, AVATARS, {SETTINGS: made_with})
 
     def _photos(self, folder: Path, views: int | str | None) -> "PreparedCapture":
         """The views of a capture that are used.
@@ -281,8 +271,8 @@ class Refine:
     """
 
     examples: ClassVar[tuple[str, ...]] = (
-        "humangs refine avatar.npz me --limit 15s --out sharp.npz",
-        "humangs refine avatar.npz me --limit 60s",
+        "humangs refine avatar.npz me --refine 15s --out sharp.npz",
+        "humangs refine avatar.npz me --refine 60s",
     )
     avatar: Positional[Path]
     """File written by `humangs reconstruct` from these photos."""
@@ -290,7 +280,7 @@ class Refine:
     """Folder with capture.json: may have more or larger photos than the network saw."""
     out: Annotated[Path, AVATAR] = Path("refined.npz")
     """The avatar file to write or replace."""
-    limit: str = "15s"
+    refine: str = "15s"
     """How long after compiling: 15s (or 15), 100steps, or 0steps for the iterations alone."""
     iterations: Annotated[int, Range(0, 16)] = ITERATIONS
     """Learned-optimizer iterations before the steps."""
@@ -306,12 +296,11 @@ class Refine:
     """Check first whether photos, cameras and poses belong together."""
 
     def run(self) -> None:
-        limits = refine_limits(self.limit, "--limit")
+        limits = refine_limits(self.refine)
         if limits["steps"] == 0 and not self.iterations:
             raise UsageError("--iterations 0: expected 1 to 16, without steps")
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
-            from humangs_jax.refinement.config import RefineConfig
 
             avatar = Avatar.load(self.avatar)
         photos = _read_capture(self.capture, self.check, self.fit_masks)
@@ -461,7 +450,7 @@ class Export:
             )
         ),
     ] = None
-    html: Annotated[Path | None, Place((".html",))] = None
+    html: Annotated[Path | None, OutputPath((".html",))] = None
     """The HTML viewer to write: one file that needs no network (docs: viewer)."""
     mesh: bool = False
     """Write the body, not the Gaussians: a .glb then holds its skin, and --motion as animation."""
@@ -478,7 +467,13 @@ class Export:
     X.ply becomes X_0000.ply, X_0005.ply and so on.
     """
     up: Annotated[
-        Up | None, arg(help=f"The axis that points up in the file. Default: {_USUAL_UP}")
+        Up | None,
+        arg(
+            help=(
+                f"The axis that points up in the file. Default: -y for {_DOWN}, as their viewers"
+                " expect, else y."
+            )
+        ),
     ] = None
     rest: bool = False
     """Add the 45 zero f_rest fields of 3DGS that some importers (Unity) require."""
@@ -486,14 +481,9 @@ class Export:
     """Version of a .spz. Default: 3, which more programs read."""
 
     def run(self) -> None:
-        if self.out is None and self.html is None:
+        out = self.out
+        if out is None and self.html is None:
             out = Path("avatar.ply")
-        else:
-            out = self.out
-        # a mesh goes into fewer formats than Gaussians
-        suffixes = EXPORTS.where(lambda each: each.mesh >= self.mesh).suffixes
-        if out is not None:
-            require_file(out, suffixes, read=(self.avatar, self.motion))
         self._check(out)
         with stage("starting"):
             from humangs_jax.avatar.attach_face import with_face_for
@@ -503,23 +493,13 @@ class Export:
             motion = None
             if self.motion is not None:
                 motion = self.part.load(self.motion, avatar.rest_joints)
-            # a motion with expressions needs an avatar with a face
-            if motion is not None:
+                # a motion with expressions needs an avatar with a face
                 avatar = with_face_for(avatar, motion)
         # the page has the whole motion, whichever frame --out has
         if self.html is not None:
-            with stage("making the page"):
-                from humangs_jax.viewer.page import write_page
-
-                name = None if self.motion is None else self.motion.stem
-                size = write_page(self.html, avatar, motion, self.avatar.stem, name)
-            wrote(
-                self.html,
-                f"{len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a"
-                " browser",
-            )
+            self._write_page(self.html, avatar, motion)
         if out is not None:
-            self._write(out, avatar, motion)
+            self._write_file(out, avatar, motion)
         # suggest the other thing that this motion can be used for
         played = self.part.options(self.motion)
         if self.html is None:
@@ -528,18 +508,25 @@ class Export:
             suggest("humangs animate", self.avatar, *played, "--out video.mp4")
 
     def _check(self, out: Path | None) -> None:
-        """Refuses options that do not go together, before anything is read. Raises: ValueError."""
+        """Refuses options that do not go together, before anything is read. Raises: UsageError."""
+        form = None
+        if out is not None:
+            # a mesh goes into fewer formats than Gaussians
+            suffixes = EXPORTS.where(lambda each: each.mesh >= self.mesh).suffixes
+            require_file(out, suffixes, read=(self.avatar, self.motion))
+            form = chosen_format(out.suffix, self.mesh)
+        # frames are of a motion
         for option, value in (("--frame", self.frame), ("--frames", self.frames)):
             if value is not None and (self.motion is None or out is None):
                 raise UsageError(f"{option} {value}: expected --motion and --out with it")
-        form = self._format(out)
-        if self.frame is not None and (
-            self.frames is not None or (form is not None and form.animated)
-        ):
-            with_it = "a file that holds the whole motion: use --frames"
-            if self.frames is not None:
-                with_it = "--frames"
-            raise UsageError(f"--frame {self.frame}: does not go with {with_it}")
+        if self.frame is not None and self.frames is not None:
+            raise UsageError(f"--frame {self.frame}: does not go with --frames")
+        if self.frame is not None and form is not None and form.animated:
+            raise UsageError(
+                f"--frame {self.frame}: does not go with a file that holds the whole motion: use"
+                " --frames"
+            )
+        # what only some formats have
         if self.rest and form is not None and not form.rest_fields:
             raise UsageError(f"--rest: {out} has no such fields: expected a file of 3DGS")
         if self.spz_version is not None and (form is None or not form.versions):
@@ -547,62 +534,72 @@ class Export:
                 f"--spz-version {self.spz_version}: expected a name of --out that ends in .spz"
             )
 
-    def _format(self, out: Path | None) -> "ExportFormat | None":
-        if out is None:
-            return None
-        return chosen_format(out.suffix, self.mesh)
+    def _write_page(self, path: Path, avatar: "Avatar", motion: "Motion | None") -> None:
+        with stage("making the page"):
+            from humangs_jax.viewer.page import write_page
 
-    def _write(self, out: Path, avatar: "Avatar", motion: "Motion | None") -> None:
+            size = write_page(path, avatar, motion, self.avatar.stem, self._motion_name())
+        count = len(avatar.gaussians.means)
+        wrote(path, f"{count:,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
+
+    def _write_file(self, out: Path, avatar: "Avatar", motion: "Motion | None") -> None:
         from humangs_jax.avatar.export.gaussians import export
-
-        form, numbers = self._format(out), None
-        assert form is not None  # its suffix was checked
-        name = "motion" if self.motion is None else self.motion.stem
-        if motion is not None:
-            motion, numbers = self._frames(motion, form.animated)
-        options = {
-            "mesh": form.mesh,
-            "up": self.up,
-            "rest_fields": self.rest,
-            "version": self.spz_version,
-            "name": name,
-        }
-        with stage("writing"):
-            files = export(out, avatar, motion, None if form.animated else numbers, **options)
-        if form.mesh:
-            what = f"{len(avatar.faces):,} triangles"
-        else:
-            what = f"{len(avatar.gaussians.means):,} Gaussians"
-        poses = ""
-        if motion is not None and form.animated:
-            poses = f", {len(motion.translations)} frames"
-        if len(files) == 1:
-            written = str(out)
-        else:
-            written = f"{files[0]} to {files[-1].name}: {len(files)} files"
-        beside = ""
-        if form.beside:
-            beside = f"; {' and '.join(file.name for file in files_beside(out, form))} belong to it"
-        wrote(written, f"{what}{poses}, feet on 0{beside}")
-
-    def _frames(self, motion: "Motion", animated: bool) -> "tuple[Motion, range | None]":
-        from humangs_jax.avatar.export.gaussians import frame_range
         from humangs_jax.core.pytree import replace
 
-        count = len(motion.translations)
-        if self.frames is None and animated:
-            return motion, None
+        form = chosen_format(out.suffix, self.mesh)
+        assert form is not None  # its suffix was checked
+        numbers = None
+        # the frames of the motion that are written
+        if motion is not None:
+            frames = self._frames(len(motion.translations), form.animated)
+            part = motion.part(slice(frames.start, frames.stop, frames.step))
+            motion = replace(part, fps=motion.fps / frames.step)
+            # many frames of a format of one pose are many files, with numbers in their names
+            if self.frames is not None and not form.animated:
+                numbers = frames
+        with stage("writing"):
+            files = export(
+                out,
+                avatar,
+                motion,
+                numbers,
+                mesh=form.mesh,
+                up=self.up,
+                rest_fields=self.rest,
+                version=self.spz_version,
+                name=self._motion_name() or "motion",
+            )
+        # say what was written
+        what = f"{len(avatar.gaussians.means):,} Gaussians"
+        if form.mesh:
+            what = f"{len(avatar.faces):,} triangles"
+        if motion is not None and form.animated:
+            what += f", {len(motion.translations)} frames"
+        what += ", feet on 0"
+        if form.beside:
+            what += f"; {' and '.join(file.name for file in files_beside(out, form))} belong to it"
+        written = str(out)
+        if len(files) > 1:
+            written = f"{files[0]} to {files[-1].name}: {len(files)} files"
+        wrote(written, what)
+
+    def _motion_name(self) -> str | None:
+        return None if self.motion is None else self.motion.stem
+
+    def _frames(self, count: int, animated: bool) -> range:
+        """Numbers of the frames that are written, of a motion of `count` frames; animated: whether
+        the file holds motions.
+        """
+        from humangs_jax.avatar.export.gaussians import frame_range
+
         if self.frames is not None:
-            numbers = frame_range(self.frames, count)
-        else:
-            frame = self.frame or 0
-            if not 0 <= frame < count:
-                raise UsageError(f"--frame {frame}: {self.motion} has {count} frames, from 0")
-            numbers = range(frame, frame + 1)
-        chosen = slice(numbers.start, numbers.stop, numbers.step)
-        fps = motion.fps / numbers.step
-        motion = replace(motion.part(chosen), fps=fps)
-        return motion, None if self.frames is None else numbers
+            return frame_range(self.frames, count)
+        if animated:
+            return range(count)
+        frame = self.frame or 0
+        if not 0 <= frame < count:
+            raise UsageError(f"--frame {frame}: {self.motion} has {count} frames, from 0")
+        return range(frame, frame + 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -620,7 +617,7 @@ class Tune:
     )
     capture: Positional[Path]
     """Folder with capture.json; "demo_capture" is the shipped one."""
-    out: Annotated[Path, Place((".json",))] = Path("tuned.json")
+    out: Annotated[Path, OutputPath((".json",))] = Path("tuned.json")
     """The settings to write."""
     reconstruct_ms: float | None = None
     """The most that making the avatar may take, with refinement, milliseconds."""

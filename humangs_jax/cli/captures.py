@@ -4,12 +4,12 @@ and of synthetic people.
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from humangs_jax.cli.options import (
-    Place,
+    OutputPath,
     UsageError,
     Workers,
     cores,
@@ -32,37 +32,6 @@ def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
         warn(line)
 
 
-def keypoints_of(views: Any, file: Path | None, person: int | None) -> Any:
-    """The keypoints of the views of a `Photos` or `Capture`, None if there is no file.
-
-    Raises: see `read_keypoints`.
-    """
-    from humangs_jax.capture.keypoints.reading import read_keypoints
-
-    height, width = views.images.shape[1:3]
-    if file is None:
-        return None
-    return read_keypoints(file, views.names, width, height, person=person)
-
-
-def keypoints_wanted() -> tuple[str, ...]:
-    """Gives the options that `humangs fit` needs: none where it finds keypoints itself."""
-    from humangs_jax.capture.detection.people import available
-
-    if available():
-        return ()
-    return (
-        (
-            "--keypoints FILE (or pip install 'humangs_jax[photos]', and they are found in the"
-            " photos)"
-        ),
-    )
-
-
-GIVE_IT = "move it away, or give keypoints that are there by --keypoints FILE"
-"""Where a capture has files of others with the names of what is found."""
-
-
 def found_here(capture: Path, person: int | None) -> Path:
     """The file of keypoints in a capture folder. What it lacks is found in its photos: keypoints,
     and masks if there are none.
@@ -78,7 +47,10 @@ def found_here(capture: Path, person: int | None) -> Path:
     photos = load_photos(folder)
     if not file.exists() or person is not None or photos.masks is None:
         detect.check_found_place(
-            folder, [f"{name}.png" for name in photos.names], GIVE_IT, masks=photos.masks is None
+            folder,
+            [f"{name}.png" for name in photos.names],
+            "move it away, or give keypoints that are there by --keypoints FILE",
+            masks=photos.masks is None,
         )
         people, number = detect.person_in_capture(folder, photos, person=person)
         detect.write_found(folder, people, number, masks=photos.masks is None, to_capture=True)
@@ -102,7 +74,7 @@ class Detect:
     )
     photos: Positional[Path]
     """Folder of the photos, or a capture folder that has no body yet."""
-    out: Annotated[Path, Place()]
+    out: Annotated[Path, OutputPath()]
     """Folder for keypoints.json, masks/ and people.png (the sheet)."""
     person: Annotated[int | None, at_least(0)] = None
     """Which person, by the number on people.png. Default: the one who is largest."""
@@ -185,6 +157,7 @@ class ImportCameras:
         require_replaceable(self.out, self.overwrite, "capture.json", inputs)
         with stage("starting"):
             from humangs_jax.capture.calibration.importing import import_cameras
+            from humangs_jax.capture.detection.people import available
 
         options = {
             name: value for name, value in vars(self).items() if name not in ("what", "max_frames")
@@ -194,11 +167,12 @@ class ImportCameras:
         with stage("importing"):
             report = import_cameras(**options, frames=self.max_frames)
         tell(report)
-        suggest("humangs fit", self.out, *keypoints_wanted())
-
-
-FOR_TRAINING = {"size": 256, "poses": 2, "views": 12, "close_views": 0}
-"""What --for-training stands for."""
+        # without a detector keypoints have to come from a file
+        if available():
+            suggest("humangs fit", self.out)
+        else:
+            install = "pip install 'humangs_jax[photos]', and they are found in the photos"
+            suggest("humangs fit", self.out, f"--keypoints FILE (or {install})")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,7 +197,7 @@ class Synth:
         "humangs synth --subjects 8 --split test --held-out 6 --out test_people",
     )
     extras: OmitArgPrefixes[Extras]
-    out: Annotated[Path, Place()] = Path("synthetic_people")
+    out: Annotated[Path, OutputPath()] = Path("synthetic_people")
     """Folder for one capture folder per subject and manifest.json."""
     subjects: Annotated[int, at_least(1)] = 8
     """Number of people."""
@@ -262,7 +236,9 @@ class Synth:
                 f"--poses {self.poses}: expected at most --motion-frames {self.motion_frames}"
             )
         # --for-training stands for other options, which may not contradict it
-        small = FOR_TRAINING if self.for_training else {}
+        small = {}
+        if self.for_training:
+            small = {"size": 256, "poses": 2, "views": 12, "close_views": 0}
         defaults = {field.name: field.default for field in dataclasses.fields(self)}
         for name, value in small.items():
             if getattr(self, name) not in (value, defaults[name]):

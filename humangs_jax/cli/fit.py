@@ -10,9 +10,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.cli.captures import found_here, keypoints_of, tell_found
+from humangs_jax.cli.captures import found_here, tell_found
 from humangs_jax.cli.options import (
-    Place,
+    OutputPath,
     UsageError,
     require_file,
     require_folder,
@@ -37,8 +37,16 @@ class Detections:
     """
 
     def read(self, views: Any) -> Any:
-        """The keypoints of the views, see `keypoints_of`."""
-        return keypoints_of(views, self.keypoints, self.person)
+        """The keypoints of the views of a `Photos` or `Capture`, None if there is no file.
+
+        Raises: see `read_keypoints`.
+        """
+        from humangs_jax.capture.keypoints.reading import read_keypoints
+
+        if self.keypoints is None:
+            return None
+        height, width = views.images.shape[1:3]
+        return read_keypoints(self.keypoints, views.names, width, height, person=self.person)
 
     def read_or_recorded(self, capture: Path, views: Any) -> tuple[Any, Any]:
         """Reads the keypoints of the views from --keypoints, else from the fit in the capture's
@@ -260,7 +268,7 @@ class Check:
     capture: Positional[Path]
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]
-    out: Annotated[Path, Place((".png",))] = DEFAULT_SHEET
+    out: Annotated[Path, OutputPath((".png",))] = DEFAULT_SHEET
     """The contact sheet to write, .png; that of the keypoints is NAME_fit.png beside it."""
 
     def run(self) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from tyro.conf import Positional, arg
 
-from humangs_jax.cli.options import Place, UsageError
+from humangs_jax.cli.options import OutputPath, UsageError
 from humangs_jax.cli.screen import stage, suggest, wrote
 from humangs_jax.core.configuration import Range, at_least
 
@@ -25,7 +25,7 @@ class MotionOfVideo:
     )
     video: Positional[Path]
     """A video in which the whole person is seen."""
-    out: Annotated[Path, Place((".npz",))]
+    out: Annotated[Path, OutputPath((".npz",))]
     """The motion to write, .npz."""
     person: Annotated[int | None, at_least(0)] = None
     """Number of the person, the largest first, from 0. Default: the largest."""
@@ -37,7 +37,7 @@ class MotionOfVideo:
     """Focal length of the camera on 35-mm film. Default: that of a telephone, 29."""
     check: Annotated[
         Path | None,
-        Place((".mp4", ".webm", ".gif")),
+        OutputPath((".mp4", ".webm", ".gif")),
         arg(help="Also write a video of the body over the input."),
     ] = None
 

@@ -31,18 +31,15 @@ from tyro.conf import Positional, arg
 from humangs_jax.core.configuration import Range, at_least, check_range, marks_in
 from humangs_jax.core.progress import say
 from humangs_jax.core.registry import alternatives
+from humangs_jax.refinement.config import ITERATIONS_ALONE, RefineConfig
 
 if TYPE_CHECKING:
     from humangs_jax.apps.settings import Settings
     from humangs_jax.body.motion import Motion
     from humangs_jax.core.array_types import Array
 
-LARGEST_IMAGE = 8192
-"""Pixels along a side of what is drawn: an image of this size takes a gigabyte while it is drawn.
-"""
-
-
-Side = Annotated[int, Range(16, LARGEST_IMAGE)]
+Side = Annotated[int, Range(16, 8192)]
+"""Pixels along a side of what is drawn: the largest image takes a gigabyte while it is drawn."""
 Workers = Annotated[int | None, at_least(1)]
 Preset = Literal["realtime", "balanced", "quality", "best"]
 """Names of `humangs_jax.PRESETS`."""
@@ -79,25 +76,27 @@ class PartOfMotion:
 
     def options(self, path: Path | None) -> tuple[str | Path, ...]:
         """What another command says to play the same; of a file, or nothing."""
-        said: list[str] = []
-        for name, value in vars(self).items():
-            if value is not None:  # what begins with a dash would be taken for an option
-                text = str(value)
-                if text.startswith("-"):
-                    said.append(f"{option_of(name)}={text}")
-                else:
-                    said += [option_of(name), text]
         if path is None:
             return ()
-        return "--motion", path, *said
+        words: list[str | Path] = ["--motion", path]
+        for name, value in self.given().items():
+            if str(value).startswith("-"):  # would be taken for an option
+                words.append(f"{option_of(name)}={value}")
+            else:
+                words += [option_of(name), str(value)]
+        return tuple(words)
+
+    def given(self) -> dict[str, Any]:
+        """The fields that are not None, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
         """The motion of a file; None: the shipped walk. Raises: MotionError."""
         from humangs_jax.motion import load_motion
 
-        said = [name for name, value in vars(self).items() if value is not None]
-        if path is None and said:
-            raise UsageError(f"{option_of(said[0])}: expected --motion with it")
+        given = self.given()
+        if path is None and given:
+            raise UsageError(f"{option_of(next(iter(given)))}: expected --motion with it")
         up = self.motion_up or "auto"
         return load_motion(
             path,
@@ -113,7 +112,7 @@ WHOLE = PartOfMotion()
 
 
 @dataclasses.dataclass(frozen=True)
-class Place:
+class OutputPath:
     """Annotation of an option that says where results go.
 
     Without suffixes it is a folder, which is made if it does not exist.
@@ -127,7 +126,7 @@ class Place:
     """Whether the file replaces an avatar only."""
 
 
-AVATAR = Place((".npz",), avatar=True)
+AVATAR = OutputPath((".npz",), avatar=True)
 
 
 def off(what: str) -> Any:
@@ -136,9 +135,6 @@ def off(what: str) -> Any:
     `--help` shows this, since that is what can be typed.
     """
     return arg(help=f"Do not {what}.")
-
-
-_VALUES = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
 
 
 @functools.cache
@@ -196,18 +192,29 @@ def fields_of(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any]]:
             yield field, hint
 
 
-def _value_shown(kind: Any) -> str | None:
-    """The metavar of a type; None for one that tyro names."""
+def types_in(kind: Any) -> list[Any]:
+    """The types that a type may be: those of unions, what is annotated, and the items of tuples."""
     if get_origin(kind) is Annotated:
-        return _value_shown(get_args(kind)[0])
-    if get_origin(kind) is Literal:
-        return "{" + ",".join(map(str, get_args(kind))) + "}"
-    if get_origin(kind) in (Union, UnionType):
-        parts = [_value_shown(part) for part in get_args(kind) if part is not type(None)]
-        if None in parts:
+        return types_in(get_args(kind)[0])
+    if get_origin(kind) in (Union, UnionType, tuple):
+        return [part for each in get_args(kind) for part in types_in(each)]
+    return [kind]
+
+
+def _value_shown(kind: Any) -> str | None:
+    """How --help shows the values of a type, without `None`; None: as tyro does."""
+    if get_origin(kind) is tuple:
+        return None
+    names = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
+    shown = []
+    for part in types_in(kind):
+        if get_origin(part) is Literal:
+            shown.append("{" + ",".join(map(str, get_args(part))) + "}")
+        elif part in names:
+            shown.append(names[part])
+        elif part is not type(None):
             return None
-        return "|".join(part for part in parts if part)
-    return _VALUES.get(kind)
+    return "|".join(shown)
 
 
 def check_options(command: Any) -> None:
@@ -220,7 +227,7 @@ def check_options(command: Any) -> None:
         for name, hint in get_type_hints(cls, include_extras=True).items()
         if hasattr(command, name)
     }
-    places = {name: place for name, hint in hints.items() for place in marks_in(hint, Place)}
+    places = {name: place for name, hint in hints.items() for place in marks_in(hint, OutputPath)}
     read = [getattr(command, name) for name in hints if name not in places]
     for name in hints:
         value = getattr(command, name)
@@ -239,7 +246,7 @@ def check_options(command: Any) -> None:
             )
 
 
-def require_place(path: Path, option: str, place: Place, read: Iterable[Path] = ()) -> None:
+def require_place(path: Path, option: str, place: OutputPath, read: Iterable[Path] = ()) -> None:
     """Checks that results of a kind can be written to a path. read: what the command reads.
 
     Raises: UsageError.
@@ -334,35 +341,31 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
         say(f"--overwrite: once the work is done, {folder} is replaced; this is deleted: {found}")
 
 
-ITERATIONS_ALONE: dict[str, Any] = {"steps": 0, "seconds": None, "image_size": 512}
-"""Refinement where nothing is asked for: some seconds, however large the photos."""
-
-
-def refine_limits(text: str, option: str) -> dict[str, Any]:
-    """Fields of `RefineConfig` for "15s", "15" (seconds), "100steps", or "0steps" (iterations
-    only). Raises: UsageError.
+def refine_limits(text: str) -> dict[str, Any]:
+    """Fields of `RefineConfig` for --refine "15s", "15" (seconds), "100steps", or "0steps"
+    (iterations only). Raises: UsageError.
     """
     match = re.fullmatch(r"(?P<number>\d+(\.\d*)?)(?P<unit>s|steps)?", text.strip())
     number = float(match["number"]) if match else 0.0
     in_steps = match is not None and match["unit"] == "steps"
     if not (number > 0 or in_steps) or (in_steps and number != int(number)):
         raise UsageError(
-            f'{option} {text!r}: expected how long to refine, as in "15s" or "100steps"'
+            f'--refine {text!r}: expected how long to refine, as in "15s" or "100steps"'
         )
     if in_steps:
         return {"steps": int(number), "seconds": None}
     return {"steps": None, "seconds": number}
 
 
-def first_refinement(text: str | None) -> dict[str, Any] | None:
-    """Fields of `RefineConfig` for --refine of a new avatar: `refine_limits`, "0" for None, by
-    default `ITERATIONS_ALONE`.
+def first_refinement(text: str | None) -> RefineConfig | None:
+    """How a new avatar is refined after --refine: as `refine_limits`, None for "0", and by default
+    by iterations alone.
     """
     if text is None:
         return ITERATIONS_ALONE
     if text == "0":
         return None
-    return refine_limits(text, "--refine")
+    return RefineConfig(**refine_limits(text))
 
 
 def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings | None":

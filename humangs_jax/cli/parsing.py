@@ -10,16 +10,9 @@ import os
 import re
 import shlex
 from collections.abc import Generator, Sequence
-from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
-from humangs_jax.cli.options import UsageError, fields_of, option_of
-
-NUMBERS = {int: "a whole number", float: "a number"}
-WIDE = "10000"
-"""Columns of the screen while tyro parses: its messages are not broken into lines."""
-FRAMES = re.compile("[\u2500-\u257f]+|-{3,}")
-"""What boxes are drawn with, or rules where the terminal knows ASCII only."""
+from humangs_jax.cli.options import UsageError, fields_of, option_of, types_in
 
 
 def parsed(command: type[Any], name: str, words: Sequence[str]) -> Any:
@@ -30,29 +23,32 @@ def parsed(command: type[Any], name: str, words: Sequence[str]) -> Any:
     import tyro
 
     asked_for_help = "--help" in words or "-h" in words
-    said = io.StringIO()
+    printed = io.StringIO()
     try:
         screen = contextlib.nullcontext() if asked_for_help else _wide_screen()
-        with contextlib.redirect_stderr(said), screen:
+        with contextlib.redirect_stderr(printed), screen:
             return tyro.cli(
                 command, prog=f"humangs {name}", args=words, config=(tyro.conf.FlagCreatePairsOff,)
             )
     except SystemExit as end:
         if not end.code:
             raise
-        raise UsageError(_one_line(command, name, words, _inside(said.getvalue()))) from None
+        raise UsageError(_one_line(command, name, words, _inside(printed.getvalue()))) from None
 
 
 def _inside(box: str) -> list[str]:
     """The lines with words, without the box around them; their indents stay."""
-    lines = [FRAMES.sub("", line).rstrip() for line in box.splitlines()]
+    # characters that boxes are drawn with, or rules where the terminal knows ASCII only
+    frame = "[\u2500-\u257f]+|-{3,}"
+    lines = [re.sub(frame, "", line).rstrip() for line in box.splitlines()]
     return [line for line in lines if line]
 
 
 @contextlib.contextmanager
 def _wide_screen() -> Generator[None]:
+    """So many columns while tyro parses that its messages are not broken into lines."""
     before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = WIDE
+    os.environ["COLUMNS"] = "10000"
     try:
         yield
     finally:
@@ -152,7 +148,8 @@ def _shown(option: str) -> str:
 def _expected(command: type[Any], option: str) -> str:
     """What the values of an option may be, in words."""
     kind = _kind(command, option)
-    numbers = [NUMBERS[part] for part in _parts(kind) if part in NUMBERS]
+    names = {int: "a whole number", float: "a number"}
+    numbers = [names[part] for part in types_in(kind) if part in names]
     words = [*numbers, *_choices(kind)]
     if not words:
         return "a value"
@@ -171,17 +168,7 @@ def _kind(command: type[Any], option: str) -> Any:
     return None
 
 
-def _parts(kind: Any) -> list[Any]:
-    """The types that a type may be: those of unions, what is annotated, and the items of tuples."""
-    if get_origin(kind) is Annotated:
-        return _parts(get_args(kind)[0])
-    if get_origin(kind) in (Union, UnionType, tuple):
-        return [part for option in get_args(kind) for part in _parts(option)]
-    return [kind]
-
-
 def _choices(kind: Any) -> list[str]:
     """The words that an option may be, in their order."""
-    return [
-        str(each) for part in _parts(kind) if get_origin(part) is Literal for each in get_args(part)
-    ]
+    literals = [part for part in types_in(kind) if get_origin(part) is Literal]
+    return [str(word) for literal in literals for word in get_args(literal)]

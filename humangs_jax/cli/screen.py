@@ -32,8 +32,6 @@ from humangs_jax.core.progress import stage as stage
 # extensions crash where it comes while they are imported.
 heard = threading.Event()
 """Whether Python has heard of Ctrl-C in this command."""
-AGAIN = 0.02
-"""Seconds after which an interrupt that was dropped, or came at a bad time, is repeated."""
 PATIENCE = 2.0
 """Seconds that Python gets to hear of it and to tidy up; files are written by calls that are
 shorter.
@@ -52,7 +50,8 @@ def end_within_seconds() -> None:
         return  # there, wake-up descriptors are sockets; or somebody else handles it
 
     def again():
-        threading.Timer(AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
+        """Repeat an interrupt that was dropped, or came at a bad time, 20 ms later."""
+        threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT)).start()
 
     def interrupt(number, frame):
         if _importing(frame):
@@ -115,12 +114,6 @@ def _importing(frame: FrameType | None) -> bool:
     return False
 
 
-XLA_LEVELS = {False: "3", True: "0"}
-"""TF_CPP_MIN_LOG_LEVEL without and with --verbose. 3 leaves fatal errors: XLA logs its boxes about
-slow compilation as errors, and real errors of a program arrive as exceptions.
-"""
-
-
 class _Handler(logging.Handler):
     """What libraries log, through the one door."""
 
@@ -135,7 +128,9 @@ def silence(verbose: bool) -> None:
     """Keep what libraries log, and errors in their threads, off the screen of a whole program (not
     of a test). Call it before JAX is imported.
     """
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", XLA_LEVELS[verbose])
+    # 3 leaves fatal errors: XLA logs its boxes about slow compilation as errors, and real errors
+    # of a program arrive as exceptions
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "0" if verbose else "3")
     if not verbose and not sys.warnoptions:
         warnings.simplefilter("ignore")
         os.environ.setdefault("PYTHONWARNINGS", "ignore")  # of processes that this one starts

@@ -85,7 +85,7 @@ class Start:
     """Start again, also where --out already has a body or a finished avatar."""
 
     def run(self) -> None:
-        limits = first_refinement(self.refine)
+        refinement = first_refinement(self.refine)
         if self.refine not in (None, "0") and self.without_masks:
             raise UsageError("--refine needs masks: leave out --without-masks")
         if self.masks is not None and self.without_masks:
@@ -94,13 +94,9 @@ class Start:
         require_replaceable(self.out, True, "capture.json")
         with stage("starting"):
             from humangs_jax.apps.from_photos import MissingError, avatar_from_photos
-            from humangs_jax.refinement.config import RefineConfig
 
         own = ("photos", "out", "refine", "browser")
         options = {name: value for name, value in vars(self).items() if name not in own}
-        refinement = None
-        if limits is not None:
-            refinement = RefineConfig(**limits)
         try:
             for step in avatar_from_photos(self.photos, self.out, refinement=refinement, **options):
                 self._show(step)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from humangs_jax.cli.options import Place, UsageError, Workers, cores, shard_of
+from humangs_jax.cli.options import OutputPath, UsageError, Workers, cores, shard_of
 from humangs_jax.cli.screen import stage, suggest, tell, wrote
 from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import DATASETS
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Kind = str
 else:
     Kind = Literal[tuple(RAW)]
-TENSORS = Place((".safetensors",))
+TENSORS = OutputPath((".safetensors",))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Preprocess:
     folder of several.
     """
     scans: OmitArgPrefixes[ScanViews]
-    out: Annotated[Path, Place()]
+    out: Annotated[Path, OutputPath()]
     """The folder to write: one folder for each scan or subject, lists, and manifest.json."""
     body: Path
     """The model of the fits: SMPLX_NEUTRAL.npz or, for scans of THuman2.0, SMPLX_MALE.npz."""
@@ -174,7 +174,7 @@ class Train:
 
     Default: the body that comes with the package.
     """
-    out: Annotated[Path, Place()] = Path("runs/train")
+    out: Annotated[Path, OutputPath()] = Path("runs/train")
     """Checkpoints, log, TensorBoard curves, validation images and weights.safetensors."""
     config: str = "small"
     """small, paper, published or tiny, or a JSON file of settings like the config.json of a run."""
@@ -339,12 +339,6 @@ class Convert:
         suggest("humangs reconstruct CAPTURE --weights", out)
 
 
-KEPT_SECONDS = 30 * 24 * 3600.0
-"""Time for which the scores of an interrupted evaluation are kept."""
-PAGE_IMAGES = 120
-"""Most images that the page of an evaluation shows."""
-
-
 @dataclasses.dataclass(frozen=True)
 class LpipsFiles:
     """Weights of LPIPS, each a file of the backbone and, if that has none, one of the heads (docs:
@@ -399,21 +393,21 @@ class Evaluate:
     """JSON that says which views are inputs and targets: {"PERSON": {"context": [...], "target":
     [...]}}.
     """
-    json: Annotated[Path | None, Place((".json",))] = None
+    json: Annotated[Path | None, OutputPath((".json",))] = None
     """Write all numbers here."""
-    html: Annotated[Path | None, Place((".html",))] = None
+    html: Annotated[Path | None, OutputPath((".html",))] = None
     """Write a page with inputs, truth, ours and error, worst first."""
-    csv: Annotated[Path | None, Place((".csv",))] = None
+    csv: Annotated[Path | None, OutputPath((".csv",))] = None
     """Write one line an image."""
-    markdown: Annotated[Path | None, Place((".md",))] = None
+    markdown: Annotated[Path | None, OutputPath((".md",))] = None
     """Write a table of people."""
-    latex: Annotated[Path | None, Place((".tex",))] = None
+    latex: Annotated[Path | None, OutputPath((".tex",))] = None
     """Write the same table for LaTeX (package booktabs)."""
 
     def run(self) -> None:
         files = {name: getattr(self, name) for name in ("json", "html", "csv", "markdown", "latex")}
         with stage("starting"):
-            from humangs_jax.evaluation.run import evaluate
+            from humangs_jax.evaluation.run import PAGE_IMAGES, evaluate
             from humangs_jax.losses.loss_networks import load_lpips
 
         # LPIPS of each backbone whose files are given
@@ -470,7 +464,7 @@ class Evaluate:
 
         named = [self.source, self.avatar, self.weights, self.predictions, self.indices, self.body]
         named += [file for files in vars(self.lpips).values() for file in files]
-        said: list[Any] = [__version__, self.protocol, self.inputs, self.html is not None]
+        key: list[Any] = [__version__, self.protocol, self.inputs, self.html is not None]
         for path in named:
             files = []
             if path is not None:
@@ -478,13 +472,14 @@ class Evaluate:
             for file in files:
                 if file.exists():
                     stat = file.stat()
-                    said.append((str(file.resolve()), stat.st_size, stat.st_mtime_ns))
+                    key.append((str(file.resolve()), stat.st_size, stat.st_mtime_ns))
         try:
             root = user_cache() / "humangs_jax" / "evaluations"
-            folder = root / hashlib.sha256(repr(said).encode()).hexdigest()[:16]
+            folder = root / hashlib.sha256(repr(key).encode()).hexdigest()[:16]
             folder.mkdir(parents=True, exist_ok=True)
+            # scores of interrupted evaluations are kept for 30 days
             for other in root.iterdir():
-                if time.time() - other.stat().st_mtime > KEPT_SECONDS:
+                if time.time() - other.stat().st_mtime > 30 * 24 * 3600.0:
                     shutil.rmtree(other, ignore_errors=True)
         except (OSError, RuntimeError):  # RuntimeError: no home
             return None

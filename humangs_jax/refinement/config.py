@@ -127,3 +127,7 @@ class RefineConfig:
             )
         if not self.held_out < 1:
             raise ValueError(f"RefineConfig.held_out {self.held_out:g}: expected less than 1")
+
+
+ITERATIONS_ALONE = RefineConfig(steps=0, seconds=None, image_size=512)
+"""Refinement where nothing is asked for: some seconds, however large the photos."""
