@@ -82,7 +82,7 @@ class Poses(NamedTuple):
     """Other axes that are up in some files of the format, see `rules.up_axis`."""
     frames: np.ndarray | None = None
     """Numbers of the frames, (m,), whose gaps are filled; None: consecutive."""
-    said: str = ""
+    note: str = ""
     """Lines for the user about the file."""
     face: FaceTrack | None = None
     """The face track of the file, None without one."""
@@ -149,13 +149,13 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
         found = read(path, options)
         if isinstance(found, skeleton.Clip):
             rate = skeleton.whole_rate(found.fps)
-            rotations, translations, said = skeleton.retargeted(found, body(), up)
+            rotations, translations, note = skeleton.retargeted(found, body(), up)
         else:
             rate = found.fps
             if up == "auto":
-                axis, said = _up_of(found, body)
+                axis, note = _up_of(found, body)
             else:
-                axis, said = up, ""
+                axis, note = up, ""
             rotations, translations = turned_upright(found.rotations, found.translations, axis)
     if rest_joints is not None and rotations.shape[1] != len(rest_joints):
         raise MotionError(
@@ -193,10 +193,10 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
     )
     if isinstance(found, Poses) and found.frames is not None:
         motion, filled = _without_gaps(motion, found.frames, path)
-        said = "; ".join(filter(None, (said, filled)))
-    said = "; ".join(filter(None, (found.said, said)))
-    if said:
-        logger.warning("%s: %s", path, said)
+        note = "; ".join(filter(None, (note, filled)))
+    note = "; ".join(filter(None, (found.note, note)))
+    if note:
+        logger.warning("%s: %s", path, note)
     return motion
 
 
@@ -278,7 +278,7 @@ def save_motion(path: str | Path, motion: Motion, *, made_from: str | None = Non
 
 
 def made_from_of(path: Path) -> str | None:
-    """What a motion of ours was made from, as `save_motion` was told; None for other files."""
+    """What a motion of ours was made from, as `save_motion` recorded it; None for other files."""
     try:
         arrays, _ = read_npz(path)
     except (ValueError, OSError):

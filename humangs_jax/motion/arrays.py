@@ -77,7 +77,7 @@ def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
         form.fixed,
         form.also,
         frames,
-        "; ".join(file.said),
+        "; ".join(file.notes),
         face,
     )
 
@@ -112,7 +112,7 @@ def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
     except InvalidFileError as error:
         if ours:
             raise
-        file.said.append(f"{key} is left out: {error}")
+        file.notes.append(f"{key} is left out: {error}")
         return None
     return track
 
@@ -198,7 +198,7 @@ def _part(
         if width in (3 * joints, 9 * joints):
             return _axis_angles(file, key, flat, joints)[:, :most]
     if 3 * most == HAND_NUMBERS and 0 < width < HAND_NUMBERS:
-        file.said.append(f"{key}: {NO_HANDS.format(width)}")
+        file.notes.append(f"{key}: {NO_HANDS.format(width)}")
         return np.zeros((count, most, 3))
     shapes = f"({count}, {3 * most})"
     if of_smpl:
@@ -225,7 +225,7 @@ def _all(
     if form.pivot == "origin" and width == 69:  # without the root
         return np.pad(flat, ((0, 0), (3, 0))).reshape(count, -1, 3)[:, :22]
     if form.pivot == "origin" and width in (78, 87):  # with coefficients of hands
-        file.said.append(NO_HANDS.format(6))
+        file.notes.append(NO_HANDS.format(6))
         return np.concatenate([flat[:, :66], flat[:, 78:]], axis=1).reshape(count, -1, 3)
     if width in (75, *COLUMNS, *(3 * number for number in COLUMNS)):
         joints = width // 3 if width in (75, *COLUMNS) else width // 9
@@ -269,13 +269,13 @@ def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float
     """(m, 3) translations; turns roots where cameras or the format's convention ask for it."""
     count, key = len(rotations), file.first(form.moves)
     if key not in file.values and form.stays and key not in file.pickled:
-        file.said.append(NO_PLACES.format(", ".join(form.moves[:3])))
+        file.notes.append(NO_PLACES.format(", ".join(form.moves[:3])))
         return np.zeros((count, 3))
     moves = file.numbers(key, None)
     if (
         moves.size == 4 * count and moves.shape[0] == count
     ):  # a weak perspective: scales, then metres beside the axis
-        file.said.append(f"{key} does not tell how far away people are: they stay at one distance")
+        file.notes.append(f"{key} does not tell how far away people are: they stay at one distance")
         moves = np.concatenate([moves.reshape(count, 4)[:, 2:], np.zeros((count, 1))], axis=1)
     if moves.size != 3 * count or moves.shape[-1] != 3 or (count > 1 and len(moves) != count):
         raise MotionError(file.path, key, f"expected shape ({count}, 3), got {moves.shape}")
@@ -329,7 +329,7 @@ def _cameras(
             (each / "camera.npy" for each in folders if (each / "camera.npy").is_file()), None
         )
         if beside is None:
-            file.said.append("no camera.npy beside it: people move as the camera sees them")
+            file.notes.append("no camera.npy beside it: people move as the camera sees them")
             return None
         camera = ArrayFile(beside, read_values(beside), error=MotionError)
         own = file.numbers(file.first(("frame", "frames")), (count,)).astype(int)
@@ -356,7 +356,7 @@ class _MotionFile(ArrayFile):
     def __init__(self, path: Path, person: Person, fps: float | None):
         super().__init__(path, person.values, person.pickled, MotionError)
         self.fps = fps
-        self.said: list[str] = []
+        self.notes: list[str] = []
 
     def first(self, keys: tuple[str, ...]) -> str:
         """The first key that the file has; the first of all if it has none."""
@@ -377,7 +377,7 @@ class _MotionFile(ArrayFile):
         if form.fps is None:
             raise MotionError(self.path, key, NO_RATE_AT_ALL)
         if not form.fixed:
-            self.said.append(
+            self.notes.append(
                 f"{NO_RATE.format(form.fps)}, which --motion-fps (in Python fps=) changes"
             )
         return form.fps
@@ -422,7 +422,7 @@ def clip_of_points(file: Any, fps: float) -> Clip:
     if "pred_cam_t" in file.values:
         points = points + _of_frames(file, "pred_cam_t", (3,), len(points))[:, None]
     else:
-        file.said.append("the file has no pred_cam_t: people stay in place")
+        file.notes.append("the file has no pred_cam_t: people stay in place")
     index = {joint: i for i, joint in enumerate(RIG)}
     parents = tuple(index.get(parent, -1) for _, parent in RIG.values())
     places = points * RIG_Y_UP
@@ -437,7 +437,7 @@ def clip_of_points(file: Any, fps: float) -> Clip:
                 "mba,mb->ma", turns[:, p], places[:, i] - places[:, p]
             ).mean(axis=0)
     names = tuple(name for name, _ in RIG.values())
-    return Clip(names, parents, rest, turns, places, fps, "y", "; ".join(file.said))
+    return Clip(names, parents, rest, turns, places, fps, "y", "; ".join(file.notes))
 
 
 def _of_frames(

@@ -204,8 +204,8 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
     if not animations:
         raise InvalidFileError("a GLB file without an animation: expected a skeleton in motion")
     # the animation; one that moves a face alone has no skeleton
-    animation, said = _chosen(animations, options.clip if options else None)
-    alone = face_alone(content, binary, animation, said)
+    animation, note = _chosen(animations, options.clip if options else None)
+    alone = face_alone(content, binary, animation, note)
     if alone is not None:
         return alone
     parents = node_parents(nodes)
@@ -228,8 +228,8 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
     names = tuple(bones.get(joint, str(nodes[joint].get("name", ""))) for joint in joints)
     above = tuple(index.get(_next_joint(parents, joint, index), -1) for joint in joints)
     face, of_face = animated_face(content, binary, animation, times)
-    said = "; ".join(filter(None, (said, of_face)))
-    return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, "y", said, face)
+    note = "; ".join(filter(None, (note, of_face)))
+    return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, "y", note, face)
 
 
 SHOWN = 12
@@ -244,11 +244,11 @@ def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[st
     names = [str(each.get("name", i)) for i, each in enumerate(animations)]
     listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
     if clip is None:
-        said = (
+        note = (
             f"{len(names)} animations ({listed}): the first is taken; the option or argument clip"
             " takes another"
         )
-        return animations[0], said if len(names) > 1 else ""
+        return animations[0], note if len(names) > 1 else ""
     plain = [name.casefold() for name in names]
     if clip.casefold() in plain:
         return animations[plain.index(clip.casefold())], ""

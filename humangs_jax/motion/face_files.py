@@ -98,9 +98,9 @@ def read_table(path: Path, options: Reading) -> Poses:
     codes = []
     if "timecode" in plain:
         codes = [row[plain["timecode"]] for row in lines]
-    fps, frames, said = _times(codes, options.fps)
+    fps, frames, note = _times(codes, options.fps)
     return _standing(
-        values, Rotation.from_euler("YXZ", head[:, [1, 0, 2]]).as_rotvec(), fps, frames, said
+        values, Rotation.from_euler("YXZ", head[:, [1, 0, 2]]).as_rotvec(), fps, frames, note
     )
 
 
@@ -118,9 +118,9 @@ def _times(codes: Sequence[str], asked: float | None) -> tuple[float, np.ndarray
     """Frames per second, the numbers of the frames (None: consecutive), and a note ("": none)."""
     parts = [re.fullmatch(r"\s*(\d+):(\d+):(\d+)[:;.](\d+(?:\.\d+)?)\s*", code) for code in codes]
     if not parts or any(part is None for part in parts):
-        said = NO_RATE.format(DEFAULT_FPS) + ", which --motion-fps (in Python fps=) changes"
+        note = NO_RATE.format(DEFAULT_FPS) + ", which --motion-fps (in Python fps=) changes"
         if asked is None:
-            return DEFAULT_FPS, None, said
+            return DEFAULT_FPS, None, note
         return asked, None, ""
     clock = np.asarray([[float(x) for x in part.groups()] for part in parts if part is not None])
     seconds, within = clock[:, :3] @ (3600.0, 60.0, 1.0), clock[:, 3]
@@ -145,7 +145,7 @@ def _standing(
     head: Float[np.ndarray, "m 3"],
     fps: float,
     frames: np.ndarray | None = None,
-    said: str = "",
+    note: str = "",
 ) -> Poses:
     """A person with this face who stands with the arms down. head: rotations, axis-angle."""
     track = FaceTrack(ARKIT, clipped(values))
@@ -157,7 +157,7 @@ def _standing(
     rotations[:, JOINT_NAMES.index("right_shoulder"), 2] = ARMS_DOWN
     rotations[:, JOINT_NAMES.index("head")] = head
     return Poses(
-        rotations, np.zeros((len(values), 3)), fps, fixed=True, frames=frames, said=said, face=track
+        rotations, np.zeros((len(values), 3)), fps, fixed=True, frames=frames, note=note, face=track
     )
 
 
@@ -187,15 +187,15 @@ def read_scores(path: Path, options: Reading) -> Poses:
             seen[0], seen[-1] + 1
         )  # frames in which nobody was seen lie between the others
         values = np.stack([np.interp(every, seen, column) for column in known.T], axis=1)
-        fps, said = options.fps, ""
+        fps, note = options.fps, ""
         given = None
         if isinstance(content, dict):
             given = content.get("fps")
         if fps is None and isinstance(given, int | float) and 0 < given < 1e6:
             fps = float(given)
         if fps is None:
-            fps, said = DEFAULT_FPS, NO_RATE.format(DEFAULT_FPS)
-        return _standing(values, np.zeros((len(values), 3)), fps, None, said)
+            fps, note = DEFAULT_FPS, NO_RATE.format(DEFAULT_FPS)
+        return _standing(values, np.zeros((len(values), 3)), fps, None, note)
 
 
 def _frames_of(content: Any) -> list[dict[str, float]] | None:
@@ -370,7 +370,7 @@ def _target_names(mesh: Mapping[str, Any], count: int) -> list[str]:
 
 
 def face_alone(
-    content: dict[str, Any], binary: bytes, animation: Mapping[str, Any], said: str
+    content: dict[str, Any], binary: bytes, animation: Mapping[str, Any], note: str
 ) -> Poses | None:
     """The motion of an animation that turns nothing and moves a face; None if it does not."""
     if any(channel["target"]["path"] == "rotation" for channel in animation["channels"]):
@@ -388,5 +388,5 @@ def face_alone(
     track, unknown = animated_face(content, binary, animation, dense)
     if track is None:
         return None
-    said = "; ".join(filter(None, (said, unknown)))
-    return _standing(track.values, np.zeros((len(dense), 3)), fps, None, said)
+    note = "; ".join(filter(None, (note, unknown)))
+    return _standing(track.values, np.zeros((len(dense), 3)), fps, None, note)

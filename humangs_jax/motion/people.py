@@ -41,19 +41,10 @@ FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
 """Where the files of a folder may lie."""
 OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
 """Suffixes of files of one person each; others are of one frame each."""
-OTHER_FILES = {
-    "this is an avatar: expected a motion to play with it": {"header", "skinning_weights", "means"},
-    "these are keypoints, which `humangs fit` makes poses of": {"points", "confidences", "set"},
-}
-"""What other files of ours are, by keys that they have."""
 DEEPEST = 6
 """Levels of lists and maps in which people are looked for."""
 SHOWN = 12
 """Keys of a file in an error."""
-NEARLY_ORTHONORMAL = 0.1
-"""3 x 3 matrices this close to rotations are those of one person, not vectors of three people;
-`ORTHONORMAL` is checked later.
-"""
 
 
 class Person(NamedTuple):
@@ -170,7 +161,10 @@ def _found(content: Any, name: str, depth: int) -> list[Person]:
                 return _found(content[key], name, depth + 1)
         named = [(str(key), each) for key, each in content.items()]
     elif isinstance(content, list | tuple):
-        named = [(_id_of(each, i), each) for i, each in enumerate(content)]
+        named = []
+        for i, each in enumerate(content):
+            key = _first(IDS, each) if isinstance(each, dict) else None
+            named.append((str(i) if key is None else _word(each[key]), each))
     else:
         return []
     found = [person for name, each in named for person in _found(each, name, depth + 1)]
@@ -178,11 +172,9 @@ def _found(content: Any, name: str, depth: int) -> list[Person]:
     return found
 
 
-def _id_of(content: Any, number: int) -> str:
-    key = next((key for key in IDS if isinstance(content, dict) and key in content), None)
-    if key is None:
-        return str(number)
-    return _word(content[key])
+def _first(keys: Sequence[str], values: Mapping[str, Any]) -> str | None:
+    """The first of some keys that is there."""
+    return next((key for key in keys if key in values), None)
 
 
 def _word(value: Any) -> str:
@@ -193,41 +185,47 @@ def _word(value: Any) -> str:
 
 
 def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person]:
-    """People along the first axis of the arrays of their roots, if they have one more than those of
-    one person.
-    """
-    place, key = next(iter(form.poses.items()))
-    if place not in ("root", "all") or form.kind != "poses" or key not in values:
+    """The one person of some values; several where their arrays have one more axis, the first."""
+    place, poses = next(iter(form.poses.items()))
+    if poses not in values or not _of_several(values[poses], place, form):
         return [Person(name, values)]
-    shape = ()
-    if not isinstance(values[key], list):
-        shape = np.shape(as_array(values[key]))
-    turns = shape[1:] == (3, 3) and _off_rotations(as_array(values[key])) < NEARLY_ORTHONORMAL
-    # vectors (people, 3), and not one person's matrix, or a whole body each
-    several = len(shape) == 3 and shape[2] == 3 and shape[1] > 1 and place == "root" and not turns
-    several = several or (form.pivot == "head" and len(shape) == 3)
-    if not several:
-        return [Person(name, values)]
-    # a row or a block of the arrays for each person
-    ids = next(
-        (np.ravel(as_array(values[key])) for key in IDS if key in values), np.arange(shape[0])
-    )
-    arrays = {
-        key: as_array(values[key]) for key in (*form.poses.values(), *form.moves) if key in values
-    }
-    if len(ids) != shape[0]:
-        ids = np.arange(shape[0])
-    rest = {key: value for key, value in values.items() if key not in arrays}
+    # poses and positions have a row or a block for each person, all else is of everybody
+    arrays = {}
+    for key in (*form.poses.values(), *form.moves):
+        if key in values:
+            arrays[key] = as_array(values[key])
+    shared = {key: value for key, value in values.items() if key not in arrays}
+    # numbers of the people, where the file has one for each
+    count = len(arrays[poses])
+    numbers = np.arange(count)
+    key = _first(IDS, values)
+    if key is not None and np.size(as_array(values[key])) == count:
+        numbers = np.ravel(as_array(values[key]))
+    people = []
+    for i, number in enumerate(numbers.tolist()):
+        own = {}
+        for key, array in arrays.items():
+            if len(array) == count:
+                # roots come for all frames of a person, whole poses for one frame
+                own[key] = array[i] if place == "root" else array[i : i + 1]
+        people.append(Person(str(number), shared | own))
+    return people
 
-    def of(array, i):
-        if place == "root":
-            return array[i]
-        return array[i : i + 1]
 
-    def own(i):
-        return {key: of(array, i) for key, array in arrays.items() if len(array) == len(ids)}
-
-    return [Person(str(number), rest | own(i)) for i, number in enumerate(ids.tolist())]
+def _of_several(poses: Any, place: str, form: ArrayKeys) -> bool:
+    """Whether roots or whole poses are those of several people, along the first axis."""
+    if place not in ("root", "all") or form.kind != "poses" or isinstance(poses, list):
+        return False
+    array = as_array(poses)
+    if array.ndim != 3:
+        return False
+    if form.pivot == "head":
+        return True
+    # vectors of several frames each; 3 x 3 numbers may also be the matrices of one person
+    _, frames, width = array.shape
+    vectors = place == "root" and width == 3 and frames > 1
+    matrices = frames == 3 and _off_rotations(array) < 0.1  # `ORTHONORMAL` is checked later
+    return vectors and not matrices
 
 
 def are_rotations(array: np.ndarray) -> bool:
@@ -247,10 +245,10 @@ def _off_rotations(array: np.ndarray) -> float:
 
 
 def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
-    key = next((key for key in FRAMES if key in values), None)
+    key = _first(FRAMES, values)
+    if key is None:
+        return None
     try:
-        if key is None:
-            return None
         return np.ravel(as_array(values[key]))
     except ValueError:
         return None
@@ -331,9 +329,9 @@ def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
         begin, first = seen[0]
         form = format_of(first)
         assert form is not None
-        keys = [
-            key for key in (*form.poses.values(), *form.moves, *form.rates, *MORE) if key in first
-        ]
+        # what is there for each frame: poses, positions, rates, and two more
+        kept = (*form.poses.values(), *form.moves, *form.rates, "cam2world", "pred_global_rots")
+        keys = [key for key in kept if key in first]
         for i, values in seen:
             missing = set(keys) - set(values)
             if missing:
@@ -349,15 +347,13 @@ def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
     return stacked
 
 
-MORE = ("cam2world", "pred_global_rots")
-"""Keys of what is there for each frame, besides poses and positions."""
-
-
 def expected(values: Mapping[Any, Any]) -> str:
     """Gives the words for what a file of no known format was expected to have."""
-    for what, needed in OTHER_FILES.items():
-        if needed <= values.keys():
-            return f"no motion: {what}"
+    # other files of ours, by keys that they have
+    if {"header", "skinning_weights", "means"} <= values.keys():
+        return "no motion: this is an avatar: expected a motion to play with it"
+    if {"points", "confidences", "set"} <= values.keys():
+        return "no motion: these are keypoints, which `humangs fit` makes poses of"
     first_keys = dict.fromkeys(
         row.arrays.keys[0] for row in MOTIONS.values() if row.arrays is not None
     )

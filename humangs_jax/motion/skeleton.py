@@ -60,7 +60,7 @@ class Clip:
     """Frames per second."""
     up: str | None = None
     """The axis that the format declares as up; None: found from the rest pose."""
-    said: str = ""
+    note: str = ""
     """Lines for the user about the file."""
     face: FaceTrack | None = None
     """The face track of the file, None without one."""
@@ -105,13 +105,13 @@ def retargeted(
         )
     source = matched(clip.names, clip.parents, clip.rest, clip.places[0])
     # whether the rest pose stands, how large the body is, and which axis is up
-    standing, said = _stands(clip, source), ""
+    standing, note = _stands(clip, source), ""
     scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.places[0], source), 1e-9)
     if up == "auto":
         if clip.up:
-            up, said = clip.up, ""
+            up, note = clip.up, ""
         else:
-            up, said = _up_of(clip, source, scale, standing)
+            up, note = _up_of(clip, source, scale, standing)
     turn = upright_matrix(up)
     turns, places = turn @ clip.turns, clip.places @ turn.T
     # rotations of each joint in the axes of the one above it
@@ -128,7 +128,7 @@ def retargeted(
     moves[:, 1] += _steps(scale * places[..., 1], source, soles) - _steps_of_body(
         world, joints, moves, source
     )
-    return rotations, moves - joints[0], said
+    return rotations, moves - joints[0], note
 
 
 Source = Mapping[str, int]
@@ -136,7 +136,7 @@ Source = Mapping[str, int]
 
 
 def _up_of(clip: Clip, source: Source, scale: float, standing: bool) -> tuple[str, str]:
-    """The axis that is up and what is to be said: BVH does not tell, a rest pose in which people
+    """The axis that is up, and a note about it: BVH does not tell, a rest pose in which people
     stand does.
     """
     usual = "y"

@@ -410,7 +410,7 @@ def compare(tmp_path, caplog, files):
         )
         assert page["fps"] == pytest.approx(motion.fps, rel=1e-6), case
         said = " ".join(caplog.messages).replace(HOW_TO_CHANGE, "")
-        assert bool(page["said"]) == bool(said) and page["said"] in said, (case, page["said"], said)
+        assert bool(page["note"]) == bool(said) and page["note"] in said, (case, page["note"], said)
 
 
 @pytest.mark.slow

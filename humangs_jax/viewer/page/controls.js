@@ -190,7 +190,7 @@ function makeControls(app) {
   }
 
   // ---- files ----
-  // rate: frames per second that somebody has said; null: those of the file. clip: the index of its motion.
+  // rate: frames per second that the user gave; null: those of the file. clip: the index of its motion.
   async function openMotion(file, rate = null, clip = 0) {
     if (!file) return;
     element("ask-rate").hidden = true;
@@ -198,7 +198,7 @@ function makeControls(app) {
       const motion = await readMotionFile(file, scene, rate, clip);
       app.setMotion(motion, file.name);
       offerClips(file, motion.clips ?? [], clip);
-      say(`${file.name}: ${counted(scene.motion.quats.length, "frame")}${motion.said ? `; ${motion.said}` : ""}`);
+      say(`${file.name}: ${counted(scene.motion.quats.length, "frame")}${motion.note ? `; ${motion.note}` : ""}`);
     } catch (error) {
       if (error.asksRate) askRate(file, error.message);
       else say(error.message, true);

@@ -51,7 +51,7 @@ function glbClip(content, binary, index) {
     throw new Error("a GLB file without an animation: expected a skeleton in motion");
   const names = animations.map((each, i) => String(each.name ?? i));
   const listed = names.slice(0, SHOWN_CLIPS).join(", ") + (names.length > SHOWN_CLIPS ? ", ..." : "");
-  const said = names.length > 1 && index === 0 ? `${names.length} animations (${listed}): the first is taken` : "";
+  const note = names.length > 1 && index === 0 ? `${names.length} animations (${listed}): the first is taken` : "";
   const parents = glbParents(nodes), { joints, binding } = glbJoints(content, binary, nodes);
   const order = withAncestors(joints, parents), tracks = glbTracks(content, binary, animations[index], new Set(order));
   const { times, fps } = glbTimes([...tracks.values()].flatMap((byPath) => [...byPath.values()]));
@@ -71,7 +71,7 @@ function glbClip(content, binary, index) {
   };
   const nameOf = (joint) => humanoid.get(joint) ?? String(nodes[joint].name ?? "");
   const named = joints.map((joint) => ({ name: nameOf(joint), parent: above(joint) }));
-  return { joints: named, place: bound.map(({ t }) => t), own, fps, up: "y", said, names };
+  return { joints: named, place: bound.map(({ t }) => t), own, fps, up: "y", note, names };
 }
 
 // ---- nodes ----

@@ -5,9 +5,9 @@
 
 const LARGEST_FILE = 512 * 2 ** 20;
 
-// { quats, translations, fps, said, clips } for the scene's joints; said: what is to be told about the file.
+// { quats, translations, fps, note, clips } for the scene's joints; note: lines about the file for the user.
 // clips: names of the motions in the file, where it has several; clip: the index of the one that is wanted.
-// rate: frames per second that somebody has said; null: those of the file. An error that asksRate can be
+// rate: frames per second that the user gave; null: those of the file. An error that asksRate can be
 // answered with one.
 async function readMotionFile(file, scene, rate = null, clip = 0) {
   if (file.size > LARGEST_FILE) throw new Error(`${file.name}: larger than 512 MB`);
@@ -132,7 +132,7 @@ function motionFromArrays(arrays, scene, asked = null) {
   const motion = turnedUp({ quats: poses, translations, fps }, format, scene);
   const notes = [still && RULES.NO_PLACES.replace("{}", format.moves.slice(0, 3).join(", "))];
   notes.push(!given && !format.fixed && RULES.NO_RATE.replace("{:g}", fps));
-  return { ...motion, said: [...notes, motion.said].filter(Boolean).join("; ") };
+  return { ...motion, note: [...notes, motion.note].filter(Boolean).join("; ") };
 }
 
 // Quaternions of all joints in each frame, of the places of a format (PLACES: the first joint, and how many).
@@ -177,15 +177,15 @@ function rotationMatrix(m, key) {
 function turnedUp(motion, format, scene) {
   const frames = motion.quats.length, axes = motion.quats.map(([root]) => matrixFromQuat(root));
   const { axis, cosine } = nearestAxis([1, 4, 7].map((i) => mean(axes.map((m) => m[i])))), { PELVIS } = RULES;
-  let up = format.up, said = "";
+  let up = format.up, note = "";
   if (!format.fixed && cosine >= RULES.CLEARLY_UP && axis !== up) {
     const places = (f) => poseJoints(scene.rest, scene.parents, scene.order, motion.quats[f], motion.translations[f]).joints;
-    ({ up, said } = upAxis(sampledFrames(frames).map(places), axis, format.up, motion.fps, RULES.HANDS, format.also));
+    ({ up, note } = upAxis(sampledFrames(frames).map(places), axis, format.up, motion.fps, RULES.HANDS, format.also));
   }
-  if (up === "y") return { ...motion, said };
+  if (up === "y") return { ...motion, note };
   const turn = RULES.UPRIGHT[up], m = uprightMatrix(up);
   return {
-    ...motion, said,
+    ...motion, note,
     quats: motion.quats.map(([root, ...others]) => [quatMultiply(turn, root), ...others]),
     translations: motion.translations.map((t) => subtract(matrixApply(m, add(t, PELVIS)), PELVIS)),
   };
@@ -206,17 +206,17 @@ function sampledFrames(count) {
   return [...new Set(first)].flatMap((f) => [f, Math.min(f + 1, count - 1)]);
 }
 
-// { up, said }: the axis that is up. points: joints in space, pairs of frames. hands: which of them carry who is upside down.
+// { up, note }: the axis that is up. points: joints in space, pairs of frames. hands: which of them carry who is upside down.
 function upAxis(points, stands, usual, fps, hands, also = []) {
   const { ON_THE_FLOOR: enough } = RULES, opposite = stands !== usual && stands.at(-1) === usual.at(-1);
-  const [here, there] = floorsOf(points, [usual, stands], fps), none = { up: usual, said: "" };
+  const [here, there] = floorsOf(points, [usual, stands], fps), none = { up: usual, note: "" };
   if (here < enough && there >= enough && here <= 0.5 * there)
-    return { up: stands, said: `${stands} is up, not ${usual} as usual in such files: people stand and step on a floor below it` };
+    return { up: stands, note: `${stands} is up, not ${usual} as usual in such files: people stand and step on a floor below it` };
   const contradicted = there < enough && here >= enough && there <= 0.5 * here;
   if (also.includes(stands) && !contradicted && !(opposite && onHands(points, usual, hands)))
-    return { up: stands, said: `${stands} is up, not ${usual}: people stand along it` };
+    return { up: stands, note: `${stands} is up, not ${usual}: people stand along it` };
   if (contradicted || opposite) return none;
-  return { up: usual, said: `${usual} is up, as usual in such files, and people lie along ${stands}` };
+  return { up: usual, note: `${usual} is up, as usual in such files, and people lie along ${stands}` };
 }
 
 // Height of the lowest point above the origin, and which it is, in the first frame of each pair.

@@ -2,7 +2,7 @@
 
 const CHANNELS = ["xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation"];
 
-// A clip, which is a skeleton in motion: { joints: [{ name, parent }], place, own, fps, up, said }.
+// A clip, which is a skeleton in motion: { joints: [{ name, parent }], place, own, fps, up, note }.
 // place: joints in the rest pose, in which nothing is turned. own: of each frame { world: rotations from
 // the rest pose, position }. up: the axis that the format says is up; null: found from the rest pose.
 // A joint's name in a BVH file ends with its line or before a brace. rate: frames per second in place of
@@ -24,7 +24,7 @@ function parseBvh(text, rate = null) {
   const frames = Array.from({ length: count }, (_, f) => words.slice(f * width, (f + 1) * width).map(bvhNumber));
   const place = joints.map(() => [0, 0, 0]);  // parents stand before their children
   joints.forEach((joint, i) => { place[i] = joint.parent < 0 ? [0, 0, 0] : add(place[joint.parent], joint.offset); });
-  return { joints, place, own: frames.map((numbers) => poseBvh(joints, numbers)), fps: 1 / seconds, up: null, said: "" };
+  return { joints, place, own: frames.map((numbers) => poseBvh(joints, numbers)), fps: 1 / seconds, up: null, note: "" };
 }
 
 function bvhNumber(word) {
@@ -236,7 +236,7 @@ function retargeted(clip, scene) {
     return sum + Math.hypot(...subtract(at(b), at(a)));
   }, 0);
   const scale = legs(rest) / Math.max(legs((name) => own[0].position[source.get(name)]), 1e-9);  // units, and the length of the steps
-  const usual = standing ? tall : "y", known = { up: clip.up, said: "" };
+  const usual = standing ? tall : "y", known = { up: clip.up, note: "" };
   const found = clip.up ? known : upOfClip(own, source, top, scale, usual, clip.fps);
   const upright = uprightMatrix(found.up);
   const posed = own.map(({ world, position }) => (
@@ -285,16 +285,16 @@ function retargeted(clip, scene) {
   const translations = moves.map((move, f) => subtract(add(move, [0, steps[f] - ofBody[f], 0]), rest("pelvis")));
   const whole = Math.round(clip.fps);  // BVH has 0.0083333 for 120
   const fps = Math.abs(clip.fps - whole) < RULES.RATE_ROUNDING * clip.fps ? whole : clip.fps;
-  return { quats, translations, fps, clips: clip.names, said: [clip.said, found.said].filter(Boolean).join("; ") };
+  return { quats, translations, fps, clips: clip.names, note: [clip.note, found.note].filter(Boolean).join("; ") };
 }
 
 const NEXT = new Map(Object.entries(RULES.NEXT));
 
-// { up, said }: BVH does not tell which axis is up, a rest pose in which people stand does.
+// { up, note }: BVH does not tell which axis is up, a rest pose in which people stand does.
 function upOfClip(posed, source, top, scale, usual, fps) {
   const trunks = posed.map(({ position }) => normalized(subtract(position[source.get(top)], position[source.get("pelvis")])));
   const { axis, cosine } = nearestAxis([0, 1, 2].map((i) => mean(trunks.map((v) => v[i]))));
-  if (!(cosine >= RULES.CLEARLY_UP) || axis === usual) return { up: usual, said: "" };
+  if (!(cosine >= RULES.CLEARLY_UP) || axis === usual) return { up: usual, note: "" };
   const used = [...source.values()].sort((a, b) => a - b);
   const points = sampledFrames(posed.length).map((f) => used.map((i) => scaled(posed[f].position[i], scale)));
   return upAxis(points, axis, usual, fps, []);
