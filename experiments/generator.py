@@ -14,9 +14,10 @@ from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from humangs_jax.synthetic import anatomy, surroundings
-from humangs_jax.synthetic.subject import DEMO, make_subject, padded, pose_subject, render_view
+from humangs_jax.synthetic.subject import SPLITS, make_subject, padded, pose_subject, render_view
 from humangs_jax.synthetic.writer import sample_motion, sample_pose
 
+DEMO = SPLITS["demo"]
 DEPTH, HOLLOW_DEPTH = 0.06, 0.01
 """Metres: how far behind poking skin its cloth may lie; how much nearer the missing body must be.
 """
@@ -171,13 +172,13 @@ def close_ups(body, seeds):
         posed = sample_pose(make_subject(seed, body), 0)
         world, joints = anatomy.joint_positions(posed.subject.build, posed.rotations.astype(float))
         joints = joints + posed.translation
-        facing = _azimuth(world[anatomy.HEAD] @ [0, 0, 1])
-        middle = joints[anatomy.HEAD] + world[anatomy.HEAD] @ [0, 0.085, 0.02]
+        facing = _azimuth(world[anatomy.Joint.HEAD] @ [0, 0, 1])
+        middle = joints[anatomy.Joint.HEAD] + world[anatomy.Joint.HEAD] @ [0, 0.085, 0.02]
         rows[0].append(_near(posed, middle, 0.17, facing + 0.35, 0.05))
         rows[1].append(_near(posed, middle, 0.17, facing + 1.6, 0.05))
-        hand = anatomy.LEFT_WRIST if seed % 2 else anatomy.RIGHT_WRIST
-        knuckles = joints[anatomy.LEFT_HAND + 3 if seed % 2 else anatomy.RIGHT_HAND + 3]
-        outwards = _azimuth(knuckles - joints[anatomy.SPINE2])
+        hand = anatomy.Joint.LEFT_WRIST if seed % 2 else anatomy.Joint.RIGHT_WRIST
+        knuckles = joints[anatomy.Joint.LEFT_HAND + 3 if seed % 2 else anatomy.Joint.RIGHT_HAND + 3]
+        outwards = _azimuth(knuckles - joints[anatomy.Joint.SPINE2])
         rows[2].append(_near(posed, 0.4 * joints[hand] + 0.6 * knuckles, 0.15, outwards, 0.1))
     return _grid(rows)
 
@@ -192,7 +193,7 @@ def motions(body, seeds):
         motion = sample_motion(subject, MOTION_FRAMES)
         rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
         pelvis = anatomy.joint_positions(subject.build, rotations[0].astype(float))[0][
-            anatomy.PELVIS
+            anatomy.Joint.PELVIS
         ]
         facing = _azimuth(pelvis @ [0, 0, 1])
         posed = [

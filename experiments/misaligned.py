@@ -26,7 +26,7 @@ from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
 from humangs_jax.synthetic.subject import PosedSubject, make_subject, pose_subject
 from humangs_jax.synthetic.surroundings import cameras_around, spread_azimuths
-from humangs_jax.synthetic.writer import CAMERA_STREAM, View, capture_views, sample_pose
+from humangs_jax.synthetic.writer import Stream, View, capture_views, sample_pose
 
 MOVED_STREAM = 77
 """Random stream of a seed, for the movements between photos."""
@@ -93,7 +93,7 @@ def moved_photos(start: Start, seed: int, far: float, views: int) -> Capture:
     """Photos of a person in poses around one, and the one as the pose of all."""
     subject = make_subject(seed, start.body)
     still = sample_pose(subject, 0)
-    rng = np.random.default_rng([seed, CAMERA_STREAM])
+    rng = np.random.default_rng([seed, Stream.CAMERAS])
     ring = cameras_around(rng, still.vertices, spread_azimuths(rng, RING), start.size)
     front = frontal_camera(still, ring)
     places = [

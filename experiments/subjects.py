@@ -40,13 +40,7 @@ from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.synthetic.subject import GENERATOR_VERSION, PosedSubject, make_subject, seeds_of
 from humangs_jax.synthetic.surroundings import cameras_around, spread_azimuths
-from humangs_jax.synthetic.writer import (
-    CAMERA_STREAM,
-    HELD_OUT_STREAM,
-    View,
-    capture_views,
-    sample_pose,
-)
+from humangs_jax.synthetic.writer import Stream, View, capture_views, sample_pose
 
 RING = 12
 """Cameras that photos are taken from; numbers of photos divide it."""
@@ -245,13 +239,13 @@ def make_evaluation_subject(
     held_out = held_out or HeldOut()
     subject = make_subject(seed, body)
     posed = [sample_pose(subject, i) for i in range(1 + held_out.poses)]
-    rng = np.random.default_rng([seed, CAMERA_STREAM])
+    rng = np.random.default_rng([seed, Stream.CAMERAS])
     ring = cameras_around(rng, posed[0].vertices, spread_azimuths(rng, RING), image_size)
     frontal = frontal_camera(posed[0], ring)
     positions = tuple(sorted({position for count in counts for position in ring_positions(count)}))
     photos = [View(0, f"photo_{i:02d}", ring[(frontal + i) % RING]) for i in positions]
 
-    rng = np.random.default_rng([seed, HELD_OUT_STREAM])
+    rng = np.random.default_rng([seed, Stream.HELD_OUT_CAMERAS])
     others = []
     for frame, pose in enumerate(posed):
         count = held_out.pose_views if frame else held_out.views

@@ -10,16 +10,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.synthetic import hair, surfaces, tailoring
-from humangs_jax.synthetic.anatomy import (
-    FLOOR,
-    HEAD,
-    LEFT_ANKLE,
-    LEFT_EYE,
-    NECK,
-    RIGHT_EYE,
-    Anatomy,
-    Vector,
-)
+from humangs_jax.synthetic.anatomy import FLOOR, Anatomy, Joint, Vector
 from humangs_jax.synthetic.fabrics import Fabric, Material, Spots, band, color, mix
 from humangs_jax.synthetic.outfits import Garment
 from humangs_jax.synthetic.surfaces import (
@@ -35,13 +26,13 @@ from humangs_jax.synthetic.surfaces import (
     unit,
 )
 
-RING = 40
+_RING = 40
 """Points of a ring around neck or head."""
-COLUMNS = 32
+_COLUMNS = 32
 """Points of a ring of a shoe."""
-AZIMUTH = circle(RING)
+_AZIMUTH = circle(_RING)
 """Azimuths of the points of a ring, radians."""
-SIDEWAYS, UP, FORWARD = np.eye(3)
+_SIDEWAYS, _UP, _FORWARD = np.eye(3)
 
 
 def build(
@@ -53,22 +44,23 @@ def build(
     kind, sizes, fabric = garment.kind, garment.sizes, garment.fabric
     hat = functools.partial(hair.scalp_shell, rng, anatomy, hat=True)
     if kind in ("glasses", "sunglasses"):
-        return glasses(anatomy, garment)
+        return _glasses(anatomy, garment)
     if kind == "necklace":
         if fabric.rng(2).random() < 0.5:
             metal = color(0.12, 0.5, 0.75)
         else:
             metal = color(0.6, 0.04, 0.72)
-        return [(necklace(anatomy, sizes["length"]), _painted(metal, 0.6))]
+        return [(_necklace(anatomy, sizes["length"]), _painted(metal, 0.6))]
     if kind in ("cap", "brim_hat"):
         if kind == "cap":
             shell = hat(0.016, 0.0, crown=0.008)
         else:
             shell = hat(0.017, 0.0, crown=0.05)
-        albedo = functools.partial(_panelled if kind == "cap" else _ribboned, fabric)
-        return [(join([shell, hat_edge(rng, anatomy, garment)]), Material(albedo, wrinkles=0.05))]
+        paint = _panelled if kind == "cap" else _ribboned
+        albedo = functools.partial(paint, fabric)
+        return [(join([shell, _hat_edge(rng, anatomy, garment)]), Material(albedo, wrinkles=0.05))]
     if kind == "scarf":
-        surface = scarf(rng, anatomy, sizes["thickness"], sizes["tails"], ease)
+        surface = _scarf(rng, anatomy, sizes["thickness"], sizes["tails"], ease)
     elif kind == "beanie":
         surface = hat(rng.uniform(0.014, 0.019), 0.04, crown=rng.uniform(0, 0.03))
     else:  # a headscarf
@@ -84,22 +76,24 @@ def _painted(dye: Vector, sheen: float) -> Material:
 
 
 def _panelled(fabric: Fabric, s: Spots) -> Points:
+    """Six panels of a cap, sewn together."""
     angle, colors = np.arctan2(s.template[:, 0], s.template[:, 2] - 0.02), fabric.colors(s)
     seam = np.abs((angle / (np.pi / 3) + 0.5) % 1 - 0.5) * (np.pi / 3) * 0.08
     return mix(colors, colors * 0.6, band(seam, -1, 0.0016) * (s.template[:, 1] > 0.34))
 
 
 def _ribboned(fabric: Fabric, s: Spots) -> Points:
+    """A ribbon around the crown of a hat."""
     above = hair.above_line(s.template, hair.CAP_LINE)
     on_crown = np.hypot(s.template[:, 0], s.template[:, 2] - 0.02) < 0.118
     return mix(fabric.colors(s), fabric.other, band(above, 0.002, 0.026, 0.002) * on_crown)
 
 
-Ring = tuple[Float[np.ndarray, "ring 3"], Float[np.ndarray, "ring 3"]]
-"""`RING` rest points from front over left, and outward directions."""
+_Ring = tuple[Float[np.ndarray, "ring 3"], Float[np.ndarray, "ring 3"]]
+"""`_RING` rest points from front over left, and outward directions."""
 
 
-def neck_ring(anatomy: Anatomy, lift: float) -> Ring:
+def _neck_ring(anatomy: Anatomy, lift: float) -> _Ring:
     """Around the neck at a lift above the crew neckline."""
     return _ring(
         anatomy,
@@ -108,13 +102,13 @@ def neck_ring(anatomy: Anatomy, lift: float) -> Ring:
     )
 
 
-def _ring(anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float) -> Ring:
+def _ring(anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float) -> _Ring:
     """Means of the chosen skin vertices by azimuth around x = 0, z = middle, on a smooth closed
     line.
     """
     x, _, z = anatomy.skin.template[near].T
     points, azimuths = anatomy.skin.vertices[near], np.arctan2(x, z - middle)
-    apart = np.abs((azimuths[None] - AZIMUTH[:, None] + np.pi) % (2 * np.pi) - np.pi)
+    apart = np.abs((azimuths[None] - _AZIMUTH[:, None] + np.pi) % (2 * np.pi) - np.pi)
     weights = np.exp(-((apart / 0.16) ** 2)) + 1e-9
     ring = weights @ points / weights.sum(1, keepdims=True)
     outwards = ring - ring.mean(0)
@@ -139,7 +133,7 @@ def _followed(
     weights = tailoring.smooth_weights(
         tailoring.nearest_weights(anatomy, vertices, candidates), faces, 6
     )
-    around_middle = vertices - [0, anatomy.joints[NECK, 1] - 0.19, 0]
+    around_middle = vertices - [0, anatomy.joints[Joint.NECK, 1] - 0.19, 0]
     return Surface(vertices, faces, weights).painted(around_middle, around_middle, 0.12)
 
 
@@ -149,14 +143,14 @@ def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
         return hair.falling_tube(
             rng, anatomy, 0.034, 0.1, _face_opening(0.31, 1.05, 0.096), wave=0.004, ends=0.1
         )
-    ring, outwards = neck_ring(anatomy, -0.012)
-    behind = 0.5 - 0.5 * np.cos(AZIMUTH)  # 0 in front, 1 at the nape
+    ring, outwards = _neck_ring(anatomy, -0.012)
+    behind = 0.5 - 0.5 * np.cos(_AZIMUTH)  # 0 in front, 1 at the nape
     thick = 0.010 + 0.020 * behind + 0.016 * behind**4
     tall = 0.016 + 0.012 * behind + 0.030 * behind**4
     path = ring + outwards * (0.4 * thick + 0.022)[:, None]
     path[:, 1] += 0.012 - 0.030 * behind**4 + 0.004 * ripples(rng, 3 * ring, 0.3)
     rolls = np.stack([tall, thick], -1) * (1 + 0.1 * ripples(rng, 4 * ring, 0.2))[:, None]
-    return _followed(anatomy, path, UP + 0.5 * outwards * behind[:, None] ** 3, rolls, 12)
+    return _followed(anatomy, path, _UP + 0.5 * outwards * behind[:, None] ** 3, rolls, 12)
 
 
 def _face_opening(
@@ -168,20 +162,20 @@ def _face_opening(
     )
 
 
-def scarf(
+def _scarf(
     rng: np.random.Generator, anatomy: Anatomy, thickness: float, tails: float, ease: float
 ) -> Surface:
     """Two turns around the neck; tails: metres that its ends hang down in front, 0 for none."""
     parts = []
     for turn, lift in enumerate((-0.004, 0.022)):
-        ring, outwards = neck_ring(anatomy, lift)
+        ring, outwards = _neck_ring(anatomy, lift)
         lumps = 1 + 0.16 * ripples(rng, 3 * ring + turn, 0.25)
         path = ring + outwards * (0.75 * thickness + min(ease, 0.015))
-        path[:, 1] += 0.014 + 0.006 * np.sin(AZIMUTH + turn * 2.1)
+        path[:, 1] += 0.014 + 0.006 * np.sin(_AZIMUTH + turn * 2.1)
         widths = np.stack([1.15 * thickness * lumps, 0.85 * thickness / lumps], -1)
-        parts.append(_followed(anatomy, path, UP, widths, 12))
+        parts.append(_followed(anatomy, path, _UP, widths, 12))
     if tails > 0:
-        ring, _ = neck_ring(anatomy, -0.004)
+        ring, _ = _neck_ring(anatomy, -0.004)
         for side, length in ((1, tails), (-1, tails * rng.uniform(0.6, 1.0))):
             parts.append(_tail(rng, anatomy, ring[0], side, length, thickness, ease))
     return join(parts)
@@ -205,16 +199,16 @@ def _tail(
     widths = np.tile([0.045 + 0.3 * thickness, 0.010], (rows, 1))
     widths[0] *= 0.5
     widths[-1, 1] = 0.002
-    return _followed(anatomy, np.stack([x, y, z], -1), SIDEWAYS, widths, 10, closed=False)
+    return _followed(anatomy, np.stack([x, y, z], -1), _SIDEWAYS, widths, 10, closed=False)
 
 
 def _on_head(anatomy: Anatomy, vertices: Points, faces: Faces, template: Points) -> Surface:
-    return surfaces.rigid(vertices, faces, HEAD, len(anatomy.joints)).painted(
+    return surfaces.rigid(vertices, faces, Joint.HEAD, len(anatomy.joints)).painted(
         template, template, 0.09
     )
 
 
-def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Surface:
+def _hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Surface:
     """The brim of a hat, wider in front, or the peak of a cap: a sheet from the edge of the hat
     outwards.
     """
@@ -228,14 +222,14 @@ def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Su
     )
     # a brim goes around the head; a peak is in front only, or behind
     if closed:
-        start, widths = ring + out * 0.012, size * (1 + 0.12 * np.cos(AZIMUTH))
-        droop = rng.uniform(-0.012, 0.02) - 0.016 * np.cos(2 * AZIMUTH) * rng.uniform(0.2, 1)
+        start, widths = ring + out * 0.012, size * (1 + 0.12 * np.cos(_AZIMUTH))
+        droop = rng.uniform(-0.012, 0.02) - 0.016 * np.cos(2 * _AZIMUTH) * rng.uniform(0.2, 1)
     else:
         backwards, across = garment.sizes["backwards"] > 0, np.linspace(-1, 1, 15)
-        middle = RING // 2 if backwards else 0
-        chosen = (middle + np.arange(-7, 8)) % RING
+        middle = _RING // 2 if backwards else 0
+        chosen = (middle + np.arange(-7, 8)) % _RING
         start = ring[chosen] + out[chosen] * 0.011
-        facing = -FORWARD if backwards else FORWARD
+        facing = -_FORWARD if backwards else _FORWARD
         out = unit(np.tile(facing, (15, 1)) + 0.25 * out[chosen])
         widths = (0.030 + size * 0.75) * np.sqrt(np.clip(1 - 0.92 * across**2, 0, 1))
         droop = 0.010 + 0.016 * across**2
@@ -246,16 +240,16 @@ def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Su
     sheet[..., 1] -= steps**2 * droop[None]
     vertices, faces = sheet.reshape(-1, 3), grid_faces(len(steps), len(start), closed=closed)
     # coordinates of the paint, around the head
-    template = vertices - anatomy.joints[HEAD]
+    template = vertices - anatomy.joints[Joint.HEAD]
     template[:, 1] = np.repeat(0.4 + 0.05 * steps, len(start))
     return surfaces.turn_in_hems(_on_head(anatomy, vertices, faces, template), 0.004)
 
 
-def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]]:
+def _glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]]:
     """Two rims, a bridge and temples to the ears; dark lenses for the sun."""
     size, squareness, wire = (garment.sizes[name] for name in ("size", "squareness", "wire"))
     dark = garment.kind == "sunglasses"
-    eyes = anatomy.joints[[LEFT_EYE, RIGHT_EYE]]
+    eyes = anatomy.joints[[Joint.LEFT_EYE, Joint.RIGHT_EYE]]
     middle, apart = eyes.mean(0), np.abs(eyes[0, 0])
     template, vertices = anatomy.skin.template, anatomy.skin.vertices
     x, y, z = template.T
@@ -272,7 +266,7 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
     for side in (1, -1):
         x, y = side * apart * 1.06 + half * radius * c, middle[1] - 0.004 + tall * radius * s
         path = np.stack([x, y, front - 9.0 * np.abs(x) ** 2.0 * 0.6], -1)
-        parts.append(sweep(path, FORWARD, wire, 6, closed=True))
+        parts.append(sweep(path, _FORWARD, wire, 6, closed=True))
         hinge = np.asarray(
             [
                 side * (apart * 1.06 + half),
@@ -287,7 +281,7 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
         line = hinge + np.linspace(0, 1, 6)[:, None] * (hook - hinge)
         parts.append(
             sweep(
-                np.concatenate([line, [hook + np.asarray([0, -0.014, -0.014])]]), UP, 1.1 * wire, 6
+                np.concatenate([line, [hook + np.asarray([0, -0.014, -0.014])]]), _UP, 1.1 * wire, 6
             )
         )
         # clear lenses are not modelled
@@ -300,7 +294,7 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
     bridge = np.stack(
         [(apart * 1.06 - half) * across, middle[1] + 0.004 + 0.003 * (1 - across**2), flat], -1
     )
-    parts.append(sweep(bridge, UP, wire, 6))
+    parts.append(sweep(bridge, _UP, wire, 6))
     glass = (lenses, _painted(color(0.08, 0.3, 0.06), 0.7))
     made = [(parts, _painted(garment.fabric.base, 0.4))]
     if dark:
@@ -311,14 +305,14 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
     ]
 
 
-def necklace(anatomy: Anatomy, length: float) -> Surface:
+def _necklace(anatomy: Anatomy, length: float) -> Surface:
     """A chain around the neck that hangs lower in front."""
-    ring, outwards = neck_ring(anatomy, 0.01)
-    front = np.clip(np.cos(AZIMUTH), 0, 1) ** 2
+    ring, outwards = _neck_ring(anatomy, 0.01)
+    front = np.clip(np.cos(_AZIMUTH), 0, 1) ** 2
     path = ring + outwards * 0.003
     path[:, 1] -= length * front
     path[:, 2] += 0.35 * length * front
-    return _followed(anatomy, path, UP, 0.0022, 6)
+    return _followed(anatomy, path, _UP, 0.0022, 6)
 
 
 def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
@@ -388,16 +382,16 @@ def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) 
     ]
     rings = []
     for y, i, extra in rows:
-        radius = shape.radius(np.full(COLUMNS, levels[i]), circle(COLUMNS)) + ease + extra
+        radius = shape.radius(np.full(_COLUMNS, levels[i]), circle(_COLUMNS)) + ease + extra
         if not rings:
             radius = 0 * radius
         rings.append(
-            surfaces.around(radius, circle(COLUMNS), np.full(COLUMNS, y), shape.centers[i])
+            surfaces.around(radius, circle(_COLUMNS), np.full(_COLUMNS, y), shape.centers[i])
         )
     vertices = np.concatenate(rings).astype(np.float32)
-    faces = np.ascontiguousarray(grid_faces(len(rows), COLUMNS, closed=True)[:, ::-1])
+    faces = np.ascontiguousarray(grid_faces(len(rows), _COLUMNS, closed=True)[:, ::-1])
     weights = tailoring.smooth_weights(tailoring.nearest_weights(anatomy, vertices, own), faces, 3)
-    local = vertices - np.where([True, False, True], anatomy.joints[LEFT_ANKLE + side], floor)
+    local = vertices - np.where([True, False, True], anatomy.joints[Joint.LEFT_ANKLE + side], floor)
     return surfaces.turn_in_hems(
         Surface(vertices, faces, weights).painted(local, local, 0.06), 0.01
     )

@@ -31,22 +31,21 @@ Rotations = Float[np.ndarray, "j 3"]
 Vector = Float[np.ndarray, "3"]
 Matrix = Float[np.ndarray, "3 3"]
 
-(
-    PELVIS,
-    LEFT_HIP,
-    RIGHT_HIP,
-    SPINE1,
-    LEFT_KNEE,
-    RIGHT_KNEE,
-    SPINE2,
-    LEFT_ANKLE,
-    RIGHT_ANKLE,
-    SPINE3,
-) = range(10)
-LEFT_FOOT, RIGHT_FOOT, NECK, LEFT_COLLAR, RIGHT_COLLAR, HEAD = range(10, 16)
-LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST = range(16, 22)
-LEFT_EYE, RIGHT_EYE, LEFT_HAND, RIGHT_HAND, JOINTS = 23, 24, 25, 40, 55
 
+class Joint:
+    """Numbers of SMPL-X's joints."""
+
+    PELVIS, LEFT_HIP, RIGHT_HIP, SPINE1, LEFT_KNEE, RIGHT_KNEE = range(6)
+    SPINE2, LEFT_ANKLE, RIGHT_ANKLE, SPINE3, LEFT_FOOT, RIGHT_FOOT = range(6, 12)
+    NECK, LEFT_COLLAR, RIGHT_COLLAR, HEAD, LEFT_SHOULDER, RIGHT_SHOULDER = range(12, 18)
+    LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST = range(18, 22)
+    LEFT_EYE, RIGHT_EYE = 23, 24
+    LEFT_HAND, RIGHT_HAND = 25, 40
+    """First joints of the hands, 15 each."""
+
+
+JOINTS = 55
+"""How many joints there are."""
 FINGER_LIMIT = 1.5
 """Largest rotation angle of a joint of a finger in the prior, radians."""
 LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9,
@@ -56,16 +55,6 @@ LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9,
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
 """The rotation vector of the mirrored rotation (left and right exchanged)."""
-BALL_HEIGHT = 0.0112
-"""Height of the joint at the ball of the foot above the sole, of the shipped body, in lengths of a
-leg.
-"""
-HEEL_BACK = 0.064
-"""Distance of the heel behind the ankle, of the shipped body, in lengths of a leg."""
-REACH = 0.998
-"""Largest stretch of a leg as a share of its length: a straight leg leaves the knee's direction
-undefined.
-"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,18 +77,19 @@ class Build:
     @property
     def leg(self) -> float:
         """Length of a leg from hip to ankle, metres."""
-        hip, knee, ankle = self.joints[[LEFT_HIP, LEFT_KNEE, LEFT_ANKLE]]
+        hip, knee, ankle = self.joints[[Joint.LEFT_HIP, Joint.LEFT_KNEE, Joint.LEFT_ANKLE]]
         return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
 
     @property
     def hip_width(self) -> float:
         """Distance of a hip from the middle, metres."""
-        return float(0.5 * (self.joints[LEFT_HIP, 0] - self.joints[RIGHT_HIP, 0]))
+        return float(0.5 * (self.joints[Joint.LEFT_HIP, 0] - self.joints[Joint.RIGHT_HIP, 0]))
 
     @property
     def sole(self) -> float:
         """Height of the sole in T-pose."""
-        return float(self.joints[[LEFT_FOOT, RIGHT_FOOT], 1].mean() - BALL_HEIGHT * self.leg)
+        balls = self.joints[[Joint.LEFT_FOOT, Joint.RIGHT_FOOT], 1].mean()
+        return float(balls - 0.0112 * self.leg)  # that high above the sole, in the shipped body
 
 
 def rotation_matrix(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
@@ -169,8 +159,8 @@ class Foot:
 Feet = tuple[Foot, ...]
 """The left and the right one."""
 LEGS = (
-    (LEFT_HIP, LEFT_KNEE, LEFT_ANKLE, LEFT_FOOT),
-    (RIGHT_HIP, RIGHT_KNEE, RIGHT_ANKLE, RIGHT_FOOT),
+    (Joint.LEFT_HIP, Joint.LEFT_KNEE, Joint.LEFT_ANKLE, Joint.LEFT_FOOT),
+    (Joint.RIGHT_HIP, Joint.RIGHT_KNEE, Joint.RIGHT_ANKLE, Joint.RIGHT_FOOT),
 )
 
 
@@ -185,20 +175,24 @@ def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
     if foot.pitch >= 0:
         pivot, offset = np.asarray([0.0, b[1] - build.sole, 0.0]), a - b
     else:
-        heel = np.asarray([a[0], build.sole, a[2] - HEEL_BACK * build.leg])
+        # the heel is that far behind the ankle, in the shipped body
+        heel = np.asarray([a[0], build.sole, a[2] - 0.064 * build.leg])
         pivot, offset = turn @ (heel - [b[0], build.sole, b[2]]), a - heel
     return np.asarray([foot.x, foot.lift, foot.z]) + pivot + orientation @ offset, orientation
 
 
 def highest_pelvis(
-    build: Build, turn: Matrix, x: float, z: float, feet: Feet, reach: float = REACH
+    build: Build, turn: Matrix, x: float, z: float, feet: Feet, reach: float = 0.998
 ) -> float:
     """The greatest height of the pelvis, turned by `turn`, above x, z, at which both legs reach
     their feet.
+
+    reach: largest stretch of a leg as a share of its length: a straight leg leaves the knee's
+    direction undefined.
     """
     heights = []
     for side, foot in enumerate(feet):
-        hip = turn @ (build.joints[LEGS[side][0]] - build.joints[PELVIS])
+        hip = turn @ (build.joints[LEGS[side][0]] - build.joints[Joint.PELVIS])
         ankle, _ = ankle_of(build, side, foot)
         away = np.hypot(x + hip[0] - ankle[0], z + hip[2] - ankle[2])
         heights.append(ankle[1] + np.sqrt(max((reach * build.leg) ** 2 - away**2, 0.0)) - hip[1])
@@ -212,12 +206,12 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -
     pelvis: where the pelvis joint is, the ground at y = 0. Returns how far (metres) the worse ankle
     is from its place, which is 0 unless a leg is too short.
     """
-    turn = rotation_matrix(rotations[PELVIS])
+    turn = rotation_matrix(rotations[Joint.PELVIS])
     missed = []
     for side, foot in enumerate(feet):
         hip, knee, ankle, ball = LEGS[side]
         target, orientation = ankle_of(build, side, foot)
-        start = pelvis + turn @ (build.joints[hip] - build.joints[PELVIS])
+        start = pelvis + turn @ (build.joints[hip] - build.joints[Joint.PELVIS])
         thigh = build.joints[knee] - build.joints[hip]
         shin = build.joints[ankle] - build.joints[knee]
         bend = _knee_angle(thigh, shin, float(np.linalg.norm(target - start)))
@@ -317,7 +311,7 @@ def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
     return t * t * (3 - 2 * t)
 
 
-def leg_membership(template: np.ndarray) -> np.ndarray:
+def _leg_membership(template: np.ndarray) -> np.ndarray:
     """(n,) 1 on the legs, 0 on the trunk, smooth across the hip."""
     return smoothstep(-CROTCH - 0.1, -CROTCH + 0.05, -template[:, 1])
 
@@ -331,7 +325,7 @@ def cloth_coordinates(template: np.ndarray) -> np.ndarray:
     """
     x, y, z = template.T
     trunk = np.stack([x, y, z - 0.02, np.full_like(x, TRUNK_GIRTH)], -1)
-    on_leg = leg_membership(template)[:, None]
+    on_leg = _leg_membership(template)[:, None]
     return (trunk * (1 - on_leg) + leg_coordinates(template) * on_leg).astype(np.float32)
 
 
@@ -374,7 +368,7 @@ def _fixed(template_bytes: bytes) -> tuple[Points, Float[np.ndarray, "n 4"], Fie
     template = np.frombuffer(template_bytes, np.float32).reshape(-1, 3)
     # 1 on the arms, 0 on the trunk, smooth across the shoulder seam
     arm = smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])
-    return template, cloth_coordinates(template), arm, leg_membership(template)
+    return template, cloth_coordinates(template), arm, _leg_membership(template)
 
 
 def measure(
@@ -402,7 +396,9 @@ def measure(
     # slices of a limb are centred on the line through its joints
     legs, arms = [], []
     for offset, side in enumerate((1, -1)):
-        line = joints[[LEFT_ANKLE + offset, LEFT_KNEE + offset, LEFT_HIP + offset]]
+        line = joints[
+            [Joint.LEFT_ANKLE + offset, Joint.LEFT_KNEE + offset, Joint.LEFT_HIP + offset]
+        ]
         centers = np.stack([np.interp(levels, line[:, 1], line[:, i]) for i in (0, 2)], -1)
         own = vertices[
             (template[:, 0] * side > 0.004)
@@ -410,7 +406,7 @@ def measure(
             & (template[:, 1] > -1.15)
         ]
         legs.append(blurred(boundaries(own[:, 1], own[:, [0, 2]], levels, centers, 0.025)))
-        line = joints[[LEFT_SHOULDER + offset, LEFT_WRIST + offset]]
+        line = joints[[Joint.LEFT_SHOULDER + offset, Joint.LEFT_WRIST + offset]]
         centers = np.stack([np.interp(along, np.abs(line[:, 0]), line[:, i]) for i in (1, 2)], -1)
         own = vertices[
             (template[:, 0] * side > 0.2)

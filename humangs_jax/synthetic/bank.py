@@ -38,7 +38,7 @@ from humangs_jax.io.arrays import check_array, check_indices, check_joints, read
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.reading import reading, write_json
 from humangs_jax.rendering.mesh.atlas import Atlas, fill_gaps, texels, unwrap
-from humangs_jax.synthetic.anatomy import HEAD, joint_positions
+from humangs_jax.synthetic.anatomy import Joint, joint_positions
 from humangs_jax.synthetic.poses import sample_rotations
 from humangs_jax.synthetic.subject import (
     GENERATOR_VERSION,
@@ -67,10 +67,6 @@ SLOPE_ZERO = 128
 """The byte of no slope."""
 FACE_DENSITY = 2.0
 """Texels per metre of skin and eyes of the head, relative to everything else."""
-HEAD_JOINTS = (HEAD, 22, 23, 24)
-"""Head, jaw and eyes."""
-SKIN_AND_EYES = (0, 1)
-"""The materials of a subject that `make_subject` puts first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +94,8 @@ def bake_subject(
     """
     surface, pieces = subject.surface, subject.face_materials
     strongest = np.argmax(surface.weights[surface.faces[:, 0]], axis=1)
-    face = np.isin(strongest, HEAD_JOINTS) & np.isin(pieces, SKIN_AND_EYES)
+    # skin and eyes, the first two pieces, that head, jaw or eyes move
+    face = np.isin(strongest, (Joint.HEAD, 22, 23, 24)) & np.isin(pieces, (0, 1))
     density = np.where(face, FACE_DENSITY, 1.0).astype(np.float32)
     atlas = unwrap(surface.vertices, surface.faces, 2 * pieces + face, texture_size, density)
     ids, weights = texels(dataclasses.replace(atlas, size=texture_size * samples))
@@ -126,12 +123,6 @@ def strongest_joints(
     ids = np.argsort(-weights, axis=1, kind="stable")[:, :count]
     kept = np.take_along_axis(weights, ids, axis=1)
     return ids.astype(np.uint8), (kept / kept.sum(1, keepdims=True)).astype(np.float32)
-
-
-SCAN = "scan"
-"""Name of the meshes in a scan's folder, without ending."""
-PARAMETERS = "scan.json"
-"""Name of the file of what is known of the person."""
 
 
 def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 2048) -> None:
@@ -167,10 +158,10 @@ def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 204
                 visual=visual,
                 process=False,
             )
-            mesh.export(temporary / f"{SCAN}.{kind}")
-        write_json(temporary / PARAMETERS, known, indent=None)
+            mesh.export(temporary / f"scan.{kind}")
+        write_json(temporary / "scan.json", known, indent=None)
 
-    replace_folder(folder, write, mark=PARAMETERS)
+    replace_folder(folder, write, mark="scan.json")
 
 
 def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "t t 3"]:
@@ -192,21 +183,8 @@ FORMAT = "humangs-people"
 """Name of the format in its files."""
 VERSION = 2
 """Version of the format that is written and read."""
-POSE_STREAM = 20
-"""Stream of a seed that draws the poses of the bank; others than the ones of written sets."""
-SILHOUETTES = 4
-"""Views that a body is displaced to."""
-SILHOUETTE_SIDE = 960
-"""Pixels a side of these views."""
-SILHOUETTE_STREAM = 23
-"""Stream of a seed that places their cameras."""
 UV_STEPS = 65535
 """Texture coordinates are stored in steps of one part of this."""
-PAD_VERTICES = 1024
-"""Meshes are padded to the vertices of the largest of the bank, rounded up to a multiple of this.
-"""
-PAD_FACES = 2048
-"""The same of faces."""
 MOST_MATERIALS = 32
 """Materials of a person, at most: arrays have room for as many."""
 
@@ -398,14 +376,14 @@ def _person(
         return np.pad(np.asarray(values), (0, MOST_MATERIALS - len(materials))).astype(kind)
 
     identities = [id(material) for material in materials]
-    generators = (np.random.default_rng([seed, POSE_STREAM, i]) for i in range(pose_count))
+    # stream 20 of a seed draws poses: others than those of written sets
+    generators = (np.random.default_rng([seed, 20, i]) for i in range(pose_count))
     rotations = np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(
         np.float32
     )
     places = np.stack([joint_positions(subject.build, r.astype(np.float64))[1] for r in rotations])
-    away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(
-        -1
-    )  # of each pose from the others
+    # distance of each pose from the others
+    away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(-1)
     joint_ids, joint_weights = strongest_joints(surface.weights, JOINTS_PER_VERTEX)
     displacements = np.zeros((0, 3), np.float16)
     if displaced is not None:
@@ -435,22 +413,18 @@ def _person(
 def to_silhouettes(
     subject: SyntheticSubject, body: BodyModel, rotations: Float[np.ndarray, "j 3"]
 ) -> Float[np.ndarray, "b 3"]:
-    """The displacement of a body to what `SILHOUETTES` cameras around the dressed person see in a
-    pose, metres.
+    """The displacement of a body to what four cameras around the dressed person see in a pose,
+    metres.
     """
-    rng, nowhere = np.random.default_rng([subject.seed, SILHOUETTE_STREAM]), np.zeros(3, np.float32)
+    views, side = 4, 960  # pixels
+    rng, nowhere = np.random.default_rng([subject.seed, 23]), np.zeros(3, np.float32)
     vertices = subject.posed_vertices(rotations, nowhere)
-    cameras = cameras_around(rng, vertices, spread_azimuths(rng, SILHOUETTES), SILHOUETTE_SIDE)
+    cameras = cameras_around(rng, vertices, spread_azimuths(rng, views), side)
     pixels = np.asarray(
         jax.vmap(project, in_axes=(0, None))(cameras, jnp.asarray(vertices, jnp.float32))[0]
     )
-    masks = np.stack(
-        [
-            silhouette(view, subject.surface.faces, (SILHOUETTE_SIDE, SILHOUETTE_SIDE))
-            for view in pixels
-        ]
-    )
-    frames, names = np.zeros(SILHOUETTES, int), tuple(map(str, range(SILHOUETTES)))
+    masks = np.stack([silhouette(view, subject.surface.faces, (side, side)) for view in pixels])
+    frames, names = np.zeros(views, int), tuple(map(str, range(views)))
     poses = jax.tree.map(lambda x: x[None], BodyPose(jnp.asarray(rotations), jnp.asarray(nowhere)))
     images = np.broadcast_to(masks[..., None], (*masks.shape, 3))
     return fit_vertex_offsets(
@@ -459,8 +433,9 @@ def to_silhouettes(
 
 
 def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: str) -> PeopleBank:
-    vertices = -(-max(len(p["vertices"]) for p in people) // PAD_VERTICES) * PAD_VERTICES
-    faces = -(-max(len(p["faces"]) for p in people) // PAD_FACES) * PAD_FACES
+    # the sizes of the largest mesh, rounded up: few shapes are compiled
+    vertices = -(-max(len(p["vertices"]) for p in people) // 1024) * 1024
+    faces = -(-max(len(p["faces"]) for p in people) // 2048) * 2048
 
     def padded(name, array):
         if name in ("faces", "uvs", "face_pieces"):

@@ -12,15 +12,13 @@ from humangs_jax.synthetic.hair import LONG_CUTS, SHORT_LINE, Haircut, above_lin
 from humangs_jax.synthetic.outfits import drawn
 from humangs_jax.synthetic.surfaces import Field, Points, Ripples, lattice
 
-EYE_X = 0.029
+_EYE_X = 0.029
 """Distance of the eyes from the middle, template coordinates."""
-EYE_Y = 0.330
+_EYE_Y = 0.330
 """Height of the eyes."""
-MOUTH_Y = 0.2629
+_MOUTH_Y = 0.2629
 """Height of the mouth."""
-HAND_Y = 0.085
-"""Height that parts the backs of the hands from the palms."""
-HAIR = {
+_HAIR = {
     "black": (0.07, 0.3, (0.05, 0.12)),
     "brown": ((0.05, 0.09), (0.5, 0.7), (0.15, 0.4)),
     "blond": ((0.09, 0.13), (0.35, 0.6), (0.5, 0.76)),
@@ -29,12 +27,8 @@ HAIR = {
     "dyed": ((0, 1), 0.55, 0.55),
 }
 """Hue, saturation and value of hair, or their ranges."""
-Face = tuple[Field, Field, Field, Points]
+_Face = tuple[Field, Field, Field, Points]
 """Distances from the middle, heights, how far in front they are in [0, 1], and the points."""
-FAIR_ODDS = np.asarray([0.2, 0.35, 0.22, 0.08, 0.06, 0.05])
-"""Odds of the colors of `HAIR` with fair skin."""
-DARK_ODDS = np.asarray([0.80, 0.12, 0.01, 0.0, 0.03, 0.03])
-"""Odds of the colors of `HAIR` with dark skin."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,23 +81,25 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
         hue = rng.choice([rng.uniform(0.94, 1.03), rng.uniform(0.935, 0.97)])
         lips = 0.3 * lips + 0.7 * color(hue, rng.uniform(0.45, 0.8), rng.uniform(0.35, 0.75))
     grey = float(np.clip((years - 40) / 35, 0, 0.85))
-    odds = (FAIR_ODDS + (DARK_ODDS - FAIR_ODDS) * np.clip((darkness - 0.22) / 0.2, 0, 1)) * (
-        1 - grey
-    )
+    # odds of the colors of `_HAIR` with fair and with dark skin
+    fair_odds = np.asarray([0.2, 0.35, 0.22, 0.08, 0.06, 0.05])
+    dark_odds = np.asarray([0.80, 0.12, 0.01, 0.0, 0.03, 0.03])
+    share = np.clip((darkness - 0.22) / 0.2, 0, 1)
+    odds = (fair_odds + (dark_odds - fair_odds) * share) * (1 - grey)
     odds[4] += grey
     if years > 60:
         odds[5] *= 0.3
-    kind = rng.choice(list(HAIR), p=odds / odds.sum())
-    colors = {
-        name: [drawn(rng, value) for value in values] for name, values in HAIR.items()
-    }  # all of them are drawn
+    kind = rng.choice(list(_HAIR), p=odds / odds.sum())
+    # all of them are drawn
+    colors = {name: [drawn(rng, value) for value in values] for name, values in _HAIR.items()}
     hair = color(*colors[kind])
     brown = darkness > 0.45 or rng.random() < 0.4
     if brown:
         iris = color(0.07, 0.6, rng.uniform(0.1, 0.3))
     else:
         iris = color(rng.uniform(0.25, 0.62), 0.4, 0.5)
-    if made_up and rng.random() < 0.5:  # nail varnish is not shown; a seed stays the same person
+    # nail varnish is not shown, but its numbers are drawn: a seed stays the same person
+    if made_up and rng.random() < 0.5:
         color(
             rng.choice([rng.uniform(0.9, 1.05), rng.random()]),
             rng.uniform(0.3, 0.8),
@@ -132,24 +128,21 @@ def _liner(rng: np.random.Generator, made_up: bool, male: bool) -> float:
     return 0.0 if male else rng.uniform(0.0, 0.25)
 
 
-FEATURES = {
-    "brow_thickness": (0.0024, 0.0056),
-    "brow_arch": (0.2, 1.7),
-    "brow_height": (-0.0025, 0.0025),
-    "lip_width": (0.9, 1.14),
-    "lip_fullness": (0.65, 1.25),
-    "eye_opening": (0.85, 1.15),
-    "nose": (0.85, 1.25),
-}
-"""Ranges of what is painted on a face: metres, or factors around 1."""
-
-
 def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut) -> Material:
     """Skin with lips, cheeks, brows, lids, nostrils, stubble, knuckles, freckles, and tones that
     vary over the body.
     """
     cloud, blotches = Ripples(rng, 0.07), Ripples(rng, 0.25)
-    features = {name: rng.uniform(*limits) for name, limits in FEATURES.items()}
+    # what is painted on the face: metres, or factors around 1
+    features = {
+        "brow_thickness": rng.uniform(0.0024, 0.0056),
+        "brow_arch": rng.uniform(0.2, 1.7),
+        "brow_height": rng.uniform(-0.0025, 0.0025),
+        "lip_width": rng.uniform(0.9, 1.14),
+        "lip_fullness": rng.uniform(0.65, 1.25),
+        "eye_opening": rng.uniform(0.85, 1.15),
+        "nose": rng.uniform(0.85, 1.25),
+    }
     seed = int(rng.integers(1 << 20))
 
     def albedo(s: Spots):
@@ -182,7 +175,7 @@ def _tinted(colors: Points, tint: tuple[float, float, float], amount: Field) -> 
 
 def _hand(tones: Complexion, result: Points, x: Field, y: Field) -> Points:
     """Palms are paler, knuckles and finger tips redder."""
-    palm = np.clip((HAND_Y - y) / 0.012, 0, 1) * np.clip((x - 0.66) / 0.03, 0, 1)
+    palm = np.clip((0.085 - y) / 0.012, 0, 1) * np.clip((x - 0.66) / 0.03, 0, 1)
     pale = 0.35 * tones.skin + 0.65 * np.asarray([0.82, 0.62, 0.53], np.float32)
     tip, knuckle = np.clip((x - 0.79) / 0.03, 0, 1), _bell((x, 0.745, 0.008)) * (1 - palm)
     return _tinted(
@@ -191,7 +184,7 @@ def _hand(tones: Complexion, result: Points, x: Field, y: Field) -> Points:
 
 
 def _cheeks_and_eyes(
-    tones: Complexion, features: Mapping[str, float], result: Points, face: Face, seed: int
+    tones: Complexion, features: Mapping[str, float], result: Points, face: _Face, seed: int
 ) -> Points:
     """Cheeks, nose and ears; freckles; sockets, make-up, lashes."""
     x, y, front, template = face
@@ -211,25 +204,25 @@ def _cheeks_and_eyes(
         )
         result = _tinted(result, (0.72, 0.58, 0.48), tones.freckles * spots)
     result = _tinted(
-        result, (0.72, 0.66, 0.66), 0.7 * _bell((x, EYE_X, 0.017), (y, EYE_Y, 0.010)) * front
+        result, (0.72, 0.66, 0.66), 0.7 * _bell((x, _EYE_X, 0.017), (y, _EYE_Y, 0.010)) * front
     )
     # shadow on the lids, then lashes, and the liner with its wing over both
-    lid = _bell((x - EYE_X, 0.002, 0.017), (y - EYE_Y, 0.008, 0.007)) * (y > EYE_Y)
+    lid = _bell((x - _EYE_X, 0.002, 0.017), (y - _EYE_Y, 0.008, 0.007)) * (y > _EYE_Y)
     result = mix(result, tones.shadow_color, tones.shadow * lid * front)
     rim = np.sqrt(
-        ((x - EYE_X) / 0.0155) ** 2
-        + ((y - EYE_Y - 0.001) / (0.0075 * features["eye_opening"])) ** 2
+        ((x - _EYE_X) / 0.0155) ** 2
+        + ((y - _EYE_Y - 0.001) / (0.0075 * features["eye_opening"])) ** 2
     )
     lashes = band(rim, 0.75, 1.08 + 0.18 * tones.liner, 0.15)
-    result = mix(result, result * 0.22, 0.8 * lashes * (y > EYE_Y - 0.002) * front)
-    wing = band(np.abs(y - EYE_Y - 0.25 * (x - 0.042)), -1, 0.0016)
+    result = mix(result, result * 0.22, 0.8 * lashes * (y > _EYE_Y - 0.002) * front)
+    wing = band(np.abs(y - _EYE_Y - 0.25 * (x - 0.042)), -1, 0.0016)
     wing = wing * band(x, 0.041, 0.041 + 0.008 * tones.liner) * front
     return mix(
-        result, result * 0.2, np.clip(tones.liner * (0.7 * lashes * (y < EYE_Y) + wing), 0, 1)
+        result, result * 0.2, np.clip(tones.liner * (0.7 * lashes * (y < _EYE_Y) + wing), 0, 1)
     )
 
 
-def _aged(tones: Complexion, result: Points, face: Face) -> Points:
+def _aged(tones: Complexion, result: Points, face: _Face) -> Points:
     """Folds beside nose and mouth, lines on the forehead, bags and crow's feet."""
     if tones.wrinkles <= 0:
         return result
@@ -239,8 +232,8 @@ def _aged(tones: Complexion, result: Points, face: Face) -> Points:
         np.abs(((y - 0.368 + 0.8 * x * x) / 0.0085) % 1 - 0.5) * 0.0085, -1, 0.0008
     )
     forehead = forehead * band(y, 0.36, 0.392, 0.006) * (x < 0.045)
-    feet = band(np.abs((y - EYE_Y) / np.maximum(x - 0.038, 1e-3) * 2 % 1 - 0.5), -1, 0.12, 0.1)
-    feet = feet * band(x, 0.046, 0.056, 0.002) * (np.abs(y - EYE_Y) < 0.012)
+    feet = band(np.abs((y - _EYE_Y) / np.maximum(x - 0.038, 1e-3) * 2 % 1 - 0.5), -1, 0.12, 0.1)
+    feet = feet * band(x, 0.046, 0.056, 0.002) * (np.abs(y - _EYE_Y) < 0.012)
     lines = 0.8 * band(fold, -1, 0.0016, 0.002) + forehead + 0.5 * feet
     bags = _bell((x, 0.028, 0.013), (y, 0.3165, 0.004))
     return _tinted(
@@ -255,7 +248,7 @@ def _mouth_and_brows(
     haircut: Haircut,
     features: Mapping[str, float],
     result: Points,
-    face: Face,
+    face: _Face,
     seed: int,
 ) -> Points:
     """Lips, nostrils, brows; roots of hair and beard, which also soften the edges of what grows
@@ -267,10 +260,10 @@ def _mouth_and_brows(
     corner = np.clip(1 - (x / width) ** 2, 0, 1)
     bow = 0.009 * features["lip_fullness"] * corner * (1 - 0.35 * _bell((x, 0, 0.005)))
     low = 0.0115 * features["lip_fullness"] * corner**0.7
-    lips = band(y, MOUTH_Y - low, MOUTH_Y + bow, 0.002) * (corner > 0) * ahead
-    shine = 1 + 0.25 * _bell((y - MOUTH_Y, -0.006, 0.003), (x, 0, 0.01))
+    lips = band(y, _MOUTH_Y - low, _MOUTH_Y + bow, 0.002) * (corner > 0) * ahead
+    shine = 1 + 0.25 * _bell((y - _MOUTH_Y, -0.006, 0.003), (x, 0, 0.01))
     result = mix(result, tones.lips * shine[:, None], 0.85 * lips)
-    line = band(y, MOUTH_Y - 0.0012, MOUTH_Y + 0.0012, 0.001) * (x < width) * ahead
+    line = band(y, _MOUTH_Y - 0.0012, _MOUTH_Y + 0.0012, 0.001) * (x < width) * ahead
     result = mix(result, tones.lips * 0.35, line)
     # nostrils are painted dark
     nostril = _bell((x, 0.0085 * features["nose"], 0.004), (y, 0.2845, 0.0025)) * (

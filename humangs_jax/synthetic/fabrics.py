@@ -17,7 +17,7 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.synthetic.anatomy import ARMHOLE, SAME_GIRTH, TRUNK_GIRTH, Vector, sewn_coordinates
 from humangs_jax.synthetic.surfaces import Field, Points, Ripples, choice, hashed, lattice
 
-SHOULDER_RIDGE = -0.02
+_SHOULDER_RIDGE = -0.02
 """Template z of the line from neck to shoulder on which front and back are sewn together."""
 ALBEDO_LIMIT = 0.88
 """Largest albedo: white clothes stay darker than the white background."""
@@ -52,7 +52,7 @@ class Spots:
             np.clip((self.cloth[:, 1] - 0.03) / 0.09, 0, 1) * self._on_trunk
         )  # 0 where the cloth hangs
         x = self.cloth[:, 0]
-        across = np.where(self.template[:, 2] > SHOULDER_RIDGE, x, np.sign(x) * np.pi * girth - x)
+        across = np.where(self.template[:, 2] > _SHOULDER_RIDGE, x, np.sign(x) * np.pi * girth - x)
         return turned + flat * (across - turned)
 
     @property
@@ -61,7 +61,7 @@ class Spots:
         their ridge.
         """
         rising = np.clip((self.template[:, 1] + 0.25) / 0.35, 0, 1) * self._on_trunk
-        return self.cloth[:, 1] - rising * np.abs(self.template[:, 2] - SHOULDER_RIDGE)
+        return self.cloth[:, 1] - rising * np.abs(self.template[:, 2] - _SHOULDER_RIDGE)
 
     @property
     def _on_trunk(self) -> Bool[np.ndarray, " n"]:
@@ -92,7 +92,7 @@ def color(hue: float, saturation: float, value: float) -> Vector:
     )
 
 
-DYES = {
+_DYES = {
     "neutral": (0.28, (0, 1), (0, 0.06), (0.1, 0.18, 0.32, 0.5, 0.7, 0.85)),
     "muted": (0.28, (0, 1), (0.2, 0.5), (0.3, 0.8)),
     "vivid": (0.22, (0, 1), (0.5, 0.85), (0.35, 0.8)),
@@ -114,7 +114,8 @@ def _color_of(rng: np.random.Generator, ranges: Iterable[Sequence[float | int]])
 
 def random_color(rng: np.random.Generator) -> Vector:
     """A dye: neutral, muted, vivid, an earth color or navy."""
-    return _color_of(rng, DYES[rng.choice(list(DYES), p=[odds for odds, *_ in DYES.values()])][1:])
+    kind = rng.choice(list(_DYES), p=[odds for odds, *_ in _DYES.values()])
+    return _color_of(rng, _DYES[kind][1:])
 
 
 def accent(rng: np.random.Generator, base: Vector) -> Vector:
@@ -162,15 +163,15 @@ class Fabric:
         return PATTERNS[self.pattern][1](s, self.rng(0), self.base, self.other)
 
 
-LEATHER_SHOES = ("flats", "sandals", "ankle_boots", "boots")
-USUAL = {
+_LEATHER_SHOES = ("flats", "sandals", "ankle_boots", "boots")
+_USUAL = {
     "denim": ((0.57, 0.63), (0.3, 0.75), (0.12, 0.6)),
     "cotton": ((0.06, 0.13), (0.15, 0.5), (0.2, 0.75)),
     "leather": ((0.05, 0.09), (0.2, 0.7), (0.06, 0.4)),
     "suit": ((0.58, 0.68), (0.05, 0.35), (0.06, 0.4)),
 }
 """Hue, saturation and value of usual cloths."""
-CLOTHS = {
+_CLOTHS = {
     "jeans": ("denim", 0.85),
     "denim_jacket": ("denim", 0.9),
     "chinos": ("cotton", 0.6),
@@ -192,19 +193,19 @@ CLOTHS = {
     "wide": ("cotton", 0.4),
 }
 """Usual cloth of a kind of garment, and how often it is of that color."""
-COLORS = (
+_COLORS = (
     (("shirt", "socks", "sneakers"), 0.45, ((0, 1), (0, 0.05), (0.72, 0.87))),
     (("sneakers", "leggings", "coat", "puffer", "slim"), 0.4, ((0, 1), (0, 0.1), (0.06, 0.16))),
-    (("sneakers", *LEATHER_SHOES), 0.6, ((0.03, 0.12), (0.0, 0.5), (0.1, 0.7))),
+    (("sneakers", *_LEATHER_SHOES), 0.6, ((0.03, 0.12), (0.0, 0.5), (0.1, 0.7))),
 )
 """Kinds of garments, how often they are (if of no color so far) of these colors; otherwise any dye.
 """
-PATTERN_RULES = (
+_PATTERN_RULES = (
     (("jeans", "denim_jacket"), "denim", 1, ()),
     (("cargo", "hooded_jacket", "shorts"), "camouflage", 0.25, ()),
     (("puffer", "leggings", "backpack"), "plain", 0.7, ()),
     (("cap", "brim_hat"), "plain", 1, ("camouflage", "melange", "checks", "herringbone")),
-    (("sneakers", *LEATHER_SHOES, "belt", "watch", "necklace", "glasses"), "plain", 1, ()),
+    (("sneakers", *_LEATHER_SHOES, "belt", "watch", "necklace", "glasses"), "plain", 1, ()),
 )
 """Kinds of garments, the pattern that they get instead of a random one, how often, and patterns
 that they keep.
@@ -221,7 +222,7 @@ def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabr
         odds = plain_ones
     pattern = choice(rng, odds)
     base = _dye(rng, kind)
-    for kinds, usual, odds, kept in PATTERN_RULES:
+    for kinds, usual, odds, kept in _PATTERN_RULES:
         if kind in kinds and pattern not in kept and (odds == 1 or rng.random() < odds):
             pattern = usual
     return Fabric(pattern, base, accent(rng, base), int(rng.integers(1 << 31)))
@@ -229,8 +230,8 @@ def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabr
 
 def _dye(rng: np.random.Generator, kind: str) -> Vector:
     """A usual color of a kind of garment, or any."""
-    cloth, odds = CLOTHS.get(kind, ("cotton", 0.0))
-    for kinds, share, ranges in (((kind,), odds, USUAL[cloth]), *COLORS):
+    cloth, odds = _CLOTHS.get(kind, ("cotton", 0.0))
+    for kinds, share, ranges in (((kind,), odds, _USUAL[cloth]), *_COLORS):
         if kind in kinds and rng.random() < share:
             return _color_of(rng, ranges)
     return random_color(rng)
@@ -250,12 +251,12 @@ def _seed(rng: np.random.Generator) -> int:
     return int(rng.integers(1 << 20))
 
 
-def plain(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
+def _plain(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
     """One dye, slightly uneven."""
     return base * (1 + 0.03 * Ripples(rng, 0.12)(s.cloth[:, :3]))[:, None]
 
 
-def stripes(
+def _stripes(
     s: Spots, rng: np.random.Generator, base: Vector, other: Vector, upright: bool = False
 ) -> Points:
     """Stripes around (or, upright, along) the limb."""
@@ -263,7 +264,7 @@ def stripes(
     return mix(base, other, _lines(s.around if upright else s.along, period, share * period))
 
 
-def checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+def _checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Gingham, or tartan with thin lines of a third dye."""
     period, third, tartan = rng.choice([0.03, 0.05, 0.08]), accent(rng, base), rng.random() < 0.6
     result = mix(
@@ -277,7 +278,7 @@ def checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> P
     return result
 
 
-def dots(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+def _dots(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Polka dots in a triangular grid."""
     period, size = rng.choice([0.03, 0.045, 0.07]), rng.uniform(0.2, 0.34)
     row = np.floor(s.along / period)
@@ -286,7 +287,7 @@ def dots(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Poi
     return mix(base, other, band(np.sqrt(x * x + y * y), -1, size * period, 0.002))
 
 
-def flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+def _flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Scattered blossoms of five petals in two dyes."""
     period, seed, third = rng.choice([0.05, 0.075]), _seed(rng), accent(rng, base)
     plane = np.stack([s.around, s.along], -1) / period
@@ -303,7 +304,7 @@ def flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> 
     )
 
 
-def mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+def _mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Camouflage, batik, tie-dye: thresholded or soft noise."""
     scale, seed = rng.choice([0.03, 0.06, 0.1]), _seed(rng)
     width = 0.02 if rng.random() < 0.5 else 0.2
@@ -315,13 +316,13 @@ def mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> 
     return mix(mix(base, other, first), third, 0.8 * second)
 
 
-def melange(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+def _melange(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Knit: fine grain."""
     seed, share = _seed(rng), rng.uniform(0.2, 0.5)
     return mix(base, other, share * _grain(s, 0.006, 0.009, seed))
 
 
-def denim(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
+def _denim(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
     """Faded on the front of the thighs and at creases, grained along the thread."""
     cloud, seed = Ripples(rng, 0.15), _seed(rng)
     fade, holes = rng.uniform(0.1, 0.6), rng.random() < 0.12
@@ -350,7 +351,7 @@ def denim(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> P
     )
 
 
-CAMOUFLAGES = np.asarray(
+_CAMOUFLAGES = np.asarray(
     [
         [[0.24, 0.26, 0.14], [0.10, 0.12, 0.07], [0.33, 0.24, 0.15], [0.52, 0.47, 0.32]],
         [[0.68, 0.58, 0.42], [0.52, 0.42, 0.29], [0.40, 0.32, 0.22], [0.78, 0.70, 0.56]],
@@ -362,9 +363,9 @@ CAMOUFLAGES = np.asarray(
 """Four colors each: earth, sand, town, sea."""
 
 
-def camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vector) -> Points:
+def _camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vector) -> Points:
     """Torn blots of four colors, larger ones below smaller ones."""
-    dyes = CAMOUFLAGES[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])]
+    dyes = _CAMOUFLAGES[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])]
     scale, seed = rng.uniform(0.045, 0.09), _seed(rng)
     p = s.cloth[:, :3] / scale * np.asarray([0.8, 1.4, 0.8], np.float32)
     warp = np.stack([lattice(2.3 * p + k, seed + k) for k in range(3)], -1) - 0.5
@@ -375,7 +376,7 @@ def camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vector
     return result
 
 
-def herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+def _herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Zigzags of slanted threads."""
     period = rng.choice([0.03, 0.045])
     pitch = rng.choice([0.008, 0.012])
@@ -384,7 +385,7 @@ def herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector)
     return mix(base, base + share * (other - base), _lines(s.along + side, pitch, 0.5 * pitch))
 
 
-def argyle(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+def _argyle(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Diamonds with thin lines across."""
     period, third = rng.choice([0.06, 0.09]), accent(rng, other)
     x, y = s.around / period, s.along / (1.6 * period)
@@ -394,7 +395,7 @@ def argyle(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> P
     return mix(mix(base, other, diamond), third, 0.8 * lines)
 
 
-def dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+def _dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """One dye runs into another along the garment, or in rings around a middle (tie-dye)."""
     rings, level, wide = rng.random() < 0.5, rng.uniform(-0.35, 0.0), rng.uniform(0.05, 0.25)
     wobble, third = lattice(s.cloth[:, :3] / 0.05, _seed(rng)) - 0.5, accent(rng, other)
@@ -409,7 +410,7 @@ def dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> 
     )
 
 
-def tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+def _tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """Woven in two threads of nearly one color."""
     seed, share = _seed(rng), rng.uniform(0.08, 0.25)
     return mix(
@@ -417,7 +418,7 @@ def tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Po
     )
 
 
-def cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
+def _cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
     """Plaits of thick yarn: light and dark, no second dye."""
     period = rng.choice([0.05, 0.07])
     x, y = (s.around / period) % 1 - 0.5, s.along / 0.045
@@ -427,7 +428,7 @@ def cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector)
     return base * (1 + 0.13 * strand * inside + 0.07 * ribs * (1 - inside))[:, None]
 
 
-def color_blocks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
+def _color_blocks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
     """A chest (or thigh) in another dye, with a line between."""
     level, wide, third = rng.uniform(-0.15, 0.06), rng.uniform(0.01, 0.03), accent(rng, other)
     return mix(
@@ -436,21 +437,21 @@ def color_blocks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector
 
 
 PATTERNS: dict[str, tuple[float, Callable]] = {
-    "plain": (0.05, plain),
-    "stripes": (0.2, stripes),
-    "upright": (0.08, functools.partial(stripes, upright=True)),
-    "checks": (0.17, checks),
-    "dots": (0.06, dots),
-    "flowers": (0.09, flowers),
-    "mottled": (0.05, mottled),
-    "camouflage": (0.05, camouflage),
-    "melange": (0.03, melange),
-    "blocks": (0.09, color_blocks),
-    "herringbone": (0.03, herringbone),
-    "argyle": (0.03, argyle),
-    "dip_dye": (0.04, dip_dye),
-    "cable_knit": (0.03, cable_knit),
-    "tweed": (0.0, tweed),
-    "denim": (0.0, denim),
+    "plain": (0.05, _plain),
+    "stripes": (0.2, _stripes),
+    "upright": (0.08, functools.partial(_stripes, upright=True)),
+    "checks": (0.17, _checks),
+    "dots": (0.06, _dots),
+    "flowers": (0.09, _flowers),
+    "mottled": (0.05, _mottled),
+    "camouflage": (0.05, _camouflage),
+    "melange": (0.03, _melange),
+    "blocks": (0.09, _color_blocks),
+    "herringbone": (0.03, _herringbone),
+    "argyle": (0.03, _argyle),
+    "dip_dye": (0.04, _dip_dye),
+    "cable_knit": (0.03, _cable_knit),
+    "tweed": (0.0, _tweed),
+    "denim": (0.0, _denim),
 }
 """Odds among fabrics that are not plain, and the pattern."""

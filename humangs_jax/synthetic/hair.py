@@ -12,16 +12,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.synthetic import surfaces
-from humangs_jax.synthetic.anatomy import (
-    HEAD,
-    LEFT_EYE,
-    NECK,
-    RIGHT_EYE,
-    SPINE3,
-    Anatomy,
-    Vector,
-    smoothstep,
-)
+from humangs_jax.synthetic.anatomy import Anatomy, Joint, Vector, smoothstep
 from humangs_jax.synthetic.outfits import HEADWEAR, drawn, row
 from humangs_jax.synthetic.surfaces import (
     Field,
@@ -52,10 +43,9 @@ CUTS = {
     "braid": (0.01, 0.05, 0.008),
 }
 """Odds for men and women, thickness (metres, or their range)."""
-NOT_UNDER_HEADWEAR = ("curly", "afro", "quiff", "bun")
-"""Cuts that no headwear fits over."""
 LONG_CUTS = ("bob", "long")
-SHELLS = {
+"""Cuts that fall over the ears."""
+_SHELLS = {
     "curly": (0.3, 0.035, 0),
     "afro": (0.1, 0.05, 0),
     "quiff": (0.2, 0.05, 1),
@@ -64,9 +54,9 @@ SHELLS = {
 """Height of the bumps of hair on the scalp as a share of the thickness, their width in metres, and
 1 if the hair is parted.
 """
-TAILS = {"ponytail": ((0.2, 0.38), 0.0), "braid": ((0.28, 0.42), 0.028)}
+_TAILS = {"ponytail": ((0.2, 0.38), 0.0), "braid": ((0.28, 0.42), 0.028)}
 """Range of their lengths; distance of the knots, metres."""
-FRINGES = {"straight": 0.28, "parted": 0.34, "side": 0.38}
+_FRINGES = {"straight": 0.28, "parted": 0.34, "side": 0.38}
 """Odds of a fringe of longer hair."""
 BEARDS = {"none": 0.5, "stubble": 0.2, "moustache": 0.05, "goatee": 0.09, "full": 0.16}
 """Odds for men."""
@@ -79,7 +69,7 @@ class Haircut:
     cut: str
     """Name of the cut, one of CUTS."""
     fringe: str
-    """Kind of fringe, one of FRINGES."""
+    """Kind of fringe, one of _FRINGES."""
     side: float
     """Side of the parting and of a braid, +1 or -1."""
     thickness: float
@@ -105,7 +95,9 @@ def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set
     odds = {name: value[0 if male else 1] for name, value in CUTS.items()}
     if male and years > 45:
         odds["bald"] *= 3.0
-    cut = drawn(rng, odds | (dict.fromkeys(NOT_UNDER_HEADWEAR, 0) if headwear else {}))
+    if headwear:
+        odds |= dict.fromkeys(("curly", "afro", "quiff", "bun"), 0)
+    cut = drawn(rng, odds)
     thickness = row(rng, {name: value[2] for name, value in CUTS.items()}, cut)
     if headwear:
         thickness = min(thickness, 0.010)
@@ -123,7 +115,7 @@ def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set
     if male and years > 17:
         beard = drawn(rng, BEARDS)
     long = 0.35 if rng.random() < 0.8 else 1.0
-    fringe, side = drawn(rng, FRINGES), float(rng.choice([-1, 1]))
+    fringe, side = drawn(rng, _FRINGES), float(rng.choice([-1, 1]))
     beard_length = rng.uniform(0.0025, 0.004) + long * rng.uniform(0.0, 0.016)
     grain = rng.uniform(0.5, 0.95)
     return Haircut(
@@ -142,9 +134,9 @@ def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set
 
 SKULL = np.asarray([0.0, 0.345, 0.02])
 """Middle of the skull in template coordinates."""
-CROWN = 0.4356
+_CROWN = 0.4356
 """Height of the crown, template coordinates."""
-NECK_HEIGHT = 0.189
+_NECK_HEIGHT = 0.189
 """Height of the neck, template coordinates."""
 
 SHORT_LINE = (
@@ -154,9 +146,9 @@ SHORT_LINE = (
 """Azimuths and heights: forehead, temple, sideburn before the ear, above and behind the ear, nape.
 """
 CAP_LINE = ([0.0, 0.8, 1.5, 2.2, 3.15], [0.375, 0.37, 0.345, 0.325, 0.315])
-TUBE_COLUMNS = 60
+"""The same of a cap's edge."""
 
-FRINGE_LINES = {
+_FRINGE_LINES = {
     "straight": (
         [-3.15, -1.2, -1.12, -0.9, -0.5, 0.0, 0.5, 0.9, 1.12, 1.2, 3.15],
         [-9.0, -9.0, 0.30, 0.362, 0.384, 0.388, 0.384, 0.362, 0.30, -9.0, -9.0],
@@ -184,14 +176,14 @@ def style(
     kind, parts = haircut.cut, []
     # long hair falls as a tube, short hair is a shell of the scalp
     if kind in LONG_CUTS:
-        opening, wave = fringe(rng, haircut), haircut.wave
+        opening, wave = _fringe(rng, haircut), haircut.wave
         parts.append(
             falling_tube(
                 rng, anatomy, haircut.thickness, haircut.bottom, opening, wave=wave, over=over
             )
         )
     elif kind not in ("buzz", "bald"):
-        bumps, size, parted = SHELLS.get(kind, (0.12, 0.035, 1))
+        bumps, size, parted = _SHELLS.get(kind, (0.12, 0.035, 1))
         quiff = 0.0
         if kind == "quiff":
             quiff = rng.uniform(0.012, 0.026)
@@ -201,24 +193,24 @@ def style(
                 rng, anatomy, haircut.thickness, bumps, size, shift=shift, quiff=quiff, side=side
             )
         )
-    if kind in TAILS:
-        length, knots = TAILS[kind]
-        parts.append(tail(rng, anatomy, rng.uniform(*length), knots))
+    if kind in _TAILS:
+        length, knots = _TAILS[kind]
+        parts.append(_tail(rng, anatomy, rng.uniform(*length), knots))
     if kind == "bun":
-        parts.append(bun(anatomy, rng.uniform(0.032, 0.05), rng.uniform(0.0, 1.1)))
+        parts.append(_bun(anatomy, rng.uniform(0.032, 0.05), rng.uniform(0.0, 1.1)))
     if haircut.beard in ("moustache", "goatee", "full"):
-        parts.append(beard(rng, anatomy, haircut.beard_length, haircut.beard))
+        parts.append(_beard(rng, anatomy, haircut.beard_length, haircut.beard))
     return parts
 
 
-Opening = Callable[[Field, Field], Field]
+_Opening = Callable[[Field, Field], Field]
 """Azimuths in (-pi, pi] and template heights -> positive where hair or cloth leaves the face free.
 """
 
 
-def fringe(rng: np.random.Generator, haircut: Haircut) -> Opening:
+def _fringe(rng: np.random.Generator, haircut: Haircut) -> _Opening:
     """Metres above the ragged edge of hair around the face."""
-    angles, heights = (np.asarray(x) for x in FRINGE_LINES[haircut.fringe])
+    angles, heights = (np.asarray(x) for x in _FRINGE_LINES[haircut.fringe])
     phase = rng.uniform(0, 6.28, 3)
 
     def above(azimuths, height):
@@ -303,7 +295,7 @@ def falling_tube(
     anatomy: Anatomy,
     thickness: float,
     bottom: float,
-    opening: Opening,
+    opening: _Opening,
     wave: float = 0.004,
     ends: float | None = None,
     over: float = 0.0,
@@ -321,7 +313,7 @@ def falling_tube(
     head = (
         (template[:, 1] > 0.24) & (np.abs(template[:, 0]) < 0.1) & ~ears & (template[:, 2] < 0.125)
     )
-    levels = np.concatenate([np.arange(-0.3, 0.24, 0.02), np.linspace(0.24, CROWN - 0.0015, 24)])
+    levels = np.concatenate([np.arange(-0.3, 0.24, 0.02), np.linspace(0.24, _CROWN - 0.0015, 24)])
     spine = np.repeat(center[None, [0, 2]], len(levels), 0)
     points = skin.vertices[head]
     skull = blurred(boundaries(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.012))
@@ -330,10 +322,10 @@ def falling_tube(
     points = skin.vertices[trunk]
     back = blurred(boundaries(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.02), 2)
 
-    top = CROWN + (CROWN - SKULL[1]) * (scale - 1)
+    top = _CROWN + (_CROWN - SKULL[1]) * (scale - 1)
     dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))
     rows = np.concatenate([dome, np.arange(SKULL[1] - 0.02, min(bottom, 0.3), -0.022)])
-    row_height, angle, faces = surfaces.tube(rows, surfaces.circle(TUBE_COLUMNS))
+    row_height, angle, faces = surfaces.tube(rows, surfaces.circle(60))
     height = to_rest(row_height)
     inner = center[1] + (height - center[1]) / scale
     brim, summit = to_rest(0.385), center[1] + (to_rest(top) - center[1]) / scale
@@ -360,20 +352,20 @@ def falling_tube(
     )
 
 
-def bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
+def _bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
     """A ball of hair on the back of the head."""
     direction = np.asarray([0, np.sin(elevation), -np.cos(elevation)])
     center = _skull(anatomy)[1] + direction * (0.095 + 0.55 * radius)
     directions, faces = surfaces.ball(12, 20)
     vertices = center + directions * (radius * np.asarray([1.0, 0.9, 0.85]))
-    return _painted(rigid(vertices, faces, HEAD, len(anatomy.joints)))
+    return _painted(rigid(vertices, faces, Joint.HEAD, len(anatomy.joints)))
 
 
-def tail(rng: np.random.Generator, anatomy: Anatomy, length: float, knots: float) -> Surface:
+def _tail(rng: np.random.Generator, anatomy: Anatomy, length: float, knots: float) -> Surface:
     """A tapering tail from the back of the head down the back; a braid has knots, `knots` metres
     apart.
     """
-    start = np.asarray([0, _skull(anatomy)[0](0.36), anatomy.joints[HEAD, 2] - 0.105])
+    start = np.asarray([0, _skull(anatomy)[0](0.36), anatomy.joints[Joint.HEAD, 2] - 0.105])
     rows = 40 if knots else 16
     columns = 14
     t = np.linspace(0, 1, rows)
@@ -387,7 +379,7 @@ def tail(rng: np.random.Generator, anatomy: Anatomy, length: float, knots: float
     vertices, faces = surfaces.sweep(line, np.asarray([1.0, 0.0, 0.0]), radius[:, None], columns)
     weights = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
     follow = smoothstep(0.1, 1.0, np.repeat(t, columns)) * 0.8
-    weights[:, HEAD], weights[:, SPINE3] = 1 - follow, follow
+    weights[:, Joint.HEAD], weights[:, Joint.SPINE3] = 1 - follow, follow
     return _painted(Surface(vertices, faces, weights))
 
 
@@ -404,7 +396,7 @@ def beard_field(template: Points, kind: str) -> Field:
     return np.where((y > 0.19) & (x < 0.08) & (z > 0.0), field, -1.0)
 
 
-def beard(rng: np.random.Generator, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
+def _beard(rng: np.random.Generator, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
     """A beard that thins out towards the cheeks."""
     template = anatomy.skin.template
     field = beard_field(template, kind)
@@ -432,7 +424,7 @@ def eyeballs(anatomy: Anatomy) -> Surface:
     """
     parts, (directions, faces) = [], surfaces.ball(14, 22)
     directions = directions.astype(np.float32)
-    for joint in (LEFT_EYE, RIGHT_EYE):
+    for joint in (Joint.LEFT_EYE, Joint.RIGHT_EYE):
         center = anatomy.joints[joint]
         lids = np.sort(np.linalg.norm(anatomy.skin.vertices - center, axis=1))[:12]
         eye = rigid(center + directions * lids.mean() * 0.985, faces, joint, len(anatomy.joints))
@@ -444,13 +436,13 @@ def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
     """Template heights of head and neck -> rest heights of the person; the skull's middle (3,) at
     rest.
     """
-    neck = anatomy.joints[NECK, 1]
-    factor = (anatomy.skin.vertices[:, 1].max() - neck) / (CROWN - NECK_HEIGHT)
+    neck = anatomy.joints[Joint.NECK, 1]
+    factor = (anatomy.skin.vertices[:, 1].max() - neck) / (_CROWN - _NECK_HEIGHT)
 
     def to_rest(y):
-        return neck + (y - NECK_HEIGHT) * factor
+        return neck + (y - _NECK_HEIGHT) * factor
 
-    return to_rest, np.asarray([0.0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01])
+    return to_rest, np.asarray([0.0, to_rest(SKULL[1]), anatomy.joints[Joint.HEAD, 2] - 0.01])
 
 
 def _falling_weights(
@@ -460,7 +452,7 @@ def _falling_weights(
     x, y, _ = anatomy.skin.template.T
     near = np.flatnonzero((np.abs(x) < 0.15) & (y > -0.3) & (y < 0.26))[::2]
     head = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
-    head[:, HEAD] = 1
+    head[:, Joint.HEAD] = 1
     own = smoothstep(0.06, 0.25, template_y)[:, None]
     lower = template_y < 0.26
     trunk = head.copy()

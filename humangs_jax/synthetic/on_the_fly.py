@@ -41,26 +41,8 @@ from humangs_jax.synthetic.surroundings import pick
 
 POSES = 2
 """Poses of an example."""
-MIXING = 0.5
-"""Largest share of the way to the nearest pose: the other half of the way is reached from that
-pose.
-"""
-DYED_SHARE = 0.7
-"""Share of examples whose clothes get other colors."""
-CLOSE_SHARE = 0.2
-"""Share of close cameras among the targets."""
-DISPLACED = 1
-"""Number that is folded into the key of an example: the new key decides whether the body is
-displaced.
-"""
-COUNTED = 2
-"""The same for how many views there are."""
 Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
 """Numbers for the cameras of views, azimuths, poses, and shares of close cameras."""
-BACKGROUND = 1.0
-"""Color behind the person, linear."""
-DARKEST_ALBEDO = 0.01
-"""Least albedo of a point."""
 
 
 @configuration
@@ -155,20 +137,21 @@ def on_the_fly_example(
         )
     numbers = _draw_numbers(bank, key, config)
     if person is not None:
-        numbers["person"] = (
-            jnp.asarray(person + 0.5) / bank.people
-        )  # which `pick` takes for this one
+        # `pick` takes this number for that person
+        numbers["person"] = jnp.asarray(person + 0.5) / bank.people
     scene = scene_from(numbers, bank)
     count = None
+    # keys of their own decide how many views there are, and whether the body is displaced
     if config.view_counts:
-        number = jax.random.uniform(jax.random.fold_in(key, COUNTED))
+        number = jax.random.uniform(jax.random.fold_in(key, 2))
         count = jnp.asarray(config.view_counts, jnp.int32)[pick(number, len(config.view_counts))]
     plans = _plans(numbers, config, count)
     if config.input_size == config.target_size:  # one loop over all views: half of the compilation
         both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *plans)
         views = _views(bank, scene, both, config, config.input_size)
+        alike = replace(views, betas=None)  # betas have no axis of views
         parts = [
-            _some(views, part)
+            replace(jax.tree.map(lambda x, part=part: x[part], alike), betas=views.betas)
             for part in (slice(config.input_views), slice(config.input_views, None))
         ]
     else:
@@ -178,7 +161,7 @@ def on_the_fly_example(
         ]
     flipped = numbers["mirrored"] < config.mirrored_share
     if config.displaced_share:
-        displaced = jax.random.uniform(jax.random.fold_in(key, DISPLACED)) < config.displaced_share
+        displaced = jax.random.uniform(jax.random.fold_in(key, 1)) < config.displaced_share
         flipped &= ~displaced
 
     def choose(a, b):
@@ -221,15 +204,16 @@ def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:
     which = pick(numbers["poses"][:, 0], bank.rotations.shape[1])
     poses = bank.rotations[person, which]
     nearest = bank.rotations[person, bank.nearest[person, which]]
-    rotations = quaternion.interpolate(poses, nearest, MIXING * numbers["poses"][:, 1:])
+    # up to half of the way to the nearest pose: the other half is reached from that pose
+    rotations = quaternion.interpolate(poses, nearest, 0.5 * numbers["poses"][:, 1:])
     dyes = surroundings.dyes_from(
         numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person]
     )
-    dyes = jnp.where(numbers["dyed"] < DYED_SHARE, dyes, jnp.eye(3))
+    dyes = jnp.where(numbers["dyed"] < 0.7, dyes, jnp.eye(3))  # others keep their colors
     lights = surroundings.lights_from(numbers["lights"])
 
     def pose(rotations):
-        vertices, normals, translation = pose_person(bank, person, rotations)
+        vertices, normals, translation = _pose_person(bank, person, rotations)
         openness, lit = surroundings.shaded_vertices(vertices, normals, lights.directions[0], faces)
         values = jnp.concatenate([normals, openness[:, None], lit[:, None]], axis=-1)
         return vertices, translation, values[faces].reshape(faces.shape[0], 15)
@@ -238,7 +222,7 @@ def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:
     return Scene(person, rotations, translations, vertices, corners, dyes, lights)
 
 
-def pose_person(
+def _pose_person(
     bank: PeopleBank, person: Int[Array, ""], rotations: Float[Array, "j 3"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "3"]]:
     """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the
@@ -281,7 +265,7 @@ def _plans(
     own, other = (pick(numbers[name], POSES) for name in ("input_poses", "target_poses"))
     own = jnp.where(numbers["mixed"] < config.mixed_pose_share, own, 0)
     anywhere = surroundings.azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
-    close = jnp.full(config.target_views, CLOSE_SHARE)
+    close = jnp.full(config.target_views, 0.2)  # share of close cameras
     inputs = numbers["input_cameras"], azimuths, own, jnp.zeros(config.input_views)
     if count is not None:
         inputs = jax.tree.map(
@@ -313,11 +297,6 @@ def _views(
     if not config.depths:
         depths = None
     return SubjectViews(images, masks, found, rotations, translations, betas, depths=depths)
-
-
-def _some(views: SubjectViews, part: slice) -> SubjectViews:
-    """Views of a range; betas have no axis of views."""
-    return replace(jax.tree.map(lambda x: x[part], replace(views, betas=None)), betas=views.betas)
 
 
 def draw_view(
@@ -385,7 +364,7 @@ def _light_pixels(
         lit = _color_points(bank, scene, corners[face], face, weight, behind[face])
         return start + step, colors.at[pixels].set(lit, mode="drop")
 
-    blank = jnp.full((count, 3), BACKGROUND, weights.dtype)
+    blank = jnp.ones((count, 3), weights.dtype)
     return lax.while_loop(lambda state: state[0] < total, light, (jnp.zeros((), jnp.int32), blank))[
         1
     ]
@@ -412,7 +391,7 @@ def _color_points(
     dye = scene.dyes[pieces]
     albedo = sum(painted[:, i : i + 1] * dye[:, :, i] for i in range(3)) / 255
     slopes = (painted[:, 3:] - SLOPE_ZERO) * SLOPE_STEP
-    albedo, sheen = jnp.clip(albedo, DARKEST_ALBEDO, None), bank.sheen[person, pieces]
+    albedo, sheen = jnp.clip(albedo, 0.01, None), bank.sheen[person, pieces]
     return surroundings.light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
 
 
@@ -457,10 +436,6 @@ def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
     )
 
 
-MakeExample = Callable[[Key, int], Example]
-"""(key, number of input views) -> Example; pure, usually jitted with the number static."""
-
-
 @dataclasses.dataclass(frozen=True)
 class GeneratedSource:
     """Examples that `make` computes from keys; all keys are of people of one split
@@ -469,8 +444,10 @@ class GeneratedSource:
     Raises: ValueError if there is no such split.
     """
 
-    make: MakeExample
-    """Called as make(key, input_count); runs wherever it is jitted to run."""
+    make: Callable[[Key, int], Example]
+    """Pure function, called as make(key, input_count); runs wherever it is jitted to run, usually
+    with the count static.
+    """
     split: str = "train"
     """Name of the split that the people are from."""
     input_counts: tuple[int, ...] = (4,)
@@ -576,12 +553,6 @@ def _compiled() -> Callable[..., Example]:
     )
 
 
-def person_drawn(bank: PeopleBank, key: Key, config: OnTheFlyConfig) -> int:
-    """The seed of the person of a bank that `on_the_fly_example` shows."""
-    number = _draw_numbers(bank, key, config)["person"]
-    return int(bank.seeds[pick(number, bank.people)])
-
-
 def on_the_fly_source(
     bank: PeopleBank,
     config: OnTheFlyConfig,
@@ -601,10 +572,12 @@ def on_the_fly_source(
     def drawn(count: int) -> OnTheFlyConfig:
         return dataclasses.replace(config, input_views=count)
 
-    return GeneratedSource(
-        make=lambda key, count: jitted_example(bank, key, config=drawn(count)),
-        split=bank.split,
-        input_counts=input_counts,
-        on_host=on_host,
-        person_of=lambda key, count: person_drawn(bank, key, drawn(count)),
-    )
+    def make(key: Key, count: int) -> Example:
+        return jitted_example(bank, key, config=drawn(count))
+
+    def person_of(key: Key, count: int) -> int:
+        """The seed of the person that `make` shows."""
+        number = _draw_numbers(bank, key, drawn(count))["person"]
+        return int(bank.seeds[pick(number, bank.people)])
+
+    return GeneratedSource(make, bank.split, input_counts, on_host, person_of)

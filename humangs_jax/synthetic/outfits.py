@@ -35,19 +35,12 @@ SKIRTS = ("short_skirt", "long_skirt", "pleated_skirt")
 DRESSES = ("short_dress", "long_dress", "shirt_dress")
 HEADWEAR = ("beanie", "cap", "brim_hat", "headscarf")
 SHOES = ("sneakers", "flats", "sandals", "ankle_boots", "boots")
-EXTRAS = (
-    "scarf",
-    "belt",
-    "tie",
-    "glasses",
-    "sunglasses",
-    "backpack",
-    "shoulder_bag",
-    "socks",
-    "necklace",
-    "watch",
+KINDS = (
+    *(*TOPS, *OUTER, *BOTTOMS, *SKIRTS, *DRESSES, *HEADWEAR, *SHOES),
+    *("scarf", "belt", "tie", "glasses", "sunglasses", "backpack", "shoulder_bag", "socks"),
+    *("necklace", "watch"),
 )
-KINDS = TOPS + OUTER + BOTTOMS + SKIRTS + DRESSES + HEADWEAR + SHOES + EXTRAS
+"""All kinds of garments."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +61,7 @@ Odds = Mapping[str, float | int]
 
 
 @dataclasses.dataclass(frozen=True)
-class Style:
+class _Style:
     """Clothes that go together."""
 
     men: float
@@ -99,8 +92,8 @@ class Style:
     """1 less the probability of sunglasses."""
 
 
-STYLES = {
-    "casual": Style(
+_STYLES = {
+    "casual": _Style(
         0.36,
         0.27,
         {
@@ -133,7 +126,7 @@ STYLES = {
         outer=0.28,
         skirt=0.22,
     ),
-    "formal": Style(
+    "formal": _Style(
         0.16,
         0.1,
         {"shirt": 6, "blouse": 2, "turtleneck": 1, "sweater": 1},
@@ -145,7 +138,7 @@ STYLES = {
         skirt=0.4,
         headwear={"brim_hat": 0.1},
     ),
-    "sport": Style(
+    "sport": _Style(
         0.14,
         0.1,
         {"tee": 3, "tank": 2, "jersey": 2.5, "hoodie": 1.5, "longsleeve": 1},
@@ -155,7 +148,7 @@ STYLES = {
         scarf=0.03,
         headwear={"cap": 0.35},
     ),
-    "winter": Style(
+    "winter": _Style(
         0.16,
         0.14,
         {"sweater": 3, "turtleneck": 2, "longsleeve": 2, "shirt": 2, "hoodie": 1.5},
@@ -166,7 +159,7 @@ STYLES = {
         scarf=0.4,
         headwear={"beanie": 0.4, "brim_hat": 0.06},
     ),
-    "summer": Style(
+    "summer": _Style(
         0.12,
         0.12,
         {"tee": 4, "tank": 3, "shirt": 2, "polo": 1.5, "blouse": 1},
@@ -177,7 +170,7 @@ STYLES = {
         headwear={"cap": 0.2, "brim_hat": 0.22},
         no_sunglasses=0.85,
     ),
-    "street": Style(
+    "street": _Style(
         0.06,
         0.04,
         {"hoodie": 4, "tee": 4, "jersey": 2, "shirt": 1},
@@ -189,7 +182,7 @@ STYLES = {
         headwear={"cap": 0.35, "beanie": 0.2},
         no_sunglasses=0.85,
     ),
-    "dressed": Style(
+    "dressed": _Style(
         0.0,
         0.25,
         {},
@@ -202,7 +195,7 @@ STYLES = {
 
 
 @dataclasses.dataclass(frozen=True)
-class OneOf:
+class _OneOf:
     """One of some specifications, all of which are drawn."""
 
     options: tuple
@@ -212,7 +205,7 @@ class OneOf:
 
 
 def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
-    """A random value: of (low, high) a uniform number, of a dict of odds a name, of `OneOf` an
+    """A random value: of (low, high) a uniform number, of a dict of odds a name, of `_OneOf` an
     option, of a name a given value.
 
     Numbers stand for themselves.
@@ -221,7 +214,7 @@ def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
         return rng.uniform(*specification)
     if isinstance(specification, Mapping):
         return choice(rng, specification)
-    if isinstance(specification, OneOf):
+    if isinstance(specification, _OneOf):
         return rng.choice(
             [drawn(rng, option, **named) for option in specification.options], p=specification.odds
         )
@@ -236,16 +229,16 @@ def row(rng: np.random.Generator, table: Mapping[str, Any], kind: str, **named: 
     return values.get(kind, values.get("other"))
 
 
-SLEEVES = {
+_SLEEVES = {
     "tank": (0.122, 0.15),
     "tee": "short",
     "polo": (0.30, 0.38),
-    "jersey": OneOf(("short", (0.125, 0.15)), (0.7, 0.3)),
-    "shirt": OneOf(("long", (0.3, 0.4), (0.44, 0.55)), (0.62, 0.23, 0.15)),
-    "blouse": OneOf(("long", (0.25, 0.55))),
-    "other": OneOf(("long", (0.42, 0.6)), (0.78, 0.22)),
+    "jersey": _OneOf(("short", (0.125, 0.15)), (0.7, 0.3)),
+    "shirt": _OneOf(("long", (0.3, 0.4), (0.44, 0.55)), (0.62, 0.23, 0.15)),
+    "blouse": _OneOf(("long", (0.25, 0.55))),
+    "other": _OneOf(("long", (0.42, 0.6)), (0.78, 0.22)),
 }
-NECKS = {
+_NECKS = {
     "tee": {"crew": 6, "vee": 2.5, "scoop": 1.5},
     "tank": "scoop",
     "jersey": {"crew": 1, "vee": 1},
@@ -256,17 +249,8 @@ NECKS = {
     "hoodie": "crew",
     "other": {"crew": 6, "vee": 2, "scoop": 0.6},
 }
-MENS_NECKS = NECKS | {"other": {"crew": 6, "vee": 2, "scoop": 0}}
-PLAIN_TOPS = {
-    "tee": 0.5,
-    "sweater": 0.4,
-    "turtleneck": 0.65,
-    "hoodie": 0.65,
-    "shirt": 0.35,
-    "tank": 0.55,
-}
-"""How often tops are in one dye; the others: 0.35."""
-TOP_DETAILS = (
+"""Necklines of tops; men's other tops have no scoop."""
+_TOP_DETAILS = (
     ("print", ("tee", "hoodie", "longsleeve", "tank"), 0.5),
     ("number", ("jersey",), 1),
     ("zip", ("hoodie",), 0.4),
@@ -276,22 +260,19 @@ TOP_DETAILS = (
     ("open", ("shirt",), 0.2),
 )
 """Feature, kinds that can have it, how often they do."""
-LEG_ENDS = {"shorts": (-0.77, -0.56), "cropped": (-1.1, -0.93), "other": (-1.172, -1.14)}
-LEG_WIDTHS = {
+_LEG_ENDS = {"shorts": (-0.77, -0.56), "cropped": (-1.1, -0.93), "other": (-1.172, -1.14)}
+_LEG_WIDTHS = {
     "wide": (0.025, 0.065),
     "cargo": (0.015, 0.04),
     "track": (0.004, 0.03),
-    "jeans": OneOf(((0.0, 0.01), (0.01, 0.035))),
+    "jeans": _OneOf(((0.0, 0.01), (0.01, 0.035))),
     "chinos": (0.004, 0.02),
     "shorts": (0.002, 0.04),
     "slim": 0.002,
     "leggings": 0.0,
     "other": (0.004, 0.025),
 }
-LEG_LOOSENESS = {"leggings": 0.0, "slim": 0.1, "wide": 0.9, "cargo": 0.9, "other": (0.2, 0.7)}
-COAT_OPEN = {"puffer": 0.4, "coat": 0.5, "cardigan": 0.85, "vest": 0.5}
-"""How often coats are open; the others: 0.75."""
-COAT_ENDS = {
+_COAT_ENDS = {
     "coat": (-0.9, -0.6),
     "blazer": (-0.43, -0.38),
     "denim_jacket": (-0.34, -0.28),
@@ -299,7 +280,7 @@ COAT_ENDS = {
     "vest": (-0.34, -0.27),
     "other": (-0.42, -0.31),
 }
-COAT_DETAILS = {
+_COAT_DETAILS = {
     "jacket": {"collar", "pockets"},
     "denim_jacket": {"collar", "pockets"},
     "coat": {"pockets"},
@@ -308,20 +289,19 @@ COAT_DETAILS = {
     "hooded_jacket": {"hood"},
     "blazer": {"lapels"},
 }
-SHAFTS = {
-    "sneakers": OneOf((0.09, (0.11, 0.14)), (0.8, 0.2)),
+_SHAFTS = {
+    "sneakers": _OneOf((0.09, (0.11, 0.14)), (0.8, 0.2)),
     "flats": (0.068, 0.085),
     "sandals": 0.07,
     "ankle_boots": (0.13, 0.17),
     "boots": (0.24, 0.40),
 }
-SOLES = {"sneakers": (0.02, 0.036), "flats": (0.008, 0.02), "other": (0.015, 0.035)}
 
 
 def sample_outfit(rng: np.random.Generator, male: bool, years: float) -> tuple[Garment, ...]:
     """Clothes that go together, innermost first; shoes and what is carried last."""
-    name = drawn(rng, {name: style.men if male else style.women for name, style in STYLES.items()})
-    style = STYLES[name]
+    name = drawn(rng, {name: style.men if male else style.women for name, style in _STYLES.items()})
+    style = _STYLES[name]
     outer = rng.random() < style.outer
     if name == "dressed":
         worn = _dress(rng, outer)
@@ -347,7 +327,7 @@ def _made(
 
 
 def _separates(rng: np.random.Generator, name: str, male: bool, outer: bool) -> list[Garment]:
-    style = STYLES[name]
+    style = _STYLES[name]
     kind = drawn(rng, style.tops)
     if male and kind == "blouse":
         kind = "shirt"
@@ -380,8 +360,11 @@ def _top(
     outer: bool,
 ) -> Garment:
     long, short = WRIST - rng.uniform(0.0, 0.035), rng.uniform(0.27, 0.40)
-    sleeve = row(rng, SLEEVES, kind, long=long, short=short)
-    details = {row(rng, MENS_NECKS if male else NECKS, kind)}
+    sleeve = row(rng, _SLEEVES, kind, long=long, short=short)
+    necks = _NECKS
+    if male:
+        necks = _NECKS | {"other": {"crew": 6, "vee": 2, "scoop": 0}}
+    details = {row(rng, necks, kind)}
     cropped = not male and not tucked and rng.random() < 0.08
     # a tucked top ends just below the waist; cropped ones are rare
     if tucked:
@@ -401,7 +384,7 @@ def _top(
     elif style == "street":
         loose = 0.4 + 0.6 * loose
     # details that another garment would hide, or that need an open front, are left out
-    for detail, kinds, odds in TOP_DETAILS:
+    for detail, kinds, odds in _TOP_DETAILS:
         possible = kind in kinds and not (detail == "open" and (tucked or outer))
         if possible and (odds == 1 or rng.random() < odds) and not (detail == "hood_up" and outer):
             details.add(detail)
@@ -411,9 +394,9 @@ def _top(
     sleeve = float(min(sleeve, WRIST - 0.01) if outer else sleeve)
     if outer or tucked:
         loose = min(loose, 0.2)
-    plainness = 0.55
-    if style != "formal":
-        plainness = PLAIN_TOPS.get(kind, 0.35)
+    # how often tops are in one dye
+    plain = {"tee": 0.5, "sweater": 0.4, "turtleneck": 0.65, "hoodie": 0.65, "tank": 0.55}
+    plainness = 0.55 if style == "formal" else plain.get(kind, 0.35)
     depth = rng.uniform(0.04, 0.095)
     return _made(
         rng, kind, plainness, details, sleeve=sleeve, bottom=bottom, loose=loose, depth=depth
@@ -421,13 +404,15 @@ def _top(
 
 
 def _trousers(
-    rng: np.random.Generator, style: Style, male: bool, waist: float, tucked: bool, top: Garment
+    rng: np.random.Generator, style: _Style, male: bool, waist: float, tucked: bool, top: Garment
 ) -> Garment:
     kind = drawn(rng, style.bottoms)
     if kind == "leggings" and male and rng.random() < 0.7:
         kind = "shorts"
-    end = row(rng, LEG_ENDS | {"shorts": (-0.77, -0.62)} if male else LEG_ENDS, kind)
-    width, loose = row(rng, LEG_WIDTHS, kind), row(rng, LEG_LOOSENESS, kind)
+    end = row(rng, _LEG_ENDS | {"shorts": (-0.77, -0.62)} if male else _LEG_ENDS, kind)
+    width = row(rng, _LEG_WIDTHS, kind)
+    looseness = {"leggings": 0.0, "slim": 0.1, "wide": 0.9, "cargo": 0.9, "other": (0.2, 0.7)}
+    loose = row(rng, looseness, kind)
     # a tucked or cropped top shows the waist; under a longer one trousers may sit lower
     upper = waist
     if not tucked and top.sizes["bottom"] <= -0.25:
@@ -489,7 +474,7 @@ def _dress(rng: np.random.Generator, outer: bool) -> list[Garment]:
     else:
         end = rng.uniform(-0.78, -0.56)
     sleeve = float(
-        drawn(rng, OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25)))
+        drawn(rng, _OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25)))
     )
     neck = "collar"
     if kind != "shirt_dress":
@@ -508,11 +493,12 @@ def _dress(rng: np.random.Generator, outer: bool) -> list[Garment]:
     return [_made(rng, kind, 0.3, [neck, "sash"] if rng.random() < 0.35 else [neck], **sizes)]
 
 
-def _outer(rng: np.random.Generator, style: Style, worn: Sequence[Garment]) -> Garment:
+def _outer(rng: np.random.Generator, style: _Style, worn: Sequence[Garment]) -> Garment:
     kind = drawn(rng, style.coats)
-    is_open = rng.random() < COAT_OPEN.get(kind, 0.75)
-    bottom = row(rng, COAT_ENDS, kind)
-    details = {"open" if is_open else "closed"} | COAT_DETAILS.get(kind, set())
+    often_open = {"puffer": 0.4, "coat": 0.5, "cardigan": 0.85, "vest": 0.5}
+    is_open = rng.random() < often_open.get(kind, 0.75)
+    bottom = row(rng, _COAT_ENDS, kind)
+    details = {"open" if is_open else "closed"} | _COAT_DETAILS.get(kind, set())
     if kind == "puffer" and rng.random() < 0.4:
         details.add("hood")
     if kind == "coat":
@@ -536,7 +522,7 @@ def _outer(rng: np.random.Generator, style: Style, worn: Sequence[Garment]) -> G
 
 
 def _shoes(
-    rng: np.random.Generator, style: Style, male: bool, worn: Sequence[Garment]
+    rng: np.random.Generator, style: _Style, male: bool, worn: Sequence[Garment]
 ) -> list[Garment]:
     lower = next(g for g in worn if g.kind in BOTTOMS + SKIRTS + DRESSES)
     kind = drawn(rng, style.shoes)
@@ -546,10 +532,12 @@ def _shoes(
     )
     if kind == "boots" and (male or not narrow):
         kind = "ankle_boots"
-    height, sole = row(rng, SHAFTS, kind), row(rng, SOLES, kind)
+    height = row(rng, _SHAFTS, kind)
+    soles = {"sneakers": (0.02, 0.036), "flats": (0.008, 0.02), "other": (0.015, 0.035)}
+    sole = row(rng, soles, kind)
     result = []
     if kind in ("sneakers", "ankle_boots") and not covered and rng.random() < 0.75:
-        tall = drawn(rng, OneOf(((0.1, 0.17), (0.2, 0.4)), (0.75, 0.25)))
+        tall = drawn(rng, _OneOf(((0.1, 0.17), (0.2, 0.4)), (0.75, 0.25)))
         result.append(_made(rng, "socks", 0.7, height=max(float(tall), height + 0.02)))
     return [
         *result,
@@ -582,7 +570,7 @@ def _fastened(
 
 
 def _extras(
-    rng: np.random.Generator, style: Style, male: bool, years: float, worn: Sequence[Garment]
+    rng: np.random.Generator, style: _Style, male: bool, years: float, worn: Sequence[Garment]
 ) -> list[Garment]:
     kinds = {g.kind for g in worn}
     hooded = any("hood_up" in g.details for g in worn)

@@ -14,24 +14,11 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.synthetic import anatomy as kin
+from humangs_jax.synthetic.anatomy import Joint
 from humangs_jax.synthetic.surfaces import choice
 
-TRIES = 20
-"""Stances tried until one is within the limits of the joints; after that the person stands upright.
-"""
-BOTH_ARMS = 0.45
-"""Share of people whose arms have the same goal."""
-ATTEMPTS = 3
-"""Goals that are tried for an arm that cannot keep clear of the body."""
-CANDIDATES = 400
-"""Poses of an arm that are drawn for a goal."""
-HAND_LENGTH = 0.6
+_HAND_LENGTH = 0.6
 """Length from the wrist to a little beyond the knuckles, in lengths of the forearm."""
-HEAD_RADIUS = 0.14
-MARGIN = 0.015
-"""Metres that forearm and hand keep away from the body."""
-
-
 Capsule = tuple[kin.Vector, kin.Vector, float]
 """Two ends and a radius, metres."""
 
@@ -56,10 +43,13 @@ class Stance:
     """How far forward the trunk bends to keep the balance."""
 
 
-def sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations) -> Stance:
-    """Set legs and pelvis in `rotations`, keeping the pelvis's heading; returns the stance."""
-    heading, width = rotations[kin.PELVIS, 1], build.hip_width / build.leg
-    for _ in range(TRIES):
+def _sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations) -> Stance:
+    """Set legs and pelvis in `rotations`, keeping the pelvis's heading; returns the stance.
+
+    Stances beyond the limits of the joints are drawn again; after 20 the person stands upright.
+    """
+    heading, width = rotations[Joint.PELVIS, 1], build.hip_width / build.leg
+    for _ in range(20):
         stance = STANCES[choice(rng, {name: odds for name, (odds, _) in STANCES.items()})][1](
             rng, width
         )
@@ -78,7 +68,7 @@ def take_stance(
     of the two feet, metres.
     """
     turn = kin.turned(y=heading) @ kin.turned(x=stance.tilt, z=stance.roll)
-    rotations[kin.PELVIS] = kin.rotation_vector(turn)
+    rotations[Joint.PELVIS] = kin.rotation_vector(turn)
     feet = in_world(stance.feet, build.leg, heading)
     pelvis = np.asarray(
         [0.0, kin.highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg, 0.0]
@@ -234,7 +224,7 @@ legs.
 
 
 @dataclasses.dataclass(frozen=True)
-class Goal:
+class _Goal:
     """Target of a wrist. Angles are in radians; pairs are ranges."""
 
     odds: float
@@ -253,23 +243,23 @@ class Goal:
 
 
 GOALS = {
-    "hang": Goal(0.36, (0.28, -1.0, 0.1), (-1.5, -1.05), (-0.25, 0.35), (0.05, 0.6)),
-    "away": Goal(0.14, (0.6, -0.85, 0.08), (-1.3, -0.7), flexed=(0.05, 0.6)),
-    "hip": Goal(0.09, (0.35, -0.82, 0.12)),
-    "front": Goal(0.09, (0.2, -0.3, 0.8)),
-    "low": Goal(0.06, (0.15, -0.75, 0.5)),
-    "chest": Goal(0.05, (-0.2, -0.4, 0.45)),
-    "wave": Goal(0.05, (0.55, 0.45, 0.25), (-1.45, 1.25), collar=0.15),
-    "side": Goal(0.04, (1.0, -0.1, 0.1), (-0.4, 0.4), collar=0.05),
-    "up": Goal(0.03, (0.25, 1.0, 0.1), (-0.5, 1.25), collar=0.3),
-    "reach": Goal(0.03, (0.15, 0.1, 0.95), (-0.6, 0.5), (0.6, 1.5), (0.05, 0.9), 0.02),
-    "back": Goal(0.02, (0.3, -0.85, -0.45), (-1.45, -0.7), (-0.9, 0.0), (0.05, 0.9)),
-    "face": Goal(0.02, (-0.2, 0.2, 0.5), (-1.3, 0.4), (0.0, 1.5), (1.2, 2.35), 0.05),
-    "diagonal": Goal(0.02, (0.75, 0.65, 0.1), (0.0, 1.1), (-0.2, 0.9), (0.05, 0.7), 0.2),
+    "hang": _Goal(0.36, (0.28, -1.0, 0.1), (-1.5, -1.05), (-0.25, 0.35), (0.05, 0.6)),
+    "away": _Goal(0.14, (0.6, -0.85, 0.08), (-1.3, -0.7), flexed=(0.05, 0.6)),
+    "hip": _Goal(0.09, (0.35, -0.82, 0.12)),
+    "front": _Goal(0.09, (0.2, -0.3, 0.8)),
+    "low": _Goal(0.06, (0.15, -0.75, 0.5)),
+    "chest": _Goal(0.05, (-0.2, -0.4, 0.45)),
+    "wave": _Goal(0.05, (0.55, 0.45, 0.25), (-1.45, 1.25), collar=0.15),
+    "side": _Goal(0.04, (1.0, -0.1, 0.1), (-0.4, 0.4), collar=0.05),
+    "up": _Goal(0.03, (0.25, 1.0, 0.1), (-0.5, 1.25), collar=0.3),
+    "reach": _Goal(0.03, (0.15, 0.1, 0.95), (-0.6, 0.5), (0.6, 1.5), (0.05, 0.9), 0.02),
+    "back": _Goal(0.02, (0.3, -0.85, -0.45), (-1.45, -0.7), (-0.9, 0.0), (0.05, 0.9)),
+    "face": _Goal(0.02, (-0.2, 0.2, 0.5), (-1.3, 0.4), (0.0, 1.5), (1.2, 2.35), 0.05),
+    "diagonal": _Goal(0.02, (0.75, 0.65, 0.1), (0.0, 1.1), (-0.2, 0.9), (0.05, 0.7), 0.2),
 }
 ARMS = (
-    (kin.LEFT_COLLAR, kin.LEFT_SHOULDER, kin.LEFT_ELBOW, kin.LEFT_WRIST),
-    (kin.RIGHT_COLLAR, kin.RIGHT_SHOULDER, kin.RIGHT_ELBOW, kin.RIGHT_WRIST),
+    (Joint.LEFT_COLLAR, Joint.LEFT_SHOULDER, Joint.LEFT_ELBOW, Joint.LEFT_WRIST),
+    (Joint.RIGHT_COLLAR, Joint.RIGHT_SHOULDER, Joint.RIGHT_ELBOW, Joint.RIGHT_WRIST),
 )
 
 
@@ -295,7 +285,7 @@ def bend_arm(
     matrix, vector = kin.rotation_matrix, kin.rotation_vector
     collar, shoulder, elbow, wrist = ARMS[side]
     mirror = np.ones(3) if side == 0 else kin.MIRROR
-    n = CANDIDATES
+    n = 400  # poses of the arm
     wanted = GOALS[goal]
     rotations[collar] = (
         np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
@@ -323,7 +313,7 @@ def bend_arm(
     wrists = elbows + upper_world @ matrix(lower) @ (rest[wrist] - rest[elbow])
     reach = np.linalg.norm(rest[elbow] - rest[shoulder]) + np.linalg.norm(rest[wrist] - rest[elbow])
     offset = np.asarray(wanted.place) * [1 - 2 * side, 1, 1] + rng.normal(0, 0.08, 3)
-    target = positions[shoulder] + reach * world[kin.SPINE3] @ offset
+    target = positions[shoulder] + reach * world[Joint.SPINE3] @ offset
     capsules = _body_capsules(build, world, positions)
     if other_arm:
         capsules += _arm_capsules(build, positions, 1 - side)
@@ -331,7 +321,9 @@ def bend_arm(
         [_clearance(build, capsules, points) for points in _along(elbows, wrists)], axis=0
     )
     beyond = np.maximum(np.linalg.norm(upper, axis=1) - kin.LIMITS[shoulder], 0)
-    cost = np.linalg.norm(wrists - target, axis=1) + 20 * np.maximum(MARGIN - clear, 0) + 5 * beyond
+    # forearm and hand keep 15 mm away from the body
+    near = np.maximum(0.015 - clear, 0)
+    cost = np.linalg.norm(wrists - target, axis=1) + 20 * near + 5 * beyond
     best = int(np.argmin(cost))
     rotations[shoulder], rotations[elbow] = upper[best], lower[best]
     rotations[wrist] = rng.normal(0, 1, 3) * [0.08, 0.12, 0.2]
@@ -356,13 +348,13 @@ def _body_capsules(
     build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations
 ) -> list[Capsule]:
     """Trunk, legs and head of a posed body: two ends (3,) and a radius each, metres."""
-    sideways = 0.25 * (positions[kin.LEFT_HIP] - positions[kin.RIGHT_HIP])
-    top = positions[kin.NECK] + world[kin.SPINE3] @ np.asarray([0, -0.06, 0])
-    head = positions[kin.HEAD] + world[kin.HEAD] @ np.asarray([0, 0.09, 0.03])
-    capsules = [(head, head, HEAD_RADIUS)]
+    sideways = 0.25 * (positions[Joint.LEFT_HIP] - positions[Joint.RIGHT_HIP])
+    top = positions[Joint.NECK] + world[Joint.SPINE3] @ np.asarray([0, -0.06, 0])
+    head = positions[Joint.HEAD] + world[Joint.HEAD] @ np.asarray([0, 0.09, 0.03])
+    capsules = [(head, head, 0.14)]
     for s in (-1.0, 0.0, 1.0):
         capsules.append(
-            (positions[kin.PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius)
+            (positions[Joint.PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius)
         )
     for hip, knee, ankle, _ in kin.LEGS:
         capsules.append((positions[hip], positions[knee], build.thigh_radius))
@@ -374,7 +366,7 @@ def _arm_capsules(build: kin.Build, positions: kin.Rotations, side: int) -> list
     """Upper arm, forearm and hand of one side."""
     _, shoulder, elbow, wrist = (positions[joint] for joint in ARMS[side])
     radius = build.arm_radius + 0.01
-    return [(shoulder, elbow, radius), (elbow, wrist + HAND_LENGTH * (wrist - elbow), radius)]
+    return [(shoulder, elbow, radius), (elbow, wrist + _HAND_LENGTH * (wrist - elbow), radius)]
 
 
 def _clearance(
@@ -393,7 +385,7 @@ def _along(
     elbows: Float[np.ndarray, "*n 3"], wrists: Float[np.ndarray, "*n 3"]
 ) -> list[Float[np.ndarray, "*n 3"]]:
     """Points of the forearm and the hand that must not touch the body."""
-    tips = wrists + HAND_LENGTH * (wrists - elbows)
+    tips = wrists + _HAND_LENGTH * (wrists - elbows)
     return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]
 
 
@@ -401,10 +393,6 @@ FINGERS = ((0, 1.0), (1, 0.15), (3, -1.2), (2, -0.6))
 """Index, middle, pinky, ring, in the order of SMPL-X's joints: place among a gesture's curls, share
 of its spread.
 """
-BONE_SHARE = (0.85, 1.0, 0.7)
-"""Share of a finger's curl at each knuckle, from the palm outwards."""
-
-
 GESTURES = {
     "relaxed": (0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25),
     "flat": (0.15, (0.03, 0.03, 0.04, 0.05), 0.0, 0.05),
@@ -424,9 +412,9 @@ def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> 
     random gesture.
     """
     if side == 0:
-        first, mirror = kin.LEFT_HAND, np.ones(3)
+        first, mirror = Joint.LEFT_HAND, np.ones(3)
     else:
-        first, mirror = kin.RIGHT_HAND, kin.MIRROR
+        first, mirror = Joint.RIGHT_HAND, kin.MIRROR
     goal, t = choice(rng, {name: odds for name, (odds, *_) in GESTURES.items()}), rng.beta(2.5, 1.0)
     blends = (
         (1 - t) * np.asarray(a) + t * np.asarray(b)
@@ -436,7 +424,8 @@ def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> 
     thumb = thumb + rng.normal(0, 0.08)
     for finger, (place, splay) in enumerate(FINGERS):
         curl = curls[place] * rng.uniform(0.85, 1.15) + rng.normal(0, 0.03)
-        for bone, share in enumerate(BONE_SHARE):
+        # from the palm outwards each knuckle has a share of the curl
+        for bone, share in enumerate((0.85, 1.0, 0.7)):
             # fingers do not bend backwards, and spread at the palm only
             bend = np.clip(curl * share * rng.uniform(0.9, 1.1), -0.1, kin.FINGER_LIMIT - 0.1)
             aside = splay * spread if bone == 0 else 0.0
@@ -451,13 +440,14 @@ def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotation
     one height.
     """
     rotations = np.zeros((kin.JOINTS, 3))
-    rotations[kin.PELVIS] = [0.0, rng.uniform(-0.7, 0.7), 0.0]
-    stance = sample_stance(rng, build, rotations)
+    rotations[Joint.PELVIS] = [0.0, rng.uniform(-0.7, 0.7), 0.0]
+    stance = _sample_stance(rng, build, rotations)
     bend_trunk(rng, rotations, stance.lean, stance.roll)
-    both, goal = rng.random() < BOTH_ARMS, draw_goal(rng)
+    # both arms may have the same goal; one that cannot keep clear of the body tries three
+    both, goal = rng.random() < 0.45, draw_goal(rng)
     for side in (0, 1):
         wanted = goal if both or side == 0 else draw_goal(rng)
-        for _ in range(ATTEMPTS):
+        for _ in range(3):
             if bend_arm(rng, build, rotations, wanted, side, other_arm=side == 1) >= 0:
                 break
             wanted = draw_goal(rng)
@@ -476,7 +466,7 @@ def bend_trunk(
     bowed = rng.random() < 0.08
     lean = lean + rng.normal(0.03, 0.07) + (rng.uniform(0.2, 0.7) if bowed else 0.0)
     side, turn = rng.normal(0, 0.06) - 0.8 * roll, rng.normal(0, 0.14)
-    for joint, share in ((kin.SPINE1, 0.3), (kin.SPINE2, 0.35), (kin.SPINE3, 0.35)):
+    for joint, share in ((Joint.SPINE1, 0.3), (Joint.SPINE2, 0.35), (Joint.SPINE3, 0.35)):
         rotations[joint] = np.asarray([lean, turn, side]) * share
     look = rng.normal(0, 1, 3) * [0.12, 0.28, 0.07]
-    rotations[kin.NECK], rotations[kin.HEAD] = 0.45 * look - [0.4 * lean, 0, 0], 0.55 * look
+    rotations[Joint.NECK], rotations[Joint.HEAD] = 0.45 * look - [0.4 * lean, 0, 0], 0.55 * look

@@ -15,6 +15,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.synthetic import anatomy as kin
+from humangs_jax.synthetic.anatomy import Joint
 from humangs_jax.synthetic.poses import (
     ARMS,
     STANCES,
@@ -30,33 +31,29 @@ from humangs_jax.synthetic.surfaces import choice
 
 FPS = 30.0
 """Frames a second."""
-LONG_STEP = 0.75
+_LONG_STEP = 0.75
 """A long step, in lengths of a leg."""
-STANCE_SHARE = 0.62
+_STANCE_SHARE = 0.62
 """Share of a stride during which a foot is on the ground."""
-FLAT_FROM = 0.15
+_FLAT_FROM = 0.15
 """Share of that from which on the sole is flat."""
-FLAT_UNTIL = 0.55
+_FLAT_UNTIL = 0.55
 """Share of that until which the sole is flat."""
-HEEL_STRIKE = 0.28
-"""Pitch of the foot when it comes down on the heel at a long stride, radians."""
-TOE_OFF = 0.85
-"""Pitch of the foot when it leaves from the toes at a long stride, radians."""
-SMOOTHING = 4
+_SMOOTHING = 4
 """Frames to both sides over which the pelvis's height is smoothed."""
-SPARE = 0.995
+_SPARE = 0.995
 """Share of the legs' reach that the pelvis's height uses."""
-TRIES = 12
+_TRIES = 12
 """Goals tried for an arm until the way to one is clear."""
 
 
-Heading = Callable[[float | np.ndarray], float | np.ndarray]
+_Heading = Callable[[float | np.ndarray], float | np.ndarray]
 """Gives the angle about y at a phase in strides."""
-Track = Callable[[float], kin.Vector]
+_Track = Callable[[float], kin.Vector]
 """Gives the body's place on its path at a phase."""
-Moves = tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], Bool[np.ndarray, "m 2"]]
+_Moves = tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], Bool[np.ndarray, "m 2"]]
 """Rotations, positions of the pelvis, feet that are planted."""
-KeyPose = tuple[kin.Rotations, kin.Vector, float]
+_KeyPose = tuple[kin.Rotations, kin.Vector, float]
 """Rotations, place of the pelvis on the ground plane, how much lower it is than it could be."""
 
 
@@ -90,11 +87,11 @@ def sample_sequence(
     if kind not in KINDS:
         raise ValueError(f"no kind of sequence {kind!r}: expected one of {', '.join(KINDS)}")
     rotations, pelvis, planted = KINDS[kind][1](rng, build, frames)
-    return Sequence(kind, rotations, pelvis - build.joints[kin.PELVIS], planted)
+    return Sequence(kind, rotations, pelvis - build.joints[Joint.PELVIS], planted)
 
 
 @dataclasses.dataclass(frozen=True)
-class Gait:
+class _Gait:
     """How a person walks or turns on the spot."""
 
     cadence: float
@@ -113,26 +110,26 @@ class Gait:
     """Swing of the arms, radians."""
 
 
-def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
-    step, curved = rng.uniform(0.3, LONG_STEP) * build.leg, rng.random() < 0.6
+def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
+    step, curved = rng.uniform(0.3, _LONG_STEP) * build.leg, rng.random() < 0.6
     cadence = rng.uniform(0.75, 1.05)
     bend = rng.normal(0, 0.16) if curved else 0.0
     width = build.hip_width * rng.uniform(0.5, 0.9)
     lift = rng.uniform(0.04, 0.09)
     turn_out = rng.uniform(0.0, 0.18)
     swing = rng.uniform(0.25, 0.5) * min(1.0, step / build.leg / 0.6)
-    return _step_along(rng, build, frames, Gait(cadence, step, bend, width, lift, turn_out, swing))
+    return _step_along(rng, build, frames, _Gait(cadence, step, bend, width, lift, turn_out, swing))
 
 
-def _turn(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
+def _turn(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
     cadence, step = rng.uniform(0.6, 0.9), rng.uniform(-0.02, 0.06)
     bend = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5)
     width = build.hip_width * rng.uniform(0.95, 1.3)
     lift, turn_out, swing = rng.uniform(0.05, 0.09), rng.uniform(0.05, 0.2), rng.uniform(0.03, 0.15)
-    return _step_along(rng, build, frames, Gait(cadence, step, bend, width, lift, turn_out, swing))
+    return _step_along(rng, build, frames, _Gait(cadence, step, bend, width, lift, turn_out, swing))
 
 
-def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: Gait) -> Moves:
+def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: _Gait) -> _Moves:
     start = rng.uniform(0, 1)
     if abs(gait.step) < 0.1 * build.leg:
         begin_heading = rng.uniform(-np.pi, np.pi)
@@ -145,7 +142,7 @@ def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: G
 
     track = _path(heading, 2 * gait.step, start, phase[-1])
     feet = [tuple(_foot_at(build, gait, heading, track, side, p) for side in (0, 1)) for p in phase]
-    planted = np.asarray([[(p + 0.5 * side) % 1 < STANCE_SHARE for side in (0, 1)] for p in phase])
+    planted = np.asarray([[(p + 0.5 * side) % 1 < _STANCE_SHARE for side in (0, 1)] for p in phase])
 
     rotations = np.zeros((frames, kin.JOINTS, 3))
     sway = (
@@ -160,17 +157,17 @@ def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: G
         turns[i] = kin.turned(y=heading(p) - twist * np.cos(once)) @ kin.turned(
             x=0.4 * lean, z=roll
         )
-        for joint, share in ((kin.SPINE1, 0.3), (kin.SPINE2, 0.4), (kin.SPINE3, 0.3)):
+        for joint, share in ((Joint.SPINE1, 0.3), (Joint.SPINE2, 0.4), (Joint.SPINE3, 0.3)):
             rotations[i, joint] = (
                 np.asarray([0.6 * lean, 2 * twist * np.cos(once - 0.2), -0.8 * roll]) * share
             )
         look = np.clip(1.2 * gait.bend, -0.5, 0.5)  # to where the path leads
-        rotations[i, [kin.NECK, kin.HEAD]] = [
+        rotations[i, [Joint.NECK, Joint.HEAD]] = [
             -0.3 * lean,
             0.5 * look - 0.5 * twist * np.cos(once - 0.2),
             0,
         ]
-    rotations[:, kin.PELVIS] = kin.rotation_vector(turns)
+    rotations[:, Joint.PELVIS] = kin.rotation_vector(turns)
     centers = np.stack([track(p) for p in phase])
     centers += np.stack(
         [kin.turned(y=heading(p))[:, 0] * s for p, s in zip(phase, sway, strict=True)]
@@ -182,7 +179,7 @@ def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: G
     return rotations, pelvis, planted
 
 
-def _path(heading: Heading, stride: float, first: float, last: float) -> Track:
+def _path(heading: _Heading, stride: float, first: float, last: float) -> _Track:
     """A function from the phase to the body's position (3,) on its path: the integral of the
     heading.
     """
@@ -198,7 +195,7 @@ def _path(heading: Heading, stride: float, first: float, last: float) -> Track:
 
 
 def _foot_at(
-    build: kin.Build, gait: Gait, heading: Heading, track: Track, side: int, phase: float
+    build: kin.Build, gait: _Gait, heading: _Heading, track: _Track, side: int, phase: float
 ) -> kin.Foot:
     """The foot of a side at a phase (strides); the left one comes down at whole phases, the right
     one half a stride later.
@@ -206,20 +203,21 @@ def _foot_at(
     number, share = divmod(phase + 0.5 * side, 1.0)
     down = number - 0.5 * side
     here, there = (_footprint(build, gait, heading, track, side, down + k) for k in (0, 1))
-    long = np.clip(gait.step / (LONG_STEP * build.leg), 0.15, 1.0)
+    long = np.clip(gait.step / (_LONG_STEP * build.leg), 0.15, 1.0)
+    # pitches of the foot when it comes down on the heel, and when it leaves from the toes
     strike = 0.0
     if gait.step > 0.2 * build.leg:
-        strike = HEEL_STRIKE * long
-    off = TOE_OFF * (0.35 + 0.65 * long)
-    if share < STANCE_SHARE:
-        u = share / STANCE_SHARE
-        rise = np.clip((u - FLAT_UNTIL) / (1 - FLAT_UNTIL), 0.0, 1.0)  # from rest to full motion
+        strike = 0.28 * long
+    off = 0.85 * (0.35 + 0.65 * long)
+    if share < _STANCE_SHARE:
+        u = share / _STANCE_SHARE
+        rise = np.clip((u - _FLAT_UNTIL) / (1 - _FLAT_UNTIL), 0.0, 1.0)  # from rest to full motion
         late = off * (rise**2 * (3 - rise) / 2)
         pitch = late
-        if u < FLAT_FROM:
-            pitch = -strike * (1 - _ease(u / FLAT_FROM))
+        if u < _FLAT_FROM:
+            pitch = -strike * (1 - _ease(u / _FLAT_FROM))
         return dataclasses.replace(here, pitch=float(pitch))
-    u = (share - STANCE_SHARE) / (1 - STANCE_SHARE)
+    u = (share - _STANCE_SHARE) / (1 - _STANCE_SHARE)
     s = _ease(u)
     at = (
         float(a + s * (b - a))
@@ -232,15 +230,15 @@ def _foot_at(
 
 
 def _footprint(
-    build: kin.Build, gait: Gait, heading: Heading, track: Track, side: int, down: float
+    build: kin.Build, gait: _Gait, heading: _Heading, track: _Track, side: int, down: float
 ) -> kin.Foot:
     """Position of the foot that comes down at a phase: beside the path, ahead of the pelvis in
     mid-stance.
     """
-    middle = down + 0.5 * STANCE_SHARE
+    middle = down + 0.5 * _STANCE_SHARE
     yaw, sign = float(heading(middle)), 1 - 2 * side
     ahead = (
-        build.joints[kin.LEFT_FOOT, 2] - build.joints[kin.PELVIS, 2] - 0.04 * build.leg
+        build.joints[Joint.LEFT_FOOT, 2] - build.joints[Joint.PELVIS, 2] - 0.04 * build.leg
     )  # of the ball, standing
     x, _, z = track(middle) + kin.turned(y=yaw) @ np.asarray([sign * gait.width, 0.0, ahead])
     return kin.Foot(float(x), float(z), float(yaw + sign * gait.turn_out))
@@ -251,7 +249,7 @@ def _swing_arms(
     build: kin.Build,
     rotations: Float[np.ndarray, "m j 3"],
     phase: Float[np.ndarray, " m"],
-    gait: Gait,
+    gait: _Gait,
 ) -> None:
     """Arms hang and swing against the legs; a hanging pose found once, its swing about the axis of
     the shoulders.
@@ -259,13 +257,13 @@ def _swing_arms(
     stood = rotations[0].copy()
     stood[[joint for leg in kin.LEGS for joint in leg]] = 0
     for side in (0, 1):
-        for _ in range(TRIES):
+        for _ in range(_TRIES):
             if bend_arm(rng, build, stood, "hang", side) > 0.01:
                 break
         pose_hand(rng, stood, side)
     for side, hand in (
-        (0, slice(kin.LEFT_HAND, kin.RIGHT_HAND)),
-        (1, slice(kin.RIGHT_HAND, kin.JOINTS)),
+        (0, slice(Joint.LEFT_HAND, Joint.RIGHT_HAND)),
+        (1, slice(Joint.RIGHT_HAND, kin.JOINTS)),
     ):
         collar, shoulder, elbow, wrist = ARMS[side]
         sign = 1 - 2 * side
@@ -284,7 +282,7 @@ def _swing_arms(
         rotations[:, wrist], rotations[:, hand] = stood[wrist], stood[hand]
 
 
-def _reach(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
+def _reach(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
     """From pose to pose on planted feet: the hands reach for targets, trunk and knees follow."""
     name = rng.choice(["stand", "contrapposto", "wide", "stride"], p=[0.4, 0.2, 0.2, 0.2])
     heading = rng.uniform(-0.7, 0.7)
@@ -305,7 +303,7 @@ def _reach(rng: np.random.Generator, build: kin.Build, frames: int) -> Moves:
         rotations[i] = kin.between(a[0], b[0], s)
         centers[i], sinks[i] = (1 - s) * a[1] + s * b[1], (1 - s) * a[2] + s * b[2]
     pelvis = _ride(
-        build, kin.rotation_matrix(rotations[:, kin.PELVIS]), centers, [feet] * frames, sinks
+        build, kin.rotation_matrix(rotations[:, Joint.PELVIS]), centers, [feet] * frames, sinks
     )
     for i in range(frames):
         kin.place_feet(build, rotations[i], pelvis[i], feet)
@@ -318,8 +316,8 @@ def _key_pose(
     heading: float,
     stance: Stance,
     feet: kin.Feet,
-    before: KeyPose | None,
-) -> KeyPose:
+    before: _KeyPose | None,
+) -> _KeyPose:
     """(rotations, place of the pelvis on the ground plane, how much lower it is than it could
     be).
     """
@@ -330,7 +328,7 @@ def _key_pose(
     stooped = sink / build.leg
     tilt, aside = 0.5 * stooped + rng.uniform(0, 0.05), rng.normal(0, 0.15)
     turn = kin.turned(y=heading + aside) @ kin.turned(x=tilt, z=stance.roll)
-    rotations[kin.PELVIS] = kin.rotation_vector(turn)
+    rotations[Joint.PELVIS] = kin.rotation_vector(turn)
     back = (
         kin.turned(y=heading)
         @ np.asarray([rng.normal(0, 0.02), 0, rng.normal(-0.08, 0.02)])
@@ -339,12 +337,12 @@ def _key_pose(
     center = np.asarray(
         [0.5 * (feet[0].x + feet[1].x) + back[0], 0.0, 0.5 * (feet[0].z + feet[1].z) + back[2]]
     )
-    height = kin.highest_pelvis(build, turn, center[0], center[2], feet, SPARE) - sink
+    height = kin.highest_pelvis(build, turn, center[0], center[2], feet, _SPARE) - sink
     kin.place_feet(build, rotations, np.asarray([center[0], height, center[2]]), feet)
     bend_trunk(rng, rotations, stance.lean + 1.2 * stooped, stance.roll)
     for side in (0, 1):
         best, best_clear = rotations, -np.inf
-        for _ in range(TRIES):
+        for _ in range(_TRIES):
             tried = rotations.copy()
             goal = "hang" if rng.random() < 0.2 else draw_goal(rng)
             bend_arm(rng, build, tried, goal, side, other_arm=side == 1)
@@ -382,16 +380,16 @@ def _ride(
     `sinks`.
     """
     heights = np.asarray([
-        kin.highest_pelvis(build, turn, center[0], center[2], both, SPARE)
+        kin.highest_pelvis(build, turn, center[0], center[2], both, _SPARE)
         for turn, center, both in zip(turns, centers, feet, strict=True)
     ])  # fmt: skip
 
     def window(values):
         """The frames around each frame."""
-        padded = np.pad(values, SMOOTHING, mode="edge")
-        return np.lib.stride_tricks.sliding_window_view(padded, 2 * SMOOTHING + 1)
+        padded = np.pad(values, _SMOOTHING, mode="edge")
+        return np.lib.stride_tricks.sliding_window_view(padded, 2 * _SMOOTHING + 1)
 
-    weights = np.hanning(2 * SMOOTHING + 3)[1:-1]
+    weights = np.hanning(2 * _SMOOTHING + 3)[1:-1]
     smooth = window(window(heights).min(-1)) @ (weights / weights.sum())
     pelvis = centers.copy()
     pelvis[:, 1] = smooth - (0.0 if sinks is None else sinks)
@@ -404,7 +402,7 @@ def _ease(t: float) -> float:
     return t**3 * (10 - 15 * t + 6 * t**2)
 
 
-KINDS: dict[str, tuple[float, Callable[[np.random.Generator, kin.Build, int], Moves]]] = {
+KINDS: dict[str, tuple[float, Callable[[np.random.Generator, kin.Build, int], _Moves]]] = {
     "walk": (0.5, _walk), "turn": (0.2, _turn), "reach": (0.3, _reach),
 }  # fmt: skip
 """Name -> probability, and a function of a generator, a build and a length."""

@@ -26,9 +26,9 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from humangs_jax.synthetic import complexion, hair, surroundings, wardrobe
 from humangs_jax.synthetic.anatomy import (
     BODY,
-    LEFT_KNEE,
     Anatomy,
     Build,
+    Joint,
     Rotations,
     Vector,
     joint_positions,
@@ -58,29 +58,21 @@ GENERATOR_VERSION = 2
 """Raised whenever the same seed makes another person, pose or image. Manifests record it; sets of
 different versions are not mixed in one folder."""
 
-TRAIN = range(0, 1_000_000)
-VALIDATION = range(1_000_000, 1_001_000)
-TEST = range(2_000_000, 2_001_000)
-"""Held out of training and of every choice made on the validation people."""
-DEMO = range(3_000_000, 3_001_000)
-"""People of the documentation and the tests."""
-FITTING = range(4_000_000, 4_001_000)
-"""People that fitting and refinement are tuned and measured on: no other result sees them."""
-TRADEOFF = range(5_000_000, 5_001_000)
-"""People that the presets of speed and accuracy are chosen on."""
-
 SPLITS = {
-    "train": TRAIN,
-    "validation": VALIDATION,
-    "test": TEST,
-    "demo": DEMO,
-    "fitting": FITTING,
-    "tradeoff": TRADEOFF,
+    "train": range(0, 1_000_000),
+    "validation": range(1_000_000, 1_001_000),
+    # held out of training and of every choice made on the validation people
+    "test": range(2_000_000, 2_001_000),
+    # people of the documentation and the tests
+    "demo": range(3_000_000, 3_001_000),
+    # people that fitting and refinement are tuned and measured on: no other result sees them
+    "fitting": range(4_000_000, 4_001_000),
+    # people that the presets of speed and accuracy are chosen on
+    "tradeoff": range(5_000_000, 5_001_000),
 }
-
-KEY_KIND = "threefry2x32"
-"""Implementation of all keys of people: the words of such a key are its seed."""
+"""Seeds by what they are for; the ranges share no person."""
 APPEARANCES = 2**32
+"""How many appearances a person has."""
 
 
 def split_of(seed: int) -> str:
@@ -112,32 +104,19 @@ def subject_key(seed: int, appearance: int = 0) -> Key:
     Raises: ValueError if the seed lies in no range of `SPLITS`.
     """
     split_of(seed)
+    # the words of a key of this implementation are its seed
     words = np.asarray([appearance % APPEARANCES, seed], np.uint32)
-    return jax.random.wrap_key_data(jnp.asarray(words), impl=KEY_KIND)
+    return jax.random.wrap_key_data(jnp.asarray(words), impl="threefry2x32")
 
 
 # People
 # --------------------------------------------------------------------------------------------------
 
 
-SHAPE_STD = 0.55
-"""Standard deviation of the shape coefficients without another rule; values are clipped at
-twice that.
-"""
-HEIGHTS = {True: (1.765, 0.085), False: (1.645, 0.08)}
-"""Mean and standard deviation of the stature in metres of men (True) and women."""
 HEIGHT_RANGE = (1.42, 2.08)
 """Range of statures, metres."""
-TALLEST_WOMAN = 1.95
-"""Largest stature of a woman, metres."""
 YEARS = (15.0, 85.0)
 """Range of ages, years."""
-YOUNG = 25.0
-"""Years at which the body's age coefficient is 0."""
-OLD = 90.0
-"""Years at which the body's age coefficient is 1."""
-LENGTHS = ("height", "leg_length", "torso_length")
-"""Coefficients that share what is missing to the wanted stature."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,7 +148,7 @@ def describe(seed: int, body: BodyModel) -> Person:
     rng = np.random.default_rng([seed, 0])
     male = bool(rng.random() < 0.5)
     years = float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS))
-    betas, stature = sample_shape(rng, body, male, years)
+    betas, stature = _sample_shape(rng, body, male, years)
     garments = sample_outfit(np.random.default_rng([seed, 11]), male, years)
     complexion = sample_complexion(np.random.default_rng([seed, 12]), male, years)
     haircut = sample_haircut(
@@ -179,33 +158,35 @@ def describe(seed: int, body: BodyModel) -> Person:
     return Person(seed, betas, male, years, stature, complexion, haircut, garments, lights)
 
 
-def sample_shape(
+def _sample_shape(
     rng: np.random.Generator, body: BodyModel, male: bool, years: float
 ) -> tuple[np.ndarray, float]:
     """(s,) shape coefficients and the stature in metres that they give."""
     at = {name: i for i, name in enumerate(body.shape_names)}
-    betas = np.clip(rng.normal(0, 1, len(at)), -2, 2) * SHAPE_STD
+    # coefficients without another rule: standard deviation 0.55, at most twice that
+    betas = np.clip(rng.normal(0, 1, len(at)), -2, 2) * 0.55
     betas[at["sex_male"]] = (1 if male else -1) * rng.uniform(0.55, 1.0)
-    if years > YOUNG:
-        betas[at["age"]] = (years - YOUNG) / (OLD - YOUNG)
+    # age is 0 at 25 years and 1 at 90
+    if years > 25.0:
+        betas[at["age"]] = (years - 25.0) / (90.0 - 25.0)
     else:
-        betas[at["age"]] = 0.03 * (years - YOUNG)
+        betas[at["age"]] = 0.03 * (years - 25.0)
     heavier = 0.25 * np.clip((years - 20) / 30, 0, 1)
     betas[at["weight"]] = np.clip(rng.normal(0.05 + heavier, 0.62), -1.0, 1.8)
     betas[at["muscle"]] = np.clip(rng.normal(0.1 - 0.4 * (years > 60), 0.6), -1.0, 1.5)
-    mean, std = HEIGHTS[male]
+    # the wanted stature, metres
+    mean, std, tallest = (1.765, 0.085, HEIGHT_RANGE[1]) if male else (1.645, 0.08, 1.95)
     youth = 0.04 * np.clip(18 - years, 0, 3) / 3 + 0.03 * np.clip((years - 60) / 25, 0, 1)
     if rng.random() < 0.85:
         tall = rng.standard_t(5)
     else:
         tall = rng.uniform(-2.6, 3.4)
-    tallest = HEIGHT_RANGE[1] if male else TALLEST_WOMAN
     wanted = np.clip(mean - youth + std * tall, HEIGHT_RANGE[0], tallest)
     *_, stature, gains = _host_arrays(body)
-    lengths = [at[name] for name in LENGTHS]
-    betas[lengths] += (
-        (wanted - (stature + gains @ betas)) * gains[lengths] / (gains[lengths] @ gains[lengths])
-    )
+    # three coefficients share what is missing to it
+    lengths = [at[name] for name in ("height", "leg_length", "torso_length")]
+    missing = wanted - (stature + gains @ betas)
+    betas[lengths] += missing * gains[lengths] / (gains[lengths] @ gains[lengths])
     return betas.astype(np.float32), float(wanted)
 
 
@@ -366,7 +347,7 @@ def _build(anatomy: Anatomy, surface: Surface) -> Build:
     spread = (
         float(np.quantile(np.abs(low[:, 0]), 0.98)) if len(low) else 0.2
     )  # wide skirts keep the hands away
-    leg_line = float(np.abs(anatomy.joints[LEFT_KNEE, 0]))
+    leg_line = float(np.abs(anatomy.joints[Joint.LEFT_KNEE, 0]))
     radii = (
         depth + 0.015,
         max(thigh + 0.02, spread - leg_line),
@@ -374,10 +355,6 @@ def _build(anatomy: Anatomy, surface: Surface) -> Build:
         0.035,
     )
     return Build(anatomy.joints.astype(np.float64), anatomy.parents, *radii)
-
-
-SAME_PLACE = 1e-6
-"""Metres in the template: a vertex of the skin is the body's there."""
 
 
 def expressed_subject(
@@ -394,7 +371,7 @@ def expressed_subject(
     # the skin's vertices, some of which are cut away, are found by their places in the template
     template = np.asarray(body.template)[known]
     distances, nearest = KDTree(template).query(subject.surface.attributes["template"])
-    rows = np.flatnonzero((distances < SAME_PLACE) & (subject.vertices_of(SKIN)))
+    rows = np.flatnonzero((distances < 1e-6) & subject.vertices_of(SKIN))  # metres
     moves = np.asarray(body.expressions.directions) @ np.asarray(coefficients, np.float32)
     vertices[rows] += moves[nearest[rows]]
     return dataclasses.replace(
@@ -407,20 +384,13 @@ def expressed_subject(
 
 
 SUPERSAMPLING = 2
-VERTEX_STEP = 4096
-"""Vertices of meshes are padded to a multiple of this: few shapes are compiled."""
-FACE_STEP = 8192
-"""Faces of meshes are padded to a multiple of this."""
-POINT_STEP = 1 << 15
+"""Samples of a pixel in each direction."""
+_POINT_STEP = 1 << 15
 """Points that are colored at once."""
-FOLD_SLOPE = 0.6
-"""Slope of painted creases on the most wrinkled cloth."""
 
 _shaded_vertices = jax.jit(surroundings.shaded_vertices)
 _seen_from_behind = jax.jit(surroundings.seen_from_behind)
 _light_points = jax.jit(surroundings.light_points)
-Image = Float[np.ndarray, "h w 3"]
-Map = Float[np.ndarray, "h w"]
 Ids = Int[np.ndarray, " m"]
 Values = Float[np.ndarray, "m 3"]
 
@@ -463,15 +433,19 @@ def pose_subject(
 def padded(
     vertices: Points, faces: Faces
 ) -> tuple[Float[Array, "n_padded 3"], Int[Array, "f_padded 3"]]:
-    """A mesh with repeated vertices and faces without area up to the next step of sizes."""
-    spare_vertices, spare_faces = -len(vertices) % VERTEX_STEP, -len(faces) % FACE_STEP
+    """A mesh with repeated vertices and faces without area up to the next multiple of 4096 and of
+    8192: few shapes are compiled.
+    """
+    spare_vertices, spare_faces = -len(vertices) % 4096, -len(faces) % 8192
     vertices = np.concatenate([vertices, np.repeat(vertices[:1], spare_vertices, axis=0)]).astype(
         np.float32
     )
     return jnp.asarray(vertices), jnp.asarray(np.pad(faces, ((0, spare_faces), (0, 0))))
 
 
-def render_view(posed: PosedSubject, camera: Camera, background: float = 1.0) -> tuple[Image, Map]:
+def render_view(
+    posed: PosedSubject, camera: Camera, background: float = 1.0
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """(h, w, 3) image on the background and (h, w) coverage of one camera, both in [0, 1]."""
     s, subject = SUPERSAMPLING, posed.subject
     fine = camera.resized(camera.width * s, camera.height * s)
@@ -511,8 +485,8 @@ def light_points(
         subject.face_materials
     ]
     colors = [np.zeros((0, 3), np.float32)]
-    for start in range(0, len(face_ids), POINT_STEP):
-        part = slice(start, start + POINT_STEP)
+    for start in range(0, len(face_ids), _POINT_STEP):
+        part = slice(start, start + _POINT_STEP)
         ids = face_ids[part]
         points = (
             values[faces[ids]].reshape(-1, 15),
@@ -522,7 +496,7 @@ def light_points(
             slopes[part],
             sheen[ids],
         )
-        full = (np.pad(x, [(0, POINT_STEP - len(ids))] + [(0, 0)] * (x.ndim - 1)) for x in points)
+        full = (np.pad(x, [(0, _POINT_STEP - len(ids))] + [(0, 0)] * (x.ndim - 1)) for x in points)
         colors.append(np.asarray(_light_points(subject.lights, *full))[: len(ids)])
     return np.concatenate(colors)
 
@@ -549,5 +523,6 @@ def paint(subject: SyntheticSubject, face_ids: Ids, spots: Spots) -> tuple[Value
         albedo[chosen] = material.albedo(own)
         if material.wrinkles > 0:
             folds = Folds(np.random.default_rng([subject.seed, 100 + k]), upright=material.draped)
-            slope[chosen] = FOLD_SLOPE * material.wrinkles * folds.slope(own.cloth[:, :3])
+            # creases of the most wrinkled cloth have a slope of 0.6
+            slope[chosen] = 0.6 * material.wrinkles * folds.slope(own.cloth[:, :3])
     return np.clip(albedo, 0.01, None), slope

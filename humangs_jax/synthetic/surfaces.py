@@ -130,7 +130,7 @@ def hashed(cells: np.ndarray, seed: int) -> np.ndarray:
 
 
 Field = Float[np.ndarray, " n"]
-Values = Float[np.ndarray, "n c"]
+_Values = Float[np.ndarray, "n c"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,16 +186,6 @@ def vertex_normals(vertices: Points, faces: Faces) -> Points:
     return unit(vertex_area_vectors(vertices, faces).astype(np.float32))
 
 
-def scatter_add(
-    indices: Int[np.ndarray, " m"], values: Float[np.ndarray, "m c"], count: int
-) -> np.ndarray:
-    """Sums of the rows of `values` (m, c) that share an index, (count, c) float32."""
-    columns = [
-        np.bincount(indices, weights=values[:, c], minlength=count) for c in range(values.shape[1])
-    ]
-    return np.stack(columns, axis=1).astype(np.float32)
-
-
 def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
     """(e, 2) directed edges that only one face has: the hems."""
     edges = edges_of(faces).astype(np.int64)
@@ -205,7 +195,7 @@ def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
     return edges[uses[inverse] == 1].astype(np.int32)
 
 
-def smooth(values: Values, faces: Faces, iterations: int, keep_hems: bool = False) -> Values:
+def smooth(values: _Values, faces: Faces, iterations: int, keep_hems: bool = False) -> _Values:
     """Laplacian smoothing of vertex values (n, c): each step moves a vertex halfway towards the
     mean of its neighbours.
 
@@ -225,7 +215,9 @@ def smooth(values: Values, faces: Faces, iterations: int, keep_hems: bool = Fals
     lonely = neighbours == 0
     neighbours = np.maximum(neighbours, 1).astype(np.float32)[:, None]
     for _ in range(iterations):
-        mean = scatter_add(target, values[source], count) / neighbours
+        # sums of the neighbours, one column after the other
+        sums = [np.bincount(target, weights=column, minlength=count) for column in values[source].T]
+        mean = np.stack(sums, axis=1).astype(np.float32) / neighbours
         mean[lonely] = values[lonely]
         values = values + 0.5 * (mean - values)
     return values.astype(np.float32)
@@ -382,7 +374,7 @@ def around(
 
 ANGLES = 48
 """Directions of a silhouette."""
-EMPTY = 1e-3
+_EMPTY = 1e-3
 """Radius of a slice without points, metres."""
 _GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
@@ -434,7 +426,7 @@ def boundaries(
     thickness of a slice, metres.
     """
     directions = np.stack([np.sin(_GRID), np.cos(_GRID)])
-    support = np.full((len(levels), ANGLES), EMPTY)
+    support = np.full((len(levels), ANGLES), _EMPTY)
     if centers is None:
         found = np.zeros((len(levels), 2))
     else:
@@ -450,7 +442,7 @@ def boundaries(
         points = across[start:end]
         if centers is None:
             found[i] = 0.5 * (points.min(0) + points.max(0))
-        support[i] = np.maximum(((points - found[i]) @ directions).max(0), EMPTY)
+        support[i] = np.maximum(((points - found[i]) @ directions).max(0), _EMPTY)
     radii = np.min(support[:, None, :] * _INVERSE[None], axis=-1)
     return Boundaries(levels, found, radii)
 

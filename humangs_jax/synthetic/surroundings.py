@@ -38,16 +38,8 @@ surface.
 """
 CLEARANCE = 0.3
 """Metres: close cameras come no nearer to a point of the surface than this."""
-FRAME = 0.98
-"""Share of the half frame that the person may reach; a camera that is too near for it steps back.
-"""
-POINT_STEP = 4096
-"""Points are padded to a multiple of this: few shapes are compiled."""
-JITTER = 0.3
-"""Share of a step by which an azimuth is moved from even spread."""
 CAMERA_NUMBERS = 5
 """Random numbers of a camera."""
-UP = (0.0, 1.0, 0.0)
 Angles = Float[np.ndarray, " v"]
 Number = Float[Array, ""] | float
 Each = Float[Array | np.ndarray, "3 ..."]
@@ -61,13 +53,12 @@ def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
 
 
 def spread_azimuths(rng: np.random.Generator, count: int) -> Angles:
-    """(count,) sorted azimuths, evenly spread from a random start, each moved by up to `JITTER` of
-    the spacing.
+    """(count,) sorted azimuths, evenly spread from a random start, each moved by up to 0.3 of the
+    spacing.
     """
     spacing = 2 * np.pi / count
-    return rng.uniform(0, spacing) + spacing * (
-        np.arange(count) + rng.uniform(-JITTER, JITTER, count)
-    )
+    start = rng.uniform(0, spacing)
+    return start + spacing * (np.arange(count) + rng.uniform(-0.3, 0.3, count))
 
 
 def cameras_around(
@@ -79,7 +70,8 @@ def cameras_around(
     center, radius = bounding_sphere(vertices)
     distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
     elevations = rng.uniform(*ELEVATION, len(azimuths))
-    points = np.pad(vertices - center, ((0, -len(vertices) % POINT_STEP), (0, 0)), mode="edge")
+    # padded to a multiple of 4096: few shapes are compiled
+    points = np.pad(vertices - center, ((0, -len(vertices) % 4096), (0, 0)), mode="edge")
     near = _nearest_distances(
         jnp.asarray(points), *(jnp.asarray(x, jnp.float32) for x in (azimuths, elevations))
     )
@@ -156,25 +148,23 @@ def camera_from(
     target = center + jnp.where(near, CLOSE_SPREAD * outwards, 0.0) * towards_vertex
     along = _along_axes(vertices - target, azimuth, elevation)
     ahead, above, aside = along
-    beside = CLEARANCE**2 - (
-        above * above + aside * aside
-    )  # a camera on its axis comes no nearer than that to a point
+    # a camera on its axis comes no nearer than that to a point
+    beside = CLEARANCE**2 - (above * above + aside * aside)
     clear = jnp.max(jnp.where(beside > 0, ahead + jnp.sqrt(jnp.maximum(beside, 0)), -jnp.inf))
     distance = jnp.maximum(factor * radius, jnp.where(near, clear, _nearest_distance(*along)))
     K = intrinsics_from_fov(VERTICAL_FOV, size, size).astype(vertices.dtype)
     eye = target + distance * _axes(azimuth, elevation)[0]
-    return look_at(eye, target, jnp.asarray(UP, vertices.dtype), K, size, size)
+    return look_at(eye, target, jnp.asarray((0.0, 1.0, 0.0), vertices.dtype), K, size, size)
 
 
 def _nearest_distance(
     ahead: Float[Array, " n"], above: Float[Array, " n"], aside: Float[Array, " n"]
 ) -> Scalar:
-    """Least distance from the origin at which a camera that looks at it has all points in its
-    square frame.
+    """Least distance from the origin at which a camera that looks at it has all points within 98 %
+    of its square frame.
     """
-    return jnp.max(
-        jnp.maximum(jnp.abs(above), jnp.abs(aside)) / (FRAME * np.tan(VERTICAL_FOV / 2)) + ahead
-    )
+    slope = 0.98 * np.tan(VERTICAL_FOV / 2)
+    return jnp.max(jnp.maximum(jnp.abs(above), jnp.abs(aside)) / slope + ahead)
 
 
 @jax.jit
@@ -241,28 +231,12 @@ CELL = 0.025
 """Edge of a voxel of the occupancy grid, metres."""
 GRID = (112, 104, 80)
 """Voxels along x, y and z, more than any pose takes: what lies outside casts no shadow."""
-MARGIN = 6
-"""Empty voxels around the person."""
-REACH = (0.045, 0.11)
-"""Distances from the surface at which the grid is sampled for openness, metres."""
-LIFT = 0.03
-"""Height above the surface at which the way to the light begins, metres."""
-STRIDES = (0.06, 0.085, 0.115, 0.155, 0.205, 0.27, 0.36, 0.47, 0.6)
-"""Distances towards the key light at which the grid is sampled for shadows, metres."""
-SHADOW_DENSITY = 2.2
-"""Extinction per unit of what the samples find."""
 DARKEST = 0.4
 """Least share of the key light that arrives."""
 SHOULDER = 0.72
 """Brightness from which highlights are compressed."""
 WHITEST = 0.97
 """Brightness that they approach."""
-WRAP = 0.25
-"""Cosine by which a wide light reaches beyond the terminator."""
-GLOSS = 0.12
-"""Strength of highlights on the glossiest material."""
-INSIDE_SHADE = 0.45
-"""Brightness of the inner side of cloth."""
 LIGHT_NUMBERS = 28
 """Random numbers of a scene of lights."""
 WARM = np.asarray([1.0, 0.0, -1.0])
@@ -395,7 +369,7 @@ def shaded_vertices(
     (meshes may have edges longer than a voxel), and the way to the light is sampled at the nearest
     voxels, which takes an eighth of the lookups.
     """
-    low = vertices.min(0) - MARGIN * CELL
+    low = vertices.min(0) - 6 * CELL  # empty voxels around the person
     points, towards_light = vertices, _trilinear
     if faces is not None:
         middles = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
@@ -408,11 +382,14 @@ def shaded_vertices(
         """Where points are in the grid, voxels."""
         return (points - low) / CELL - 0.5
 
-    dark = sum(_trilinear(grid, place(vertices + reach * normals)) for reach in REACH) / len(REACH)
+    # openness: what is found at two distances from the surface, metres
+    dark = sum(_trilinear(grid, place(vertices + away * normals)) for away in (0.045, 0.11)) / 2
     openness = jnp.clip(1.08 - 2.6 * dark, 0.35, 1.0)
-    start = vertices + LIFT * normals
-    found = sum(towards_light(grid, place(start + stride * direction)) for stride in STRIDES)
-    return openness, jnp.maximum(jnp.exp(-SHADOW_DENSITY * found), DARKEST)
+    # shadow: what is found on the way to the light, which begins above the surface, metres
+    start = vertices + 0.03 * normals
+    strides = (0.06, 0.085, 0.115, 0.155, 0.205, 0.27, 0.36, 0.47, 0.6)
+    found = sum(towards_light(grid, place(start + stride * direction)) for stride in strides)
+    return openness, jnp.maximum(jnp.exp(-2.2 * found), DARKEST)
 
 
 def _blurred(grid: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
@@ -483,7 +460,7 @@ def light_points(
     blended = wa * corners[:, :5] + wb * corners[:, 5:10] + wc * corners[:, 10:]
     normals, openness, lit = _unit(blended[:, :3]), blended[:, 3], blended[:, 4]
     normals = jnp.where(behind[:, None], -normals, normals)
-    openness = jnp.where(behind, INSIDE_SHADE, 1.0) * openness
+    openness = jnp.where(behind, 0.45, 1.0) * openness  # the inner side of cloth is darker
     # tilted against the gradient of a height field on the surface
     normals = _unit(normals - (slopes - jnp.sum(slopes * normals, -1, keepdims=True) * normals))
     return shade(lights, albedo, normals, openness, lit, sheen)
@@ -498,13 +475,14 @@ def shade(
     up = 0.5 + 0.5 * normals[..., 1:2]
     light = (lights.ground + (lights.sky - lights.ground) * up) * openness[..., None]
     half = jnp.sqrt(openness)
+    wrap = 0.25  # cosine by which a wide light reaches beyond the terminator
     for k in range(lights.directions.shape[0]):
         arrives = half * lit if k == 0 else half
         x, y, z = lights.directions[k]
         cosine = normals[..., 0] * x + normals[..., 1] * y + normals[..., 2] * z
-        wrapped = jnp.clip((cosine + WRAP) / (1 + WRAP), 0, 1)
+        wrapped = jnp.clip((cosine + wrap) / (1 + wrap), 0, 1)
         light += lights.strengths[k] * (wrapped * arrives)[..., None]
-        gloss = GLOSS * jnp.clip(cosine, 0, 1) ** 12 * sheen * (lit if k == 0 else 1.0)
+        gloss = 0.12 * jnp.clip(cosine, 0, 1) ** 12 * sheen * (lit if k == 0 else 1.0)
         albedo = albedo + gloss[..., None] * lights.strengths[k]
     return rolled_off(jnp.minimum(albedo, ALBEDO_LIMIT) * light * lights.gain)
 

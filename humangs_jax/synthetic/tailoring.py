@@ -16,10 +16,8 @@ from humangs_jax.synthetic.anatomy import (
     ANKLE,
     ARM_HEIGHT,
     FLOOR,
-    LEFT_HIP,
-    LEFT_KNEE,
-    LEFT_SHOULDER,
     Anatomy,
+    Joint,
     sewn_coordinates,
     smoothstep,
 )
@@ -49,12 +47,6 @@ always covered.
 """
 HEM_MARGIN = 0.012
 """Skin is removed below cloth from this far inside the hem (metres of template coordinates)."""
-UNDER_A_HEM = 0.009
-"""How much narrower a skirt is below a top that hangs over it, metres."""
-TUBE_COLUMNS = 72
-"""Columns of a tube of cloth."""
-TUBE_STEP = 0.035
-"""Largest height of a row of a tube, metres."""
 
 
 def neckline(template: Points, style: str, depth: float) -> Field:
@@ -253,7 +245,7 @@ def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fi
     normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 2))
     points = smooth(below, surface.faces, 8, keep_hems=True) + fit.ease * normals
     below_armpit = 1 - smoothstep(
-        -0.03, 0.06, points[:, 1] - anatomy.joints[LEFT_SHOULDER, 1] + ARM_HEIGHT
+        -0.03, 0.06, points[:, 1] - anatomy.joints[Joint.LEFT_SHOULDER, 1] + ARM_HEIGHT
     )
     angle, radius = polar(points[:, [0, 2]], np.zeros((1, 2)))
     wanted = hanging(anatomy.trunk, fit.hang).radius(points[:, 1], angle) + fit.ease
@@ -371,15 +363,15 @@ def skirt(
     metres from the top over which it does not flare.
     """
     top, bottom = heights
-    rows = max(3, int(np.ceil((top - bottom) / TUBE_STEP)) + 1)
-    template_y, angle, faces = surfaces.tube(
-        np.linspace(top, bottom, rows), surfaces.circle(TUBE_COLUMNS)
-    )
+    # rows are at most 35 mm high
+    rows = max(3, int(np.ceil((top - bottom) / 0.035)) + 1)
+    template_y, angle, faces = surfaces.tube(np.linspace(top, bottom, rows), surfaces.circle(72))
     height, drop = rest_height(anatomy, template_y), top - template_y
     below = drop - cling
     boundary = blurred(hanging(anatomy.hips_and_legs, 0.15))
     radius = boundary.radius(height, angle) + ease + flare * np.maximum(below, 0)
-    radius = radius - UNDER_A_HEM * np.clip(1 - below / 0.06, 0, 1) * (cling > 0)
+    # narrower below a top that hangs over it
+    radius = radius - 0.009 * np.clip(1 - below / 0.06, 0, 1) * (cling > 0)
     waves = ripples(rng, surfaces.around(1, angle, 0.3 * height), wavelength=0.9)
     loose = np.clip(below / 0.25, 0, 1) * (drop / max(top - bottom, 1e-6)) ** 0.5
     radius = radius + loose * (
@@ -423,7 +415,10 @@ def _skirt_weights(
     shin = 0.92 * smoothstep(0.68, 0.9, -template_y)
     legs = np.zeros_like(trunk)
     for side, share in ((0, left), (1, 1 - left)):
-        legs[:, LEFT_HIP + side], legs[:, LEFT_KNEE + side] = share * (1 - shin), share * shin
+        legs[:, Joint.LEFT_HIP + side], legs[:, Joint.LEFT_KNEE + side] = (
+            share * (1 - shin),
+            share * shin,
+        )
     return (trunk * (1 - thigh)[:, None] + legs * thigh[:, None]).astype(np.float32)
 
 

@@ -1,7 +1,7 @@
 """What is sewn on or printed on a fabric: prints, buttons, zips, seams, pockets, ribs, bands,
 stripes, laces.
 
-`sewn` is the fabric of a garment with all of that, by the table `SEWN_ON`. Its trimmings take
+`sewn` is the fabric of a garment with all of that, by the table `_SEWN_ON`. Its trimmings take
 colors (n, 3) at points, the points, random numbers and the garment, and return other colors. Words
 are set in a 5 x 7 alphabet of the package's own.
 """
@@ -21,9 +21,9 @@ QUILT = 0.075
 PADDED = ("puffer", "vest")
 """Kinds of garments that are quilted."""
 
-ROWS = 7
+_ROWS = 7
 """Rows of cells of a letter."""
-ADVANCE = 6
+_ADVANCE = 6
 """Columns of cells from one letter to the next."""
 
 _ALPHABET = {
@@ -45,29 +45,26 @@ _ALPHABET = {
 }  # fmt: skip
 """Seven rows of five bits each, in hexadecimal."""
 
-WORDS = ("OCEAN", "NORTH", "WILD",
-         "NOVA", "CITY", "PEAK", "LOOP", "SUNNY", "TEAM", "RIVER", "ZERO", "MAGIC", "HELLO",
-         "FOX")  # fmt: skip
 EMBLEMS = ("disc", "star", "heart", "peaks", "sun", "diamond", "bolt", "ring")
-PRINTS = {"words": 0.3, "emblem": 0.22, "both": 0.22, "logo": 0.13, "picture": 0.13}
-"""Odds."""
+"""Shapes that are printed."""
 
 
 def bitmap(text: str) -> Bool[np.ndarray, "7 w"]:
     """(7, 6 n) cells of a word of n letters; unknown letters are blanks."""
-    cells = np.zeros((ROWS, ADVANCE * len(text)), bool)
+    cells = np.zeros((_ROWS, _ADVANCE * len(text)), bool)
     for i, letter in enumerate(text):
-        code = bytes.fromhex(_ALPHABET.get(letter, "00" * ROWS))
+        code = bytes.fromhex(_ALPHABET.get(letter, "00" * _ROWS))
         for row, bits in enumerate(code):
-            cells[row, ADVANCE * i : ADVANCE * i + 5] = [bits >> (4 - k) & 1 for k in range(5)]
+            cells[row, _ADVANCE * i : _ADVANCE * i + 5] = [bits >> (4 - k) & 1 for k in range(5)]
     return cells
 
 
-def random_text(rng: np.random.Generator) -> str:
-    """A word, a year or a made-up name."""
+def _random_text(rng: np.random.Generator) -> str:
+    """A word, a number, a year or a made-up name."""
     kind = rng.random()
     if kind < 0.4:
-        return str(rng.choice(WORDS))
+        words = "OCEAN NORTH WILD NOVA CITY PEAK LOOP SUNNY TEAM RIVER ZERO MAGIC HELLO FOX"
+        return str(rng.choice(words.split()))
     if kind < 0.6:
         if rng.random() < 0.5:
             return str(rng.integers(1, 100))
@@ -84,7 +81,7 @@ def written(cells: Bool[np.ndarray, "7 w"], x: Field, y: Field) -> Field:
     """
     padded = np.pad(cells.astype(np.float32), 1)
     column = np.clip(x + 0.5, 0, padded.shape[1] - 1.001)
-    row = np.clip(ROWS - y + 0.5, 0, padded.shape[0] - 1.001)
+    row = np.clip(_ROWS - y + 0.5, 0, padded.shape[0] - 1.001)
     i, k = np.floor(row).astype(int), np.floor(column).astype(int)
     u, w = row - i, column - k
     top = padded[i, k] * (1 - w) + padded[i, k + 1] * w
@@ -137,7 +134,7 @@ def _darker(colors: Points, share: float | Float[np.ndarray, "n 1"], where: Fiel
     return mix(colors, colors * share, where)
 
 
-def seamed(colors: Points, s: Spots) -> Points:
+def _seamed(colors: Points, s: Spots) -> Points:
     """Seams down the sides of trunk and limbs and around the armholes."""
     armhole = np.where(s.template[:, 1] > -0.02, np.abs(np.abs(s.template[:, 0]) - ARMHOLE), 1.0)
     return _darker(
@@ -145,7 +142,7 @@ def seamed(colors: Points, s: Spots) -> Points:
     )
 
 
-def hemmed(colors: Points, s: Spots, hem: float, sleeve: float | None) -> Points:
+def _hemmed(colors: Points, s: Spots, hem: float, sleeve: float | None) -> Points:
     """Stitching beside the hem at height y of trunk or legs, and at |x| = sleeve of the arms."""
     x, y, _ = s.template.T
     on_arm = np.abs(x) > 0.2
@@ -155,7 +152,7 @@ def hemmed(colors: Points, s: Spots, hem: float, sleeve: float | None) -> Points
     return _darker(colors, 0.8, line)
 
 
-def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+def _printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a
     scene.
     """
@@ -165,8 +162,9 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
     ink2 = accent(rng, ink)
     kind = "number"
     if not number:
-        kind = str(rng.choice(list(PRINTS), p=list(PRINTS.values())))
-    cells = bitmap(str(rng.integers(0, 100)) if number else random_text(rng))
+        odds = {"words": 0.3, "emblem": 0.22, "both": 0.22, "logo": 0.13, "picture": 0.13}
+        kind = str(rng.choice(list(odds), p=list(odds.values())))
+    cells = bitmap(str(rng.integers(0, 100)) if number else _random_text(rng))
     width = cells.shape[1] - 1
     cell = min(rng.uniform(0.17, 0.26) / width, 0.026 if number else 0.014)
     height = rng.uniform(-0.05, 0.02)
@@ -175,7 +173,7 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
     on_back, framed = number or rng.random() < 0.25, rng.random() < 0.3
 
     def words(x, y):
-        return written(cells, x / cell + 0.5 * width, y / cell + 0.5 * ROWS)
+        return written(cells, x / cell + 0.5 * width, y / cell + 0.5 * _ROWS)
 
     def badge(x, y, size):
         return emblem(shape, x / size, y / size, points)
@@ -215,7 +213,7 @@ def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
     return result
 
 
-def side_striped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+def _side_striped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """One to three stripes down the outside of arms and legs."""
     ink, count = accent(rng, garment.fabric.base), int(rng.integers(1, 4))
     girth, wide = s.cloth[:, 3], 0.022 / count
@@ -231,7 +229,7 @@ def side_striped(colors: Points, s: Spots, rng: np.random.Generator, garment: Ga
     return mix(colors, ink, stripes * band(girth, 0.0, 0.12, 0.01))
 
 
-def ribbed(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
+def _ribbed(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
     """Knitted bands at the hem and the cuffs: upright ribs, a little darker."""
     x, width = np.abs(s.template[:, 0]), 0.04
     at_hem = s.template[:, 1] < garment.sizes["bottom"] + 1.3 * width
@@ -240,13 +238,13 @@ def ribbed(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garment
     return _darker(colors, ribs[:, None], inside.astype(np.float32))
 
 
-def quilted(colors: Points, s: Spots, _rng: np.random.Generator, _garment: Garment) -> Points:
+def _quilted(colors: Points, s: Spots, _rng: np.random.Generator, _garment: Garment) -> Points:
     """Dark stitched lines around the garment, between which it bulges."""
     phase = (s.along / QUILT) % 1
     return _darker(colors, 0.55, np.exp(-((np.minimum(phase, 1 - phase) * QUILT / 0.006) ** 2)))
 
 
-def buttoned(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+def _buttoned(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A placket with buttons down the front."""
     high = 0.2
     low = garment.sizes["end" if garment.kind in DRESSES else "bottom"]
@@ -264,7 +262,7 @@ def buttoned(colors: Points, s: Spots, rng: np.random.Generator, garment: Garmen
     return mix(_darker(colors, 0.6, band(np.abs(x - 0.002), 0.0135, 0.016) * front), ink, button)
 
 
-def zipped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+def _zipped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A zip down the front, or its halves along the edges of an open front."""
     ink = color(0.1, 0.05, rng.choice([0.15, 0.6, 0.75]))
     edge = max(garment.sizes.get("gap", 0.0), 0.0)
@@ -279,7 +277,7 @@ def _boundary(x: Field, y: Field, half_width: float, half_height: float) -> Fiel
     return band(np.abs(np.maximum(np.abs(x) - half_width, np.abs(y) - half_height)), -1, 0.0018)
 
 
-def pocketed(
+def _pocketed(
     colors: Points, s: Spots, rng: np.random.Generator, _garment: Garment, kind: str
 ) -> Points:
     """Pockets as stitched silhouettes: on the chest, in a jacket's front, on jeans (front and back)
@@ -314,7 +312,7 @@ def banded(colors: Points, s: Spots, ink: np.ndarray, low: float, high: float) -
     return mix(colors, ink, band(s.cloth[:, 1], low, high) * band(s.cloth[:, 3], 0.1, 1.0, 0.01))
 
 
-def sashed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+def _sashed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A sash around the waist of a coat or a dress."""
     if garment.kind == "coat":
         return banded(colors, s, garment.fabric.base * 0.6, WAIST - 0.02, WAIST + 0.02)
@@ -322,26 +320,26 @@ def sashed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment)
     return banded(colors, s, garment.fabric.other, waist - 0.01, waist + rng.uniform(0.02, 0.05))
 
 
-def turned_up(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
+def _turned_up(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
     """The paler inner side of trouser legs above their hems."""
     pale = (0.5 * garment.fabric.base + 0.35).astype(np.float32)
     return mix(colors, pale, band(s.template[:, 1], -9.0, garment.sizes["end"] + 0.045))
 
 
-SEWN_ON = (
-    (PADDED, None, quilted),
-    (TOPS, "pocket", pocketed, "chest"),
-    (("denim_jacket",), "pockets", pocketed, "chest"),
-    ({*OUTER} - {"denim_jacket"}, "pockets", pocketed, "jacket"),
-    (BOTTOMS, "pockets", pocketed, "jeans"),
-    (("cargo",), None, pocketed, "cargo"),
-    (("shirt", "blouse"), "closed collar", buttoned),
-    (("denim_jacket", "blazer", "cardigan", "coat"), "closed", buttoned),
-    (("polo", "shirt_dress"), None, buttoned),
-    (("hoodie",), "zip", zipped),
-    (("jacket", "puffer", "hooded_jacket", "vest"), None, zipped),
-    (("coat", *DRESSES), "sash", sashed),
-    (("jeans",), "turn_up", turned_up),
+_SEWN_ON = (
+    (PADDED, None, _quilted),
+    (TOPS, "pocket", _pocketed, "chest"),
+    (("denim_jacket",), "pockets", _pocketed, "chest"),
+    ({*OUTER} - {"denim_jacket"}, "pockets", _pocketed, "jacket"),
+    (BOTTOMS, "pockets", _pocketed, "jeans"),
+    (("cargo",), None, _pocketed, "cargo"),
+    (("shirt", "blouse"), "closed collar", _buttoned),
+    (("denim_jacket", "blazer", "cardigan", "coat"), "closed", _buttoned),
+    (("polo", "shirt_dress"), None, _buttoned),
+    (("hoodie",), "zip", _zipped),
+    (("jacket", "puffer", "hooded_jacket", "vest"), None, _zipped),
+    (("coat", *DRESSES), "sash", _sashed),
+    (("jeans",), "turn_up", _turned_up),
 )
 """Kinds of garments, the detail that they need for it, None: all have it; a trimming, and its
 further arguments. In this order: they share the fabric's random numbers."""
@@ -359,17 +357,17 @@ def sewn(
 
     def colors(s):
         rng = garment.fabric.rng(1)
-        result = hemmed(garment.fabric.colors(s), s, hem, sleeve)
+        result = _hemmed(garment.fabric.colors(s), s, hem, sleeve)
         if seams:
-            result = seamed(result, s)
+            result = _seamed(result, s)
         if "ribbed" in details and sleeve is not None:
-            result = ribbed(result, s, rng, garment)
+            result = _ribbed(result, s, rng, garment)
         if details & {"print", "number"}:
-            result = printed(result, s, rng, garment)
+            result = _printed(result, s, rng, garment)
         if "side_stripe" in details:
-            result = side_striped(result, s, rng, garment)
+            result = _side_striped(result, s, rng, garment)
         rng = garment.fabric.rng(2)
-        for kinds, detail, trimming, *arguments in SEWN_ON:
+        for kinds, detail, trimming, *arguments in _SEWN_ON:
             if garment.kind in kinds and (detail is None or detail in details):
                 result = trimming(result, s, rng, garment, *arguments)
         return result

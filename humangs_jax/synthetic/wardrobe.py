@@ -16,13 +16,10 @@ from humangs_jax.synthetic.surfaces import Field, Points, Surface, compact
 from humangs_jax.synthetic.tailoring import HEM_MARGIN, Fit, shell, skirt
 from humangs_jax.synthetic.trimmings import PADDED, QUILT, sewn
 
-Cover = Callable[[np.ndarray], np.ndarray]
-"""Template points (n, 3) -> (n,) metres inside of a garment's hems, negative outside."""
-
-Cut = tuple[Callable[..., np.ndarray], *tuple[Any, ...]]
+_Cut = tuple[Callable[..., np.ndarray], *tuple[Any, ...]]
 """A field of `tailoring` over template points, and its further arguments."""
 
-LAYER = 0.006
+_LAYER = 0.006
 """What one layer is further out than the one below it, metres."""
 
 
@@ -83,9 +80,11 @@ class Outfit:
             shown = np.zeros(len(surface.vertices), bool)
         self.pieces.append(Piece(surface, material, shown))
 
-    def hide(self, cover: Cover, margin: float, cloth: bool = True) -> None:
+    def hide(self, cover: Callable[[Points], Field], margin: float, cloth: bool = True) -> None:
         """Take away what lies further than a margin inside of a garment that is put on next: skin,
         and cloth if it is below.
+
+        cover: template points (n, 3) -> (n,) metres inside of its hems, negative outside.
         """
         field = cover(self.template)
         self.cover = np.maximum(self.cover, field)
@@ -97,7 +96,7 @@ class Outfit:
 
     def put(
         self,
-        cuts: Sequence[Cut],
+        cuts: Sequence[_Cut],
         fit: Fit,
         material: Material,
         margin: float = HEM_MARGIN,
@@ -126,7 +125,7 @@ def dress_up(rng: np.random.Generator, anatomy: Anatomy, garments: tuple[Garment
     outfit = Outfit(anatomy, [], np.full(count, -1.0), np.zeros(count, bool), rng)
     for garment, own in zip(garments, rng.spawn(len(garments)), strict=True):
         outfit.rng = own
-        BUILDERS.get(garment.kind, _accessory)(outfit, garment)
+        _BUILDERS.get(garment.kind, _accessory)(outfit, garment)
     outfit.pieces = [piece.visible() for piece in outfit.pieces]
     return outfit
 
@@ -138,7 +137,7 @@ def _bodice(
     fit: Fit,
     material: Material,
     margin: float,
-    opening: Sequence[Cut] = (),
+    opening: Sequence[_Cut] = (),
 ) -> None:
     """Cloth on trunk and arms, the outermost so far. sizes: depth of the neckline, ends of the
     sleeves and of the trunk.
@@ -179,11 +178,11 @@ def _top(outfit: Outfit, garment: Garment) -> None:
         hang = outfit.rng.choice([0.05, 0.2, 0.5])
     wide = 0.035 if sleeve < 0.45 else 0.016
     fit = Fit(
-        ease=max(least + 0.016 * loose, outfit.trunk + LAYER),
+        ease=max(least + 0.016 * loose, outfit.trunk + _LAYER),
         hang=hang,
         sleeve=0.003 + wide * loose,
         fold=0.0015 + 0.0055 * loose,
-        inner=outfit.trunk + 0.5 * LAYER if outfit.trunk else 0.0,
+        inner=outfit.trunk + 0.5 * _LAYER if outfit.trunk else 0.0,
         skirted=True,
     )
     stitches = sewn(garment, bottom + 0.018, sleeve - 0.016 if sleeve > 0.2 else None)
@@ -231,7 +230,7 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
         hem=0.014,
         quilt=QUILT if padded else 0.0,
         skirted=True,
-        inner=outfit.trunk + 0.5 * LAYER,
+        inner=outfit.trunk + 0.5 * _LAYER,
     )
     stitches = sewn(garment, bottom + 0.018, sizes["sleeve"] - 0.016 if kind != "vest" else None)
     material = Material(
@@ -271,14 +270,12 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
         _collar(outfit, material, fit, 0.003, (0.12, 0.185 if padded else 0.175, max(gap, 0.01)))
 
 
-LEG_HANG = {"wide": 0.02, "slim": 1.0, "leggings": 3.0, "jeans": 0.12}
-
-
 def _trousers(outfit: Outfit, garment: Garment) -> None:
     sizes, kind = garment.sizes, garment.kind
     top, end, loose, tucked = sizes["top"], sizes["end"], sizes["loose"], sizes["tucked"] > 0
     ease = outfit.trunk + 0.004 if tucked else 0.005
-    hang = outfit.rng.choice([0.05, 0.1])
+    hangs = {"wide": 0.02, "slim": 1.0, "leggings": 3.0, "jeans": 0.12}
+    hang = hangs.get(kind, outfit.rng.choice([0.05, 0.1]))
     distance = 0.004 if kind == "leggings" and not tucked else ease
     fold = 0.0025 + 0.0035 * loose
     if kind in ("leggings", "slim"):
@@ -287,7 +284,7 @@ def _trousers(outfit: Outfit, garment: Garment) -> None:
         ease=distance,
         hang=0.6,
         leg=sizes["width"],
-        leg_hang=LEG_HANG.get(kind, hang),
+        leg_hang=hang,
         fold=fold,
         calm=9.0 if tucked else outfit.lowest + 0.02,
     )
@@ -379,16 +376,14 @@ def _shoes(outfit: Outfit, garment: Garment) -> None:
     surface = accessories.pair_of_shoes(outfit.anatomy, height, sole, 0.017 if over else 0.006)
     outfit.hide(lambda t: tailoring.shaft(t, height), 0.012)
     if not over:
-        outfit.pieces = [_unhidden_legs(piece) for piece in outfit.pieces]
+        # trouser legs hang over low shoes, which hide nothing of them, only socks
+        for i, piece in enumerate(outfit.pieces):
+            if piece.hidden is None:
+                continue
+            y = piece.surface.template[:, 1]
+            if y.min() >= -1.2:
+                outfit.pieces[i] = dataclasses.replace(piece, hidden=piece.hidden & (y >= -0.9))
     outfit.add(surface, material, layered=False)
-
-
-def _unhidden_legs(piece: Piece) -> Piece:
-    """Trouser legs hang over low shoes: the shoe hides nothing of them, only socks."""
-    if piece.hidden is None or piece.surface.template[:, 1].min() < -1.2:
-        return piece
-    low = piece.surface.template[:, 1] < -0.9
-    return dataclasses.replace(piece, hidden=piece.hidden & ~low)
 
 
 def _belt(outfit: Outfit, garment: Garment) -> None:
@@ -448,7 +443,7 @@ def _accessory(outfit: Outfit, garment: Garment) -> None:
         outfit.add(surface, material, layered=False)
 
 
-BUILDERS = {
+_BUILDERS = {
     **dict.fromkeys(TOPS, _top),
     **dict.fromkeys(OUTER, _outer),
     **dict.fromkeys(BOTTOMS, _trousers),

@@ -66,21 +66,14 @@ from humangs_jax.synthetic.surroundings import (
 
 HELD_OUT = "held_out"
 """Sub-folder of a subject's folder."""
-POSE_STREAM = 1
-"""Random stream of a seed that draws poses; stream 0 makes the person."""
-CAMERA_STREAM = 2
-"""Stream of the cameras."""
-HELD_OUT_STREAM = 3
-"""Stream of the held-out cameras."""
-CLOSE_STREAM = 4
-"""Stream of the close cameras."""
-MOTION_STREAM = 5
-"""Stream of the motion."""
-GROUNDED_EVERY = 5
-"""Every how many frames the height of a motion above the ground is measured."""
 CAPTURE = "capture.json"
-MANIFEST_EVERY = 30.0
-"""Seconds between two updates of the manifest."""
+"""File of a capture that is written last."""
+
+
+class Stream:
+    """Random streams of a seed, by what they draw; stream 0 makes the person."""
+
+    POSES, CAMERAS, HELD_OUT_CAMERAS, CLOSE_CAMERAS, MOTION = range(1, 6)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +118,7 @@ def sample_pose(subject: SyntheticSubject, index: int) -> PosedSubject:
 
     Pose 0 is the one of the input views.
     """
-    rng = np.random.default_rng([subject.seed, POSE_STREAM, index])
+    rng = np.random.default_rng([subject.seed, Stream.POSES, index])
     return stand(subject, sample_rotations(rng, subject.build))
 
 
@@ -141,11 +134,12 @@ def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = Non
     0 about all the time.
     """
     sequence = sample_sequence(
-        np.random.default_rng([subject.seed, MOTION_STREAM]), subject.build, frames, kind
+        np.random.default_rng([subject.seed, Stream.MOTION]), subject.build, frames, kind
     )
     rotations = sequence.rotations.astype(np.float32)
     translations = sequence.translations.astype(np.float32)
-    asked = range(0, frames, GROUNDED_EVERY)
+    # the height above the ground, of every fifth frame
+    asked = range(0, frames, 5)
     lowest = [subject.posed_vertices(rotations[i], translations[i])[:, 1].min() for i in asked]
     translations[:, 1] -= np.median(lowest)
     return Motion(jnp.asarray(rotations), jnp.asarray(translations), sequence.fps)
@@ -196,9 +190,13 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
     ]
     size = layout.image_size
     # each kind of camera has its stream: more of one does not change the others
-    views = _views([seed, CAMERA_STREAM], cameras_around, layout.views, posed, size)
-    views += _views([seed, CLOSE_STREAM], close_cameras, layout.close_views, posed, size, mark="c")
-    held_out = _views([seed, HELD_OUT_STREAM], cameras_around, layout.held_out_views, others, size)
+    views = _views([seed, Stream.CAMERAS], cameras_around, layout.views, posed, size)
+    views += _views(
+        [seed, Stream.CLOSE_CAMERAS], close_cameras, layout.close_views, posed, size, mark="c"
+    )
+    held_out = _views(
+        [seed, Stream.HELD_OUT_CAMERAS], cameras_around, layout.held_out_views, others, size
+    )
 
     def write(temporary: Path):
         save_capture(temporary, capture_views(subject, body, posed, views))
@@ -263,8 +261,8 @@ def write_set(
                     failed[seed] = error
                     say(f"seed {seed}: {error}", lines=False)
                 bar.update(1)
-                # the manifest names what is finished, in case this is interrupted
-                if time.monotonic() - listed > MANIFEST_EVERY:
+                # twice a minute the manifest names what is finished, in case this is interrupted
+                if time.monotonic() - listed > 30.0:
                     write_manifest(out, SYNTHETIC, made_with, subjects=finished(out, CAPTURE))
                     listed = time.monotonic()
     finally:

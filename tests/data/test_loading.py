@@ -21,7 +21,7 @@ from humangs_jax.data.sets import DATA_SET, SYNTHETIC, begin_set
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.synthetic.on_the_fly import GeneratedSource
-from humangs_jax.synthetic.subject import GENERATOR_VERSION, SPLITS, TRAIN, split_of, subject_key
+from humangs_jax.synthetic.subject import GENERATOR_VERSION, SPLITS, split_of, subject_key
 from humangs_jax.synthetic.writer import find_people
 
 SIZE = 4
@@ -119,6 +119,10 @@ import jax, json, numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from tests.data.test_loading import CountingSource, same
 from humangs_jax.data.loading import Loader
+
+TRAIN = SPLITS["train"]
+
+
 mesh = jax.make_mesh((2, 2), ("data", "model"), axis_types=(AxisType.Auto,) * 2)
 plain = Loader(CountingSource(), 4, seed=1)
 for spec in (PartitionSpec("data"), PartitionSpec(("data", "model")), PartitionSpec()):

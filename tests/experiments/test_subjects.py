@@ -8,9 +8,10 @@ import pytest
 from experiments import subjects as people
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
-from humangs_jax.synthetic.subject import DEMO
+from humangs_jax.synthetic.subject import SPLITS
 from humangs_jax.synthetic.writer import Layout, write_person
 
+DEMO = SPLITS["demo"]
 SIZE = 48
 pytestmark = pytest.mark.slow
 

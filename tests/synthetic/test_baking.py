@@ -14,8 +14,9 @@ from humangs_jax.body.library import load_body
 from humangs_jax.rendering.mesh import atlas, rasterizer
 from humangs_jax.rendering.mesh.rasterizer import sample_texture
 from humangs_jax.synthetic import bank, subject, surroundings, writer
-from humangs_jax.synthetic.subject import DEMO
+from humangs_jax.synthetic.subject import SPLITS
 
+DEMO = SPLITS["demo"]
 SIZE = 512
 LEAST_DENSITY = 0.4
 """Charts may shrink faces that look aside, to `atlas.LEAST_COSINE` along one direction; measured

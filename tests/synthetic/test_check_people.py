@@ -7,9 +7,10 @@ import pytest
 
 from experiments import generator as check_people
 from humangs_jax.synthetic import surroundings
-from humangs_jax.synthetic.subject import DEMO, make_subject
+from humangs_jax.synthetic.subject import SPLITS, make_subject
 from humangs_jax.synthetic.writer import sample_pose
 
+DEMO = SPLITS["demo"]
 SIZE = 96
 
 

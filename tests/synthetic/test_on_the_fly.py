@@ -25,8 +25,10 @@ from humangs_jax.synthetic import on_the_fly, subject, surroundings
 from humangs_jax.synthetic.anatomy import joint_positions
 from humangs_jax.synthetic.bank import build_bank, load_bank, save_bank, to_silhouettes
 from humangs_jax.synthetic.on_the_fly import jitted_example, on_the_fly_source
-from humangs_jax.synthetic.subject import DEMO, TEST, make_subject
+from humangs_jax.synthetic.subject import SPLITS, make_subject
 
+DEMO = SPLITS["demo"]
+TEST = SPLITS["test"]
 SEEDS = (DEMO[0], DEMO[4])
 CONFIG = on_the_fly.OnTheFlyConfig(input_views=2, target_views=1, input_size=48, target_size=48)
 SIZE = 96

@@ -9,9 +9,10 @@ from humangs_jax.synthetic import outfits, subject, surroundings
 from humangs_jax.synthetic.anatomy import ARM_GIRTH, ARMHOLE, TRUNK_GIRTH
 from humangs_jax.synthetic.fabrics import Spots
 from humangs_jax.synthetic.hair import BEARDS, CUTS
-from humangs_jax.synthetic.subject import DEMO, HEIGHT_RANGE, YEARS, describe
+from humangs_jax.synthetic.subject import HEIGHT_RANGE, SPLITS, YEARS, describe
 from humangs_jax.synthetic.trimmings import EMBLEMS, bitmap, emblem, written
 
+DEMO = SPLITS["demo"]
 MILLIMETRES = 4e-3
 """The stature is set by two vertices of the mean body; another one may be the highest."""
 

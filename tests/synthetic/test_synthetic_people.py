@@ -8,10 +8,11 @@ from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from humangs_jax.synthetic import fabrics, subject, surroundings, writer
-from humangs_jax.synthetic.anatomy import LEFT_HIP, LEFT_KNEE
+from humangs_jax.synthetic.anatomy import Joint
 from humangs_jax.synthetic.fabrics import PATTERNS
-from humangs_jax.synthetic.subject import DEMO
+from humangs_jax.synthetic.subject import SPLITS
 
+DEMO = SPLITS["demo"]
 SEEDS = [DEMO[i] for i in range(4)]
 SIZE = 96
 POKED = 0.01
@@ -137,12 +138,12 @@ def test_garments_move_with_the_pose(people):
     rotations = np.zeros((55, 3), np.float32)
     rest = person.posed_vertices(rotations, np.zeros(3))
     np.testing.assert_allclose(rest, person.surface.vertices, atol=1e-5)
-    rotations[LEFT_HIP] = [-0.6, 0, 0]
+    rotations[Joint.LEFT_HIP] = [-0.6, 0, 0]
     moved = np.linalg.norm(person.posed_vertices(rotations, np.zeros(3)) - rest, axis=1)
     template = person.surface.attributes["template"]
     is_cloth = np.ones(len(rest), bool)
     is_cloth[np.unique(person.surface.faces[person.face_materials <= 1])] = False
-    knee = person.build.joints[LEFT_KNEE]
+    knee = person.build.joints[Joint.LEFT_KNEE]
     near_knee = np.linalg.norm(rest - (knee + np.asarray([0, 0.1, 0])), axis=1) < 0.15
     assert np.median(moved[near_knee]) > 0.05
     assert moved[(template[:, 1] > 0.25) & ~is_cloth].max() < 1e-5

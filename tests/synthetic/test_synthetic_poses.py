@@ -77,18 +77,20 @@ def test_all_joints_stay_within_their_limits(drawn):
     angles = np.linalg.norm(drawn, axis=-1)
     for joint, limit in enumerate(kin.LIMITS):
         assert angles[:, joint].max() <= limit + 1e-9, joint
-    assert angles[:, kin.LEFT_HAND :].max() <= kin.FINGER_LIMIT + 1e-9
+    assert angles[:, kin.Joint.LEFT_HAND :].max() <= kin.FINGER_LIMIT + 1e-9
     assert (angles[:, 22:25] == 0).all()
     assert (angles.std(0)[:22] > 0.01).all()  # every joint of the body takes part
-    assert (angles.std(0)[kin.LEFT_HAND :] > 0.01).all()  # and every joint of the hands
+    assert (angles.std(0)[kin.Joint.LEFT_HAND :] > 0.01).all()  # and every joint of the hands
 
 
 def test_knees_elbows_and_fingers_bend_one_way(drawn):
     assert (
-        drawn[:, [kin.LEFT_KNEE, kin.RIGHT_KNEE], 0] >= -0.03
+        drawn[:, [kin.Joint.LEFT_KNEE, kin.Joint.RIGHT_KNEE], 0] >= -0.03
     ).all()  # rest knees are not quite straight
-    assert (drawn[:, kin.LEFT_ELBOW, 1] < 0).all() and (drawn[:, kin.RIGHT_ELBOW, 1] > 0).all()
-    for first, sign in ((kin.LEFT_HAND, -1), (kin.RIGHT_HAND, 1)):
+    assert (drawn[:, kin.Joint.LEFT_ELBOW, 1] < 0).all() and (
+        drawn[:, kin.Joint.RIGHT_ELBOW, 1] > 0
+    ).all()
+    for first, sign in ((kin.Joint.LEFT_HAND, -1), (kin.Joint.RIGHT_HAND, 1)):
         bends = sign * drawn[:, first : first + 12, 2]  # towards the palm
         assert bends.min() > -0.12 and bends.max() > 1.0 and np.median(bends) > 0.1
 
@@ -117,23 +119,23 @@ def test_legs_put_the_feet_where_they_are_to_be(x, z, yaw, pitch, lift, sink):
     joints = build.joints
     feet = (kin.Foot(0.12 + x, z, yaw, pitch, lift), kin.Foot(-0.12, 0.05, 0.0))
     rotations = np.zeros((kin.JOINTS, 3))
-    rotations[kin.PELVIS] = [0.1, 0.3, 0.05]
+    rotations[kin.Joint.PELVIS] = [0.1, 0.3, 0.05]
     height = kin.highest_pelvis(build, kin.rotation_matrix(rotations[0]), 0.0, 0.0, feet) - sink
     pelvis = np.asarray([0.0, height, 0.0])
     assert kin.place_feet(build, rotations, pelvis, feet) < 1e-9
     world, positions = kin.joint_positions(build, rotations)
-    positions = positions + pelvis - positions[kin.PELVIS]
+    positions = positions + pelvis - positions[kin.Joint.PELVIS]
     for side, foot in enumerate(feet):
         ankle, orientation = kin.ankle_of(build, side, foot)
-        np.testing.assert_allclose(positions[kin.LEFT_ANKLE + side], ankle, atol=1e-9)
-        np.testing.assert_allclose(world[kin.LEFT_ANKLE + side], orientation, atol=1e-9)
+        np.testing.assert_allclose(positions[kin.Joint.LEFT_ANKLE + side], ankle, atol=1e-9)
+        np.testing.assert_allclose(world[kin.Joint.LEFT_ANKLE + side], orientation, atol=1e-9)
         if foot.pitch >= 0:  # the ball is above its place, the toes are flat
-            ball = positions[kin.LEFT_FOOT + side]
+            ball = positions[kin.Joint.LEFT_FOOT + side]
             np.testing.assert_allclose(ball[[0, 2]], [foot.x, foot.z], atol=1e-9)
             np.testing.assert_allclose(
-                ball[1], foot.lift + joints[kin.LEFT_FOOT + side, 1] - build.sole, atol=1e-9
+                ball[1], foot.lift + joints[kin.Joint.LEFT_FOOT + side, 1] - build.sole, atol=1e-9
             )
-            np.testing.assert_allclose(world[kin.LEFT_FOOT + side][1], [0, 1, 0], atol=1e-9)
+            np.testing.assert_allclose(world[kin.Joint.LEFT_FOOT + side][1], [0, 1, 0], atol=1e-9)
 
 
 def test_both_soles_are_on_the_ground(body, build, posed):
@@ -141,7 +143,9 @@ def test_both_soles_are_on_the_ground(body, build, posed):
     raised.
     """
     part = np.asarray(body.skinning_weights).argmax(1)
-    soles = [np.isin(part, (kin.LEFT_ANKLE + side, kin.LEFT_FOOT + side)) for side in (0, 1)]
+    soles = [
+        np.isin(part, (kin.Joint.LEFT_ANKLE + side, kin.Joint.LEFT_FOOT + side)) for side in (0, 1)
+    ]
     gaps = {}
     for name, (_, draw) in STANCES.items():
         for seed in range(4):
@@ -207,12 +211,12 @@ def test_hardly_any_of_the_body_is_inside_itself(body, drawn):
     inside = [inside_of(rotations) for rotations in drawn[:10]]
     assert np.mean(inside) < INSIDE and np.max(inside) < 0.04
     folded = np.zeros((kin.JOINTS, 3))
-    folded[[kin.LEFT_HIP, kin.RIGHT_HIP], 2] = -0.3, 0.3  # legs through each other
+    folded[[kin.Joint.LEFT_HIP, kin.Joint.RIGHT_HIP], 2] = -0.3, 0.3  # legs through each other
     assert inside_of(folded) > 0.04
 
 
 def test_mirrored_goals_give_both_arms_the_same_freedom(drawn):
-    left, right = drawn[:, kin.LEFT_SHOULDER] * kin.MIRROR, drawn[:, kin.RIGHT_SHOULDER]
+    left, right = drawn[:, kin.Joint.LEFT_SHOULDER] * kin.MIRROR, drawn[:, kin.Joint.RIGHT_SHOULDER]
     assert np.abs(left.mean(0) - right.mean(0)).max() < 0.4  # means of 40 draws of spread 0.6
 
 
@@ -223,9 +227,12 @@ def test_gestures_are_drawn_and_mirrored():
             rotations = np.zeros((kin.JOINTS, 3))
             pose_hand(np.random.default_rng(seed), rotations, side)
             drawn.append(rotations)
-            assert not rotations[: kin.LEFT_HAND].any()
+            assert not rotations[: kin.Joint.LEFT_HAND].any()
         curls = (
-            -sign * np.asarray(drawn)[:, (kin.LEFT_HAND, kin.RIGHT_HAND)[side] + np.arange(12), 2]
+            -sign
+            * np.asarray(drawn)[
+                :, (kin.Joint.LEFT_HAND, kin.Joint.RIGHT_HAND)[side] + np.arange(12), 2
+            ]
         )
         index, others = curls[:, :3].mean(1), curls[:, 3:].mean(1)
         assert ((index < 0.3) & (others > 0.8)).any()  # pointing

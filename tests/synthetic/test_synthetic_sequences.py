@@ -96,7 +96,7 @@ def test_motions_are_smooth(drawn, case):
 def test_legs_and_arms_keep_to_their_limits(build, drawn, case):
     for rotations in drawn[case].rotations:
         assert kin.excess(rotations, tuple(range(1, 22))) < 0.05
-        assert (rotations[[kin.LEFT_KNEE, kin.RIGHT_KNEE], 0] > -0.03).all()
+        assert (rotations[[kin.Joint.LEFT_KNEE, kin.Joint.RIGHT_KNEE], 0] > -0.03).all()
     inside = [arm_clearance(build, rotations) < -0.03 for rotations in drawn[case].rotations]
     assert np.mean(inside) < 0.1
 

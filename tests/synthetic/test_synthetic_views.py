@@ -15,7 +15,6 @@ from humangs_jax.io.atomic import replace_folder
 from humangs_jax.motion import load_motion
 from humangs_jax.synthetic import surroundings, writer
 from humangs_jax.synthetic.subject import (
-    DEMO,
     GENERATOR_VERSION,
     SPLITS,
     make_subject,
@@ -25,6 +24,7 @@ from humangs_jax.synthetic.subject import (
 )
 from humangs_jax.synthetic.writer import find_people
 
+DEMO = SPLITS["demo"]
 SIZE, EIGHT_BITS = 32, 1.01 / 255
 BODY = load_body()
 LAYOUT = writer.Layout(SIZE, poses=2, views=3, close_views=1, held_out_views=1, novel_poses=1)

@@ -22,9 +22,10 @@ from humangs_jax.data.datasets.subject import BodyParameters, FileBody, posed_pe
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import to_uint8
 from humangs_jax.synthetic.bank import bake_subject, lit_texture
-from humangs_jax.synthetic.subject import DEMO, describe, make_subject, pose_subject, render_view
+from humangs_jax.synthetic.subject import SPLITS, describe, make_subject, pose_subject, render_view
 from humangs_jax.synthetic.writer import sample_motion, sample_pose
 
+DEMO = SPLITS["demo"]
 SEEDS = (3_000_271, 3_000_584)
 """People who are written, of the split "demo"."""
 TIGHT = ("tank", "leggings", "socks")
