@@ -153,6 +153,7 @@ def _bodice(
 
 
 def _neck(garment: Garment) -> str:
+    """The neckline of a top or a dress."""
     return next(neck for neck in tailoring.NECKLINES if neck in garment.details)
 
 
@@ -163,12 +164,15 @@ def _collar(
     extra: float = 0.004,
     sizes: Sequence[float] = (0.125, 0.178, 0.012),
 ) -> None:
-    """sizes: see `tailoring.collar`."""
-    cut_of = dataclasses.replace(fit, ease=fit.ease + extra, fold=0.0, hem=0.01, quilt=0.0)
-    outfit.strip(tailoring.collar(outfit.template, *sizes), cut_of, material)
+    """A collar that stands off from its garment by some metres more. sizes: see
+    `tailoring.collar`.
+    """
+    flat = dataclasses.replace(fit, ease=fit.ease + extra, fold=0.0, hem=0.01, quilt=0.0)
+    outfit.strip(tailoring.collar(outfit.template, *sizes), flat, material)
 
 
 def _top(outfit: Outfit, garment: Garment) -> None:
+    """A top: its bodice, and a collar or a hood that lies on it."""
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
     # looser tops stand off further, hang more, and have higher folds; short sleeves stand off too
@@ -185,81 +189,62 @@ def _top(outfit: Outfit, garment: Garment) -> None:
         inner=outfit.trunk + 0.5 * _LAYER if outfit.trunk else 0.0,
         skirted=True,
     )
-    stitches = sewn(garment, bottom + 0.018, sleeve - 0.016 if sleeve > 0.2 else None)
-    material = Material(stitches, 0.25 + 0.45 * loose, sheen=0.04)
+    cuffs = sleeve - 0.016 if sleeve > 0.2 else None
+    material = Material(sewn(garment, bottom + 0.018, cuffs), 0.25 + 0.45 * loose, sheen=0.04)
     # an open front is one more cut through the bodice
     opening = []
     if "open" in details:
         opening = [(tailoring.front_opening, 0.03, 0.12)]
-    _bodice(
-        outfit,
-        _neck(garment),
-        (sizes["depth"], sleeve, bottom),
-        fit,
-        material,
-        HEM_MARGIN + 0.03 * loose,
-        opening,
-    )
-    # collars and hoods are pieces that lie on the bodice
+    margin = HEM_MARGIN + 0.03 * loose
+    ends = sizes["depth"], sleeve, bottom
+    _bodice(outfit, _neck(garment), ends, fit, material, margin, opening)
     if kind in ("shirt", "polo", "blouse") and "collar" in details:
         _collar(outfit, material, fit)
     if kind == "hoodie":
-        outfit.add(
-            accessories.hood(outfit.rng, outfit.anatomy, "hood_up" in details),
-            material,
-            layered=False,
-        )
+        hood = accessories.hood(outfit.rng, outfit.anatomy, "hood_up" in details)
+        outfit.add(hood, material, layered=False)
 
 
 def _outer(outfit: Outfit, garment: Garment) -> None:
+    """A jacket or a coat: its bodice, the part of a coat below the waist, and lapels, a hood or a
+    collar.
+    """
     sizes, kind, details = garment.sizes, garment.kind, garment.details
-    gap, spread, bottom, loose = sizes["gap"], sizes["spread"], sizes["bottom"], sizes["loose"]
-    long, padded, blazer = kind == "coat", kind in PADDED, kind == "blazer"
-    ease = max(outfit.trunk + 0.009 + 0.008 * loose, 0.022 if padded else 0.0)
-    if long:
-        hang = 1.5
-    elif blazer:
-        hang = 0.8
-    else:
-        hang = outfit.rng.choice([0.05, 0.3])
-    fit = Fit(
-        ease=ease,
-        hang=hang,
-        sleeve=0.01 + 0.012 * loose,
-        fold=0.002 if padded or blazer else 0.002 + 0.003 * loose,
-        hem=0.014,
-        quilt=QUILT if padded else 0.0,
-        skirted=True,
-        inner=outfit.trunk + 0.5 * _LAYER,
-    )
-    stitches = sewn(garment, bottom + 0.018, sizes["sleeve"] - 0.016 if kind != "vest" else None)
-    material = Material(
-        stitches, 0.15 if blazer else 0.3 + 0.2 * loose, sheen=0.12 if padded else 0.05
-    )
+    gap, spread, bottom = sizes["gap"], sizes["spread"], sizes["bottom"]
+    fit = _outer_fit(outfit, garment)
+    cuffs = None if kind == "vest" else sizes["sleeve"] - 0.016
+    stitches = sewn(garment, bottom + 0.018, cuffs)
+    wrinkles = 0.15 if kind == "blazer" else 0.3 + 0.2 * sizes["loose"]
+    material = Material(stitches, wrinkles, sheen=0.12 if kind in PADDED else 0.05)
+    # an open front is one more cut through the bodice
     opening = []
     if gap > 0:
         opening = [(tailoring.front_opening, gap, spread)]
     neck = "vee" if "lapels" in details else "crew"
-    low = WAIST - 0.045 if long else bottom
+    low = WAIST - 0.045 if kind == "coat" else bottom
     _bodice(outfit, neck, (0.09, sizes["sleeve"], low), fit, material, 0.03, opening)
-    if long:
-        width, flare = max(outfit.legs, ease) + 0.002, sizes["flare"]
+    # a coat goes on below the waist as a tube
+    if kind == "coat":
+        width = max(outfit.legs, fit.ease) + 0.002
+        heights, pleats = (WAIST + 0.02, bottom), (5, 0.008)
         tube = skirt(
             outfit.rng,
             outfit.anatomy,
-            (WAIST + 0.02, bottom),
+            heights,
             width,
-            flare,
-            (5, 0.008),
+            sizes["flare"],
+            pleats,
             gap,
             0.5 * spread,
         )
         if gap < 0:
             outfit.hide(lambda t: tailoring.hips_and_legs(t, WAIST, bottom), 0.02)
         outfit.add(tube, dataclasses.replace(material, draped=True))
+    # what lies on the bodice
     if "lapels" in details:
         edge, low = max(gap, 0.004), outfit.rng.uniform(-0.16, -0.08)
-        strip = dataclasses.replace(fit, ease=ease + 0.006, fold=0.0, hem=0.005, inner=ease + 0.003)
+        raised, below = fit.ease + 0.006, fit.ease + 0.003
+        strip = dataclasses.replace(fit, ease=raised, fold=0.0, hem=0.005, inner=below)
         dark = Material(lambda s: 0.88 * stitches(s), sheen=0.06)  # seen against its pile
         wide = spread if gap > 0 else 0.0
         outfit.strip(tailoring.lapel(outfit.template, edge, wide, low), strip, dark)
@@ -267,12 +252,36 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
     elif "hood" in details or kind == "hooded_jacket":
         outfit.add(accessories.hood(outfit.rng, outfit.anatomy, False), material, layered=False)
     elif kind not in ("cardigan", "blazer"):
-        _collar(outfit, material, fit, 0.003, (0.12, 0.185 if padded else 0.175, max(gap, 0.01)))
+        high = 0.185 if kind in PADDED else 0.175
+        _collar(outfit, material, fit, 0.003, (0.12, high, max(gap, 0.01)))
+
+
+def _outer_fit(outfit: Outfit, garment: Garment) -> Fit:
+    """How a jacket or coat hangs: padded ones stand off, blazers and padded ones have low folds."""
+    kind, loose, padded = garment.kind, garment.sizes["loose"], garment.kind in PADDED
+    if kind == "coat":
+        hang = 1.5
+    elif kind == "blazer":
+        hang = 0.8
+    else:
+        hang = outfit.rng.choice([0.05, 0.3])
+    return Fit(
+        ease=max(outfit.trunk + 0.009 + 0.008 * loose, 0.022 if padded else 0.0),
+        hang=hang,
+        sleeve=0.01 + 0.012 * loose,
+        fold=0.002 if padded or kind == "blazer" else 0.002 + 0.003 * loose,
+        hem=0.014,
+        quilt=QUILT if padded else 0.0,
+        skirted=True,
+        inner=outfit.trunk + 0.5 * _LAYER,
+    )
 
 
 def _trousers(outfit: Outfit, garment: Garment) -> None:
+    """Trousers: over a top that is tucked in, else below it, as far as they can be seen."""
     sizes, kind = garment.sizes, garment.kind
     top, end, loose, tucked = sizes["top"], sizes["end"], sizes["loose"], sizes["tucked"] > 0
+    # loose ones have higher folds, which end below a top that hangs over them
     ease = outfit.trunk + 0.004 if tucked else 0.005
     hangs = {"wide": 0.02, "slim": 1.0, "leggings": 3.0, "jeans": 0.12}
     hang = hangs.get(kind, outfit.rng.choice([0.05, 0.1]))
@@ -295,7 +304,8 @@ def _trousers(outfit: Outfit, garment: Garment) -> None:
 
     margin = HEM_MARGIN + 0.03 * loose * (kind in ("wide", "shorts"))
     outfit.put([(tailoring.trousers, top, end)], fit, material, margin, in_two_legs, tucked)
-    x, y, _ = outfit.template.T  # skin between shirt and trousers, below both
+    # skin between shirt and trousers, below both
+    x, y, _ = outfit.template.T
     seat = (np.abs(x) < 0.22) & (y < WAIST - 0.06) & (y > max(end + 0.02, CROTCH - 0.075))
     outfit.removed = outfit.removed | (seat & (outfit.cover > 0))
     outfit.legs = ease + sizes["width"]
@@ -314,6 +324,7 @@ def _let_hang_over(outfit: Outfit, margin: float) -> None:
 
 
 def _skirt(outfit: Outfit, garment: Garment) -> None:
+    """A skirt with a waistband, over a top that is tucked in, else below it."""
     sizes, tucked = garment.sizes, garment.sizes["tucked"] > 0
     top, end = sizes["top"], sizes["end"]
     ease = outfit.trunk + 0.004 if tucked else 0.004
@@ -339,6 +350,7 @@ def _hem_of(sizes: Mapping[str, float]) -> tuple[float, tuple[int, float]]:
 
 
 def _dress(outfit: Outfit, garment: Garment) -> None:
+    """A dress: a bodice down to the waist, and a skirt of the same fabric."""
     sizes, waist, end = garment.sizes, garment.sizes["waist"], garment.sizes["end"]
     fit = Fit(ease=0.008, hang=1.0, sleeve=0.004 + 0.03 * sizes["loose"], fold=0.002)
     material = Material(sewn(garment, end + 0.02, seams=False), wrinkles=0.3, sheen=0.05)
@@ -353,6 +365,8 @@ def _dress(outfit: Outfit, garment: Garment) -> None:
 
 
 def _socks(outfit: Outfit, garment: Garment) -> None:
+    """Socks of a ribbed fabric."""
+
     def ribbed(s: Spots) -> Points:
         ribs = 0.94 + 0.06 * np.cos(2 * np.pi * s.around / 0.008)
         return garment.fabric.colors(s) * ribs[:, None]
@@ -363,13 +377,13 @@ def _socks(outfit: Outfit, garment: Garment) -> None:
 
 
 def _shoes(outfit: Outfit, garment: Garment) -> None:
+    """Shoes, or the soles and straps of sandals."""
     height, sole, over = (garment.sizes[name] for name in ("height", "sole", "over"))
     sheen = 0.2 if garment.kind != "sneakers" else 0.08
     material = Material(lambda s: trimmings.leather(s, garment), sheen=sheen)
     if garment.kind == "sandals":
-        outfit.add(
-            accessories.pair_of_shoes(outfit.anatomy, 0.024, sole, 0.004), material, layered=False
-        )
+        soles = accessories.pair_of_shoes(outfit.anatomy, 0.024, sole, 0.004)
+        outfit.add(soles, material, layered=False)
         for field in tailoring.sandal_straps(outfit.template):
             outfit.strip(field, Fit(ease=0.005, fold=0.0, hem=0.004), material)
         return
@@ -387,6 +401,7 @@ def _shoes(outfit: Outfit, garment: Garment) -> None:
 
 
 def _belt(outfit: Outfit, garment: Garment) -> None:
+    """A belt on the trousers, with a buckle."""
     top, width = garment.sizes["top"], garment.sizes["width"]
     fit = Fit(ease=outfit.trunk + 0.009, hang=0.6, fold=0.0, hem=0.006, inner=outfit.trunk + 0.007)
     material = Material(lambda s: trimmings.buckled(s, garment), sheen=0.15)
@@ -394,6 +409,7 @@ def _belt(outfit: Outfit, garment: Garment) -> None:
 
 
 def _tie(outfit: Outfit, garment: Garment) -> None:
+    """A tie that lies on the folds of the shirt."""
     field = tailoring.necktie(outfit.template, garment.sizes["length"], garment.sizes["width"])
     raised = outfit.trunk + 0.005 + outfit.fit.fold
     fit = dataclasses.replace(outfit.fit, ease=raised, inner=raised - 0.002, fold=0.0, hem=0.004)
@@ -401,10 +417,10 @@ def _tie(outfit: Outfit, garment: Garment) -> None:
 
 
 def _watch(outfit: Outfit, garment: Garment) -> None:
+    """A watch on one wrist."""
     field = tailoring.bracelet(outfit.template, garment.sizes["side"], 0.628, 0.650)
-    outfit.strip(
-        field, Fit(ease=0.003, fold=0.0, hem=0.002), Material(garment.fabric.colors, sheen=0.3)
-    )
+    fit = Fit(ease=0.003, fold=0.0, hem=0.002)
+    outfit.strip(field, fit, Material(garment.fabric.colors, sheen=0.3))
 
 
 def _bag(outfit: Outfit, garment: Garment) -> None:
@@ -414,6 +430,7 @@ def _bag(outfit: Outfit, garment: Garment) -> None:
     def colors(s):
         return trimmings.bagged(s, garment)
 
+    # the bag, and where its straps run
     if on_back:
         ease = outfit.trunk
         material = Material(colors, 0.1)
@@ -426,19 +443,20 @@ def _bag(outfit: Outfit, garment: Garment) -> None:
     outfit.add(surface, material, layered=False)
     # the straps lie on the folds of what is below them
     raised = outfit.trunk + 0.009 + 1.5 * outfit.fit.fold
-    flat = {
-        "ease": raised,
-        "inner": raised - 0.002,
-        "fold": 0.0,
-        "hem": 0.006,
-        "quilt": 0.0,
-        "skirted": True,
-    }
-    strap = Material(garment.fabric.colors, sheen=material.sheen)
-    outfit.strip(straps, dataclasses.replace(outfit.fit, **flat), strap)
+    flat = dataclasses.replace(
+        outfit.fit,
+        ease=raised,
+        inner=raised - 0.002,
+        fold=0.0,
+        hem=0.006,
+        quilt=0.0,
+        skirted=True,
+    )
+    outfit.strip(straps, flat, Material(garment.fabric.colors, sheen=material.sheen))
 
 
 def _accessory(outfit: Outfit, garment: Garment) -> None:
+    """Anything that `accessories` builds, on top of what is worn."""
     for surface, material in accessories.build(outfit.rng, outfit.anatomy, garment, outfit.trunk):
         outfit.add(surface, material, layered=False)
 
