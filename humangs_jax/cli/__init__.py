@@ -57,7 +57,7 @@ GROUPS = {
         "render": "animate.Render",
         "view": "animate.View",
     },
-    "Take it along": {"export": "avatars.Export"},
+    "Take it along": {"export": "export.Export"},
     "Prepare photos": {
         "detect": "captures.Detect",
         "import": "captures.ImportCameras",

@@ -1,20 +1,15 @@
-"""`humangs demo`, `reconstruct`, `refine`, `export`: from photos to an avatar, and to files of
-it.
-"""
+"""`humangs demo`, `reconstruct`, `refine`, `tune`: from photos to an avatar."""
 
 import dataclasses
 import functools
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import Positional
 
-from humangs_jax.avatar.export import EXPORTS, Up, chosen_format, files_beside
 from humangs_jax.cli.options import (
     AVATAR,
-    WHOLE,
     OutputPath,
-    PartOfMotion,
     Preset,
     Side,
     UsageError,
@@ -22,23 +17,16 @@ from humangs_jax.cli.options import (
     first_refinement,
     off,
     refine_limits,
-    require_file,
     require_place,
     shard_of,
 )
 from humangs_jax.cli.screen import bar, stage, suggest, tell, warn, wrote
 from humangs_jax.core.configuration import Range, at_least
-from humangs_jax.core.registry import alternatives
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
-    from humangs_jax.body.motion import Motion
     from humangs_jax.data.prepared import PreparedCapture
-
-
-_DOWN = alternatives(EXPORTS.where(lambda each: each.up == "-y").suffixes)
-"""Suffixes of files in which y points down."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,6 +133,7 @@ class Reconstruct:
         part, parts = shard_of(self.shard)
         if not self.captures:
             raise UsageError("CAPTURES: expected at least one folder with capture.json")
+        # one capture gives a file, several give a folder of files
         captures = _capture_folders(self.captures)
         several = tuple(captures.values()) != self.captures[:1]
         out = self.out or Path("avatars" if several else "avatar.npz")
@@ -162,34 +151,31 @@ class Reconstruct:
             from humangs_jax.network.weights import load_weights
 
             settings = chosen_settings(self.preset, self.config)
-        if self.refine is None and settings is not None:
+        # --refine and --views win over --preset and --config
+        views = self.views
+        if settings is not None and self.refine is None:
             how = settings.refinement
-        if several:
-            self._begin_set(out)
-            done = {name for name in captures if (out / f"{name}.npz").exists()}
-            if done:
-                tell(f"{out}: {len(done)} of {len(captures)} avatars are there")
-            captures = dict(list(captures.items())[part::parts])
-            for name in done & captures.keys():
-                _check_source(out / f"{name}.npz", captures.pop(name))
         if settings is not None and self.views is None:
             views = settings.views
-        else:
-            views = self.views
+        if several:
+            captures = self._unmade(out, captures, part, parts)
+        # captures are read when it is their turn
         sources: dict[str, str] = {}
 
-        def photos_of(name: str, folder: Path) -> "PreparedCapture":
+        def prepared_capture(name: str, folder: Path) -> "PreparedCapture":
             if several:
                 sources[name] = capture_checksum(folder)
-            return self._photos(folder, views)
+            return self._read(folder, views)
 
         load = {
-            name: functools.partial(photos_of, name, folder) for name, folder in captures.items()
+            name: functools.partial(prepared_capture, name, folder)
+            for name, folder in captures.items()
         }
-        if not several:  # what is wrong with it is reported before the network is read
+        # what is wrong with the only one is reported before the network is read
+        if not several:
             (name, read), *_ = load.items()
-            photos = read()
-            load = {name: lambda: photos}
+            only = read()
+            load = {name: lambda: only}
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
         if settings is not None:
@@ -200,36 +186,53 @@ class Reconstruct:
         )
         failed = []
         with stage("reconstructing"):
-            made = reconstruct_batch(variables, config, [*load.values()], self.batch or BATCH)
-            named = bar(
-                zip(load, made, strict=True), total=len(load), shown=several, desc="reconstruct"
-            )
-            for name, (photos, avatar, error) in named:
+            made = reconstruct_many(variables, config, load, self.batch)
+            for name, prepared, avatar, error in bar(
+                made, total=len(load), shown=several, desc="reconstruct"
+            ):
+                # one of several that fails does not stop the others
+                if error is not None and not several:
+                    raise error
                 if error is not None:
-                    if not several:
-                        raise error
                     failed.append(name)
                     warn(f"{name}: {error}")
                     continue
-                if how is not None and photos.capture.masks is None:
+                refinement = how
+                if how is not None and prepared.capture.masks is None:
                     tell(f"{name}: no masks: the avatar is not refined")
-                file = out / f"{name}.npz" if several else out
+                    refinement = None
                 # in a set a file is a finished avatar: one that was interrupted is made again
                 _refine_and_save(
                     avatar,
-                    photos,
-                    file,
-                    how if photos.capture.masks is not None else None,
+                    prepared,
+                    out / f"{name}.npz" if several else out,
+                    refinement,
                     unfinished=not several,
                     made_from=sources.get(name),
                 )
-                guess = guess_line(photos.capture)
+                guess = guess_line(prepared.capture)
                 if guess is not None:
                     tell(f"{name}: {guess}" if several else guess)
         if not several:
             suggest("humangs view", out)
         if failed:
             raise ValueError(f"{len(failed)} of {len(load)} captures failed: {', '.join(failed)}")
+
+    def _unmade(
+        self, out: Path, captures: dict[str, Path], part: int, parts: int
+    ) -> dict[str, Path]:
+        """The captures of a part of a set whose avatars are not there.
+
+        Raises: CaptureError for an avatar of other contents, or a set that was made in other ways.
+        """
+        self._begin_set(out)
+        done = {name for name in captures if (out / f"{name}.npz").exists()}
+        if done:
+            tell(f"{out}: {len(done)} of {len(captures)} avatars are there")
+        captures = dict(list(captures.items())[part::parts])
+        for name in done & captures.keys():
+            _check_source(out / f"{name}.npz", captures.pop(name))
+        return captures
 
     def _begin_set(self, out: Path) -> None:
         """Avatars that were made in other ways are not mixed. Raises: CaptureError."""
@@ -249,17 +252,17 @@ class Reconstruct:
                 made_with[name] += f" ({file_checksum(file)[:SHORT]})"
         begin_set(out, AVATARS, {SETTINGS: made_with})
 
-    def _photos(self, folder: Path, views: int | str | None) -> "PreparedCapture":
+    def _read(self, folder: Path, views: int | str | None) -> "PreparedCapture":
         """The views of a capture that are used.
 
         Raises: ValueError; UsageError for --refine without masks.
         """
-        photos = _read_capture(folder, self.check, self.fit_masks, views)
-        if self.refine not in (None, "0") and photos.capture.masks is None:
+        prepared = _read_capture(folder, self.check, self.fit_masks, views)
+        if self.refine not in (None, "0") and prepared.capture.masks is None:
             raise UsageError(f"--refine {self.refine}: needs masks, and {folder} has none")
-        if photos.chosen:
-            tell(f"photos: {', '.join(photos.capture.names)}")
-        return photos
+        if prepared.chosen:
+            tell(f"photos: {', '.join(prepared.capture.names)}")
+        return prepared
 
 
 @dataclasses.dataclass(frozen=True)
@@ -303,9 +306,9 @@ class Refine:
             from humangs_jax.avatar.avatar import Avatar
 
             avatar = Avatar.load(self.avatar)
-        photos = _read_capture(self.capture, self.check, self.fit_masks)
+        prepared = _read_capture(self.capture, self.check, self.fit_masks)
         how = RefineConfig(iterations=self.iterations, image_size=self.image_size, **limits)
-        _refine_and_save(avatar, photos, self.out, how)
+        _refine_and_save(avatar, prepared, self.out, how)
         suggest("humangs view", self.out)
 
 
@@ -361,26 +364,26 @@ def _read_capture(
         from humangs_jax.data.hidden import hidden_line, with_hidden_parts
         from humangs_jax.data.prepared import prepare_capture
 
-        photos = load_capture(path, fit_masks=fit_masks)
+        capture = load_capture(path, fit_masks=fit_masks)
     if fit_masks:
         with stage("looking for what is in front of the person"):
-            seen = with_hidden_parts(photos)
-        line = hidden_line(photos, seen)
+            seen = with_hidden_parts(capture)
+        line = hidden_line(capture, seen)
         if line is not None:
             warn(line)
-        photos = seen
+        capture = seen
     # where nobody is found, the check still says what is likely wrong
     prepared, nobody = None, None
     with stage("preparing the photos"):
         try:
-            prepared = prepare_capture(photos, views=views)
+            prepared = prepare_capture(capture, views=views)
         except ValueError as error:
             nobody = error
     if check:
         with stage("checking it"):
             from humangs_jax.apps.quick_check import likely_mistakes
 
-            mistakes = likely_mistakes(photos if prepared is None else prepared.shown)
+            mistakes = likely_mistakes(capture if prepared is None else prepared.shown)
         for mistake in mistakes:
             warn(mistake)
         if mistakes and nobody is None:
@@ -393,7 +396,7 @@ def _read_capture(
 
 def _refine_and_save(
     avatar: "Avatar",
-    photos: "PreparedCapture",
+    prepared: "PreparedCapture",
     out: Path,
     how: "RefineConfig | None",
     unfinished: bool = True,
@@ -407,16 +410,16 @@ def _refine_and_save(
     Raises: KeyboardInterrupt, after that, if one ended it.
     """
     if how is None:
-        _save(avatar, out, f"from {photos.capture.view_count} photos", made_from)
+        _save(avatar, out, f"from {prepared.capture.view_count} photos", made_from)
         return
     with stage("refining"):
         from humangs_jax.refinement.refine import refine_with_report
 
-        refinement = refine_with_report(avatar, photos, how, progress=True)
+        refinement = refine_with_report(avatar, prepared, how, progress=True)
     if refinement.interrupted and not unfinished:
         tell(f"{out}: not written, its refinement was interrupted: the same command makes it again")
         raise KeyboardInterrupt
-    done = f"from {photos.capture.view_count} photos, {refinement.summary()}"
+    done = f"from {prepared.capture.view_count} photos, {refinement.summary()}"
     _save(refinement.avatar, out, done, made_from)
     if refinement.interrupted:
         raise KeyboardInterrupt
@@ -426,180 +429,6 @@ def _save(avatar: "Avatar", out: Path, how: str, made_from: str | None) -> None:
     with stage("writing"):
         avatar.save(out, made_from=made_from)
     wrote(out, f"{len(avatar.gaussians.means):,} Gaussians {how}")
-
-
-@dataclasses.dataclass(frozen=True)
-class Export:
-    """Export Gaussians, a textured mesh, or an HTML viewer.
-
-    In the T-pose, in one frame of a motion, or in many. Programs and formats: docs: export.
-    """
-
-    examples: ClassVar[tuple[str, ...]] = (
-        "humangs export avatar.npz --html avatar.html",
-        "humangs export avatar.npz --out person.glb --mesh --motion dance.bvh",
-    )
-    avatar: Positional[Path]
-    """File written by `humangs reconstruct`."""
-    out: Annotated[
-        Path | None,
-        arg(
-            help=(
-                f"File to write: {EXPORTS.listed()}. Default: avatar.ply without --html, none"
-                " with it."
-            )
-        ),
-    ] = None
-    html: Annotated[Path | None, OutputPath((".html",))] = None
-    """The HTML viewer to write: one file that needs no network (docs: viewer)."""
-    mesh: bool = False
-    """Write the body, not the Gaussians: a .glb then holds its skin, and --motion as animation."""
-    motion: Path | None = None
-    """The motion that the viewer plays (default: the shipped walk) or that poses --out (default:
-    T-pose). docs: motions.
-    """
-    part: OmitArgPrefixes[PartOfMotion] = WHOLE
-    frame: int | None = None
-    """Which frame of the motion, from 0. Default: the first."""
-    frames: str | None = None
-    """Many frames: a:b:step as in Python, ":" for all.
-
-    X.ply becomes X_0000.ply, X_0005.ply and so on.
-    """
-    up: Annotated[
-        Up | None,
-        arg(
-            help=(
-                f"The axis that points up in the file. Default: -y for {_DOWN}, as their viewers"
-                " expect, else y."
-            )
-        ),
-    ] = None
-    rest: bool = False
-    """Add the 45 zero f_rest fields of 3DGS that some importers (Unity) require."""
-    spz_version: Literal[3, 4] | None = None
-    """Version of a .spz. Default: 3, which more programs read."""
-
-    def run(self) -> None:
-        out = self.out
-        if out is None and self.html is None:
-            out = Path("avatar.ply")
-        self._check(out)
-        with stage("starting"):
-            from humangs_jax.avatar.attach_face import with_face_for
-            from humangs_jax.avatar.avatar import Avatar
-
-            avatar = Avatar.load(self.avatar)
-            motion = None
-            if self.motion is not None:
-                motion = self.part.load(self.motion, avatar.rest_joints)
-                # a motion with expressions needs an avatar with a face
-                avatar = with_face_for(avatar, motion)
-        # the page has the whole motion, whichever frame --out has
-        if self.html is not None:
-            self._write_page(self.html, avatar, motion)
-        if out is not None:
-            self._write_file(out, avatar, motion)
-        # suggest the other thing that this motion can be used for
-        played = self.part.options(self.motion)
-        if self.html is None:
-            suggest("humangs export", self.avatar, "--html avatar.html", *played)
-        else:
-            suggest("humangs animate", self.avatar, *played, "--out video.mp4")
-
-    def _check(self, out: Path | None) -> None:
-        """Refuses options that do not go together, before anything is read. Raises: UsageError."""
-        form = None
-        if out is not None:
-            # a mesh goes into fewer formats than Gaussians
-            suffixes = EXPORTS.where(lambda each: each.mesh >= self.mesh).suffixes
-            require_file(out, suffixes, read=(self.avatar, self.motion))
-            form = chosen_format(out.suffix, self.mesh)
-        # frames are of a motion
-        for option, value in (("--frame", self.frame), ("--frames", self.frames)):
-            if value is not None and (self.motion is None or out is None):
-                raise UsageError(f"{option} {value}: expected --motion and --out with it")
-        if self.frame is not None and self.frames is not None:
-            raise UsageError(f"--frame {self.frame}: does not go with --frames")
-        if self.frame is not None and form is not None and form.animated:
-            raise UsageError(
-                f"--frame {self.frame}: does not go with a file that holds the whole motion: use"
-                " --frames"
-            )
-        # what only some formats have
-        if self.rest and form is not None and not form.rest_fields:
-            raise UsageError(f"--rest: {out} has no such fields: expected a file of 3DGS")
-        if self.spz_version is not None and (form is None or not form.versions):
-            raise UsageError(
-                f"--spz-version {self.spz_version}: expected a name of --out that ends in .spz"
-            )
-
-    def _write_page(self, path: Path, avatar: "Avatar", motion: "Motion | None") -> None:
-        with stage("making the page"):
-            from humangs_jax.viewer.page import write_page
-
-            size = write_page(path, avatar, motion, self.avatar.stem, self._motion_name())
-        count = len(avatar.gaussians.means)
-        wrote(path, f"{count:,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
-
-    def _write_file(self, out: Path, avatar: "Avatar", motion: "Motion | None") -> None:
-        from humangs_jax.avatar.export.gaussians import export
-        from humangs_jax.core.pytree import replace
-
-        form = chosen_format(out.suffix, self.mesh)
-        assert form is not None  # its suffix was checked
-        numbers = None
-        # the frames of the motion that are written
-        if motion is not None:
-            frames = self._frames(len(motion.translations), form.animated)
-            part = motion.part(slice(frames.start, frames.stop, frames.step))
-            motion = replace(part, fps=motion.fps / frames.step)
-            # many frames of a format of one pose are many files, with numbers in their names
-            if self.frames is not None and not form.animated:
-                numbers = frames
-        with stage("writing"):
-            files = export(
-                out,
-                avatar,
-                motion,
-                numbers,
-                mesh=form.mesh,
-                up=self.up,
-                rest_fields=self.rest,
-                version=self.spz_version,
-                name=self._motion_name() or "motion",
-            )
-        # say what was written
-        what = f"{len(avatar.gaussians.means):,} Gaussians"
-        if form.mesh:
-            what = f"{len(avatar.faces):,} triangles"
-        if motion is not None and form.animated:
-            what += f", {len(motion.translations)} frames"
-        what += ", feet on 0"
-        if form.beside:
-            what += f"; {' and '.join(file.name for file in files_beside(out, form))} belong to it"
-        written = str(out)
-        if len(files) > 1:
-            written = f"{files[0]} to {files[-1].name}: {len(files)} files"
-        wrote(written, what)
-
-    def _motion_name(self) -> str | None:
-        return None if self.motion is None else self.motion.stem
-
-    def _frames(self, count: int, animated: bool) -> range:
-        """Numbers of the frames that are written, of a motion of `count` frames; animated: whether
-        the file holds motions.
-        """
-        from humangs_jax.avatar.export.gaussians import frame_range
-
-        if self.frames is not None:
-            return frame_range(self.frames, count)
-        if animated:
-            return range(count)
-        frame = self.frame or 0
-        if not 0 <= frame < count:
-            raise UsageError(f"--frame {frame}: {self.motion} has {count} frames, from 0")
-        return range(frame, frame + 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -649,11 +478,13 @@ class Tune:
             from humangs_jax.network.weights import load_weights
 
         # the photos are checked by `humangs check`, not here
-        photos = _read_capture(self.capture, check=False)
+        prepared = _read_capture(self.capture, check=False)
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
         with stage("measuring"):
-            tuned = tune(variables, config, photos.shown, **budgets, size=self.size, progress=True)
+            tuned = tune(
+                variables, config, prepared.shown, **budgets, size=self.size, progress=True
+            )
         # the file keeps what was measured beside the settings
         costs = {name: dataclasses.asdict(cost) for name, cost in tuned.measured.items()}
         about = {
