@@ -32,11 +32,13 @@ __all__ = ["Motion", "MotionError", "load_motion", "save_motion"]
 
 
 logger = logging.getLogger(__name__)
-WALK, MADE_FROM = "walk.npz", "made_from"
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif")
-_OF_A_VIDEO = ", a video: `humangs motion` finds the motion of the person in it (docs/motions.md)"
+_MADE_FROM = "made_from"
+"""Key of what a motion was made from."""
 OTHERS = {
-    **dict.fromkeys(VIDEOS, _OF_A_VIDEO),
+    **dict.fromkeys(
+        (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif"),
+        ", a video: `humangs motion` finds the motion of the person in it (docs/motions.md)",
+    ),
     ".fbx": ": open it in Blender and export a .bvh or .glb",
     ".c3d": (
         ", markers without a skeleton: solve them with the program that recorded them, and export a"
@@ -44,8 +46,6 @@ OTHERS = {
     ),
 }
 """Hints about files that are not read, by suffix."""
-SLOWEST = 0.01
-"""Frames per second: one in more than a minute and a half is no motion."""
 
 
 class MotionError(FileError):
@@ -125,7 +125,7 @@ def load_motion(
         raise ValueError(f"up: expected auto, {', '.join(UPRIGHT)}, got {up!r}")
     # the walk that comes with the package
     if path is None:
-        with resources.as_file(resources.files("humangs_jax") / "assets" / WALK) as file:
+        with resources.as_file(resources.files("humangs_jax") / "assets" / "walk.npz") as file:
             return load_motion(file, up=up, fps=fps, rest_joints=rest_joints)
     if fps is not None and not (np.isfinite(fps) and fps > 0):
         raise MotionError(
@@ -178,8 +178,9 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
     if options.fps is not None:
         rate = options.fps
     check_limit("rate", rate, "frames per second")
-    if rate < SLOWEST:
-        raise MotionError(path, "", f"{rate:g} frames per second: expected at least {SLOWEST:g}")
+    # one frame in more than a minute and a half is no motion
+    if rate < 0.01:
+        raise MotionError(path, "", f"{rate:g} frames per second: expected at least 0.01")
     if found.face is None:
         names, faces = (), None
     else:
@@ -270,7 +271,7 @@ def save_motion(path: str | Path, motion: Motion, *, made_from: str | None = Non
         "fps": motion.fps,
     }
     if made_from is not None:
-        arrays[MADE_FROM] = made_from
+        arrays[_MADE_FROM] = made_from
     if motion.expressions is not None:
         arrays["expressions"] = motion.expressions
         arrays["expression_names"] = np.asarray(motion.expression_names)
@@ -283,6 +284,6 @@ def made_from_of(path: Path) -> str | None:
         arrays, _ = read_npz(path)
     except (ValueError, OSError):
         return None
-    if MADE_FROM in arrays:
-        return str(arrays[MADE_FROM])
+    if _MADE_FROM in arrays:
+        return str(arrays[_MADE_FROM])
     return None

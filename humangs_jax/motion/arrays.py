@@ -2,7 +2,7 @@
 under them.
 
 SMPL-X has 55 joints (165 numbers), SMPL-H 52 (156), SMPL 24 (72), of which the last two are whole
-hands; 22 (66) are the body. Rotations are axis-angles or matrices (three times as many numbers).
+hands; 22 (66) are the body. _Rotations are axis-angles or matrices (three times as many numbers).
 What a file does not have (fingers, eyes) is 0.
 """
 
@@ -35,15 +35,13 @@ from humangs_jax.motion.rules import (
 from humangs_jax.motion.skeleton import Clip
 from humangs_jax.motion.vectors import frames_first
 
-HEAD = JOINT_NAMES.index("head")
-Rotations = Float[np.ndarray, "m n 3"]
+_HEAD = JOINT_NAMES.index("head")
+_Rotations = Float[np.ndarray, "m n 3"]
 """Axis-angles of the frames."""
-NO_RATE_AT_ALL = (
-    "missing: how many frames are a second? expected --motion-fps (in Python fps=), or this key"
-)
-SOMA_JOINTS = 77
+_SOMA_JOINTS = 77
 """Joints of Kimodo's skeleton, which is not SMPL-X's."""
-NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat"
+_NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat"
+"""A note about hands that are not read."""
 
 
 def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
@@ -59,7 +57,7 @@ def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
     file = _MotionFile(path, person, options.fps)
     # points in space are a skeleton; all others are rotations of a body
     if form.kind == "points":
-        return clip_of_points(file, file.rate(form))
+        return _clip_of_points(file, file.rate(form))
     if form.kind == "ours":
         rotations = file.numbers(form.poses["all"], (None, None, 3))
     else:
@@ -82,7 +80,7 @@ def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
     )
 
 
-EXPRESSIONS = ("expressions", "expression", "expressionParameters", "expr")
+_EXPRESSIONS = ("expressions", "expression", "expressionParameters", "expr")
 """Keys of SMPL-X's expressions, the first that is there; ours have names."""
 
 
@@ -93,7 +91,7 @@ def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
     Raises: MotionError for a file of ours.
     """
     ours = form.kind == "ours"
-    key = "expressions" if ours else file.first(EXPRESSIONS)
+    key = "expressions" if ours else file.first(_EXPRESSIONS)
     if key not in file.values:
         return None
     values = np.atleast_1d(file.numbers(key, None))
@@ -147,12 +145,12 @@ def _frames(person: Person) -> int:
     return 0
 
 
-# Rotations
+# _Rotations
 # --------------------------------------------------------------------------------------------------
 
 
-def _posed(file: "_MotionFile", form: ArrayKeys) -> Rotations:
-    rotations: Rotations | None = None
+def _posed(file: "_MotionFile", form: ArrayKeys) -> _Rotations:
+    rotations: _Rotations | None = None
     for place, key in form.poses.items():
         if rotations is not None and key not in file.values:
             continue
@@ -190,7 +188,7 @@ def _part(
     key: str,
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
-) -> Rotations:
+) -> _Rotations:
     most, (count, width) = PLACES[place][1], flat.shape
     of_smpl = place in ("limbs", "body")
     counts = (most, most + 2) if of_smpl else (most,)
@@ -198,7 +196,7 @@ def _part(
         if width in (3 * joints, 9 * joints):
             return _axis_angles(file, key, flat, joints)[:, :most]
     if 3 * most == HAND_NUMBERS and 0 < width < HAND_NUMBERS:
-        file.notes.append(f"{key}: {NO_HANDS.format(width)}")
+        file.notes.append(f"{key}: {_NO_HANDS.format(width)}")
         return np.zeros((count, most, 3))
     shapes = f"({count}, {3 * most})"
     if of_smpl:
@@ -212,7 +210,7 @@ def _all(
     key: str,
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
-) -> Rotations:
+) -> _Rotations:
     """Of a pose under one key: what is behind the body of SMPL is left out, of SMPL-H it is the
     fingers.
     """
@@ -225,7 +223,7 @@ def _all(
     if form.pivot == "origin" and width == 69:  # without the root
         return np.pad(flat, ((0, 0), (3, 0))).reshape(count, -1, 3)[:, :22]
     if form.pivot == "origin" and width in (78, 87):  # with coefficients of hands
-        file.notes.append(NO_HANDS.format(6))
+        file.notes.append(_NO_HANDS.format(6))
         return np.concatenate([flat[:, :66], flat[:, 78:]], axis=1).reshape(count, -1, 3)
     if width in (75, *COLUMNS, *(3 * number for number in COLUMNS)):
         joints = width // 3 if width in (75, *COLUMNS) else width // 9
@@ -239,8 +237,8 @@ def _all(
         return np.concatenate([pose[:, :22], face, pose[:, -30:]], axis=1)
     words = ", ".join(f"{number} ({whose})" for number, whose in COLUMNS.items())
     joints = f", {width // 3} joints" if width % 3 == 0 else ""
-    if values.shape[1:] == (SOMA_JOINTS, 3, 3):
-        joints = f", {SOMA_JOINTS} joints of SOMA: write a .bvh of them"
+    if values.shape[1:] == (_SOMA_JOINTS, 3, 3):
+        joints = f", {_SOMA_JOINTS} joints of SOMA: write a .bvh of them"
     raise MotionError(
         file.path, key, f"expected {words} numbers a frame, got shape {values.shape}{joints}"
     )
@@ -248,7 +246,7 @@ def _all(
 
 def _axis_angles(
     file: "_MotionFile", key: str, flat: Float[np.ndarray, "m columns"], joints: int
-) -> Rotations:
+) -> _Rotations:
     if flat.shape[1] == 3 * joints:
         return flat.reshape(len(flat), joints, 3)
     matrices = flat.reshape(-1, 3, 3)
@@ -265,7 +263,9 @@ def _axis_angles(
 # --------------------------------------------------------------------------------------------------
 
 
-def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float[np.ndarray, "m 3"]:
+def _placed(
+    file: "_MotionFile", form: ArrayKeys, rotations: _Rotations
+) -> Float[np.ndarray, "m 3"]:
     """(m, 3) translations; turns roots where cameras or the format's convention ask for it."""
     count, key = len(rotations), file.first(form.moves)
     if key not in file.values and form.stays and key not in file.pickled:
@@ -299,7 +299,7 @@ def _placed(file: "_MotionFile", form: ArrayKeys, rotations: Rotations) -> Float
         moves = moves - PELVIS
     if form.pivot == "head":
         joints = skeleton.shipped_joints()
-        moves = moves - joint_places(joints, rotations, np.zeros((count, 3)))[:, HEAD]
+        moves = moves - joint_places(joints, rotations, np.zeros((count, 3)))[:, _HEAD]
     camera = _cameras(file, count)
     if camera is None:
         return moves
@@ -375,7 +375,12 @@ class _MotionFile(ArrayFile):
                 )
             return rate
         if form.fps is None:
-            raise MotionError(self.path, key, NO_RATE_AT_ALL)
+            raise MotionError(
+                self.path,
+                key,
+                "missing: how many frames are a second? expected --motion-fps (in Python fps=), or"
+                " this key",
+            )
         if not form.fixed:
             self.notes.append(
                 f"{NO_RATE.format(form.fps)}, which --motion-fps (in Python fps=) changes"
@@ -413,10 +418,10 @@ RIG = {
 }
 """Of the rig's 127: name and the joint above."""
 RIG_JOINTS = 127
-RIG_Y_UP = np.array([1.0, -1.0, -1.0])
+"""Joints of the rig."""
 
 
-def clip_of_points(file: Any, fps: float) -> Clip:
+def _clip_of_points(file: Any, fps: float) -> Clip:
     """The skeleton in motion of an `ArrayFile`. Raises: the file's error, naming the key."""
     points = _of_frames(file, "pred_joint_coords", (RIG_JOINTS, 3))[:, list(RIG)]
     if "pred_cam_t" in file.values:
@@ -425,7 +430,7 @@ def clip_of_points(file: Any, fps: float) -> Clip:
         file.notes.append("the file has no pred_cam_t: people stay in place")
     index = {joint: i for i, joint in enumerate(RIG)}
     parents = tuple(index.get(parent, -1) for _, parent in RIG.values())
-    places = points * RIG_Y_UP
+    places = points * np.array([1.0, -1.0, -1.0])  # y up
     if "pred_global_rots" in file.values:
         turns = _of_frames(file, "pred_global_rots", (RIG_JOINTS, 3, 3), len(points))[:, list(RIG)]
     else:

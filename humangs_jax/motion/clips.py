@@ -44,7 +44,7 @@ from humangs_jax.motion import Poses, Reading
 from humangs_jax.motion.face_files import animated_face, face_alone
 from humangs_jax.motion.skeleton import Clip, bytes_of_clip
 
-CHANNELS = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
+_CHANNELS = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
 _WORD = re.compile(r"(ROOT|JOINT|End)\s+([^\r\n{}]*)|[{}]|[^\s{}]+")
 _MOTION = re.compile(r"(?<!\S)MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)")
 
@@ -124,7 +124,7 @@ def _tree(
                     next(words)[0].lower() for _ in range(int(min(max(amount, 0), 7)))
                 ]
                 if amount != len(channels[here]) or any(
-                    name not in CHANNELS for name in channels[here]
+                    name not in _CHANNELS for name in channels[here]
                 ):
                     raise InvalidFileError(
                         f"joint {names[here]}: expected up to 6 channels such as Xrotation"
@@ -232,7 +232,7 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
     return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, "y", note, face)
 
 
-SHOWN = 12
+_SHOWN = 12
 """Names of animations in a line."""
 
 
@@ -242,7 +242,7 @@ def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[st
     Raises: InvalidFileError.
     """
     names = [str(each.get("name", i)) for i, each in enumerate(animations)]
-    listed = ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
+    listed = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
     if clip is None:
         note = (
             f"{len(names)} animations ({listed}): the first is taken; the option or argument clip"

@@ -42,18 +42,13 @@ from humangs_jax.motion.face_tracks import (
 )
 from humangs_jax.motion.rules import NO_RATE
 
-ARMS_DOWN = 1.15
+_ARMS_DOWN = 1.15
 """Radians by which the arms of a person hang down who has a face and no motion."""
-FEWEST = 5
+_FEWEST = 5
 """Shapes of ARKit that make a table or an object one of faces."""
-HEAD_TURNS = ("headpitch", "headyaw", "headroll")
-"""Names of columns: rotations about x, y, z, radians."""
-RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
-"""Frames per second of timecodes, whose last number stays below."""
-LIVE_LINK_FPS = 60.0
-"""Of timecodes that are too short to tell."""
-MOST_COLUMNS = 1000
-DEEPEST = 5
+_MOST_COLUMNS = 1000
+"""Names in a file."""
+_DEEPEST = 5
 """Objects and lists within each other, down to the scores of a frame."""
 
 
@@ -74,7 +69,7 @@ def read_table(path: Path, options: Reading) -> Poses:
         names = [name.strip() for name in lines[0]]
     shapes = {arkit_name(name): i for i, name in reversed(list(enumerate(names)))}
     shapes.pop(None, None)
-    if len(shapes) < FEWEST or len(names) > MOST_COLUMNS:
+    if len(shapes) < _FEWEST or len(names) > _MOST_COLUMNS:
         raise InvalidFileError(
             "expected a line with names of ARKit's shapes such as EyeBlinkLeft, got"
             f" {', '.join(names[:4]) or 'nothing'}"
@@ -92,9 +87,11 @@ def read_table(path: Path, options: Reading) -> Poses:
     values = np.zeros((len(lines), len(ARKIT)))
     for name, i in shapes.items():
         values[:, ARKIT.index(str(name))] = column(i)
-    # the turn of the head, and the times, where the table has them
-    turns = [column(plain[name]) if name in plain else 0.0 for name in HEAD_TURNS]
-    head = np.stack([np.broadcast_to(turn, len(lines)) for turn in turns], axis=1)
+    # the turn of the head about x, y and z, and the times, where the table has them
+    head = np.zeros((len(lines), 3))
+    for axis, name in enumerate(("headpitch", "headyaw", "headroll")):
+        if name in plain:
+            head[:, axis] = column(plain[name])
     codes = []
     if "timecode" in plain:
         codes = [row[plain["timecode"]] for row in lines]
@@ -124,10 +121,11 @@ def _times(codes: Sequence[str], asked: float | None) -> tuple[float, np.ndarray
         return asked, None, ""
     clock = np.asarray([[float(x) for x in part.groups()] for part in parts if part is not None])
     seconds, within = clock[:, :3] @ (3600.0, 60.0, 1.0), clock[:, 3]
-    long_enough = np.ptp(seconds) >= 2
-    fitting = [rate for rate in RATES if rate > np.floor(within.max())]
-    rate = LIVE_LINK_FPS
-    if long_enough and fitting:
+    # the last number of a timecode stays below the rate; short ones do not tell: Live Link's
+    rates = (24.0, 25.0, 30.0, 50.0, 60.0)
+    fitting = [rate for rate in rates if rate > np.floor(within.max())]
+    rate = 60.0
+    if np.ptp(seconds) >= 2 and fitting:
         rate = fitting[0]
     numbers = np.rint(seconds * rate + within)
     steps = np.diff(numbers)
@@ -153,8 +151,8 @@ def _standing(
     if not np.isfinite(head).all():
         raise InvalidFileError("head: expected finite numbers")
     rotations = np.zeros((len(values), len(JOINT_NAMES), 3))
-    rotations[:, JOINT_NAMES.index("left_shoulder"), 2] = -ARMS_DOWN
-    rotations[:, JOINT_NAMES.index("right_shoulder"), 2] = ARMS_DOWN
+    rotations[:, JOINT_NAMES.index("left_shoulder"), 2] = -_ARMS_DOWN
+    rotations[:, JOINT_NAMES.index("right_shoulder"), 2] = _ARMS_DOWN
     rotations[:, JOINT_NAMES.index("head")] = head
     return Poses(
         rotations, np.zeros((len(values), 3)), fps, fixed=True, frames=frames, note=note, face=track
@@ -183,9 +181,8 @@ def read_scores(path: Path, options: Reading) -> Poses:
         for row, i in enumerate(seen):
             for name, score in frames[i].items():
                 known[row, ARKIT.index(name)] = score
-        every = np.arange(
-            seen[0], seen[-1] + 1
-        )  # frames in which nobody was seen lie between the others
+        # frames in which nobody was seen lie between the others
+        every = np.arange(seen[0], seen[-1] + 1)
         values = np.stack([np.interp(every, seen, column) for column in known.T], axis=1)
         fps, note = options.fps, ""
         given = None
@@ -217,33 +214,32 @@ def _scores_of(frame: Any, depth: int) -> dict[str, float]:
     """Scores by ARKit's names in one frame: an object of them, or a list of categories, however
     deep.
     """
-    if depth > DEEPEST:
+    if depth > _DEEPEST:
         return {}
     if isinstance(frame, dict):
         named = {arkit_name(str(name)): value for name, value in frame.items()}
         named.pop(None, None)
-        if len(named) >= FEWEST:
+        if len(named) >= _FEWEST:
             return {str(name): _score(name, value) for name, value in named.items()}
         inner = list(frame.values())
     elif isinstance(frame, list):
-        categories = [each for each in frame if isinstance(each, dict) and "score" in each]
-        named = {arkit_name(_category(each)): each["score"] for each in categories}
+        named = {}
+        for each in frame:
+            if isinstance(each, dict) and "score" in each:
+                keys = ("categoryName", "category_name", "displayName", "display_name", "name")
+                name = next((str(each[key]) for key in keys if each.get(key)), "")
+                named[arkit_name(name)] = each["score"]
         named.pop(None, None)
-        if len(named) >= FEWEST:
+        if len(named) >= _FEWEST:
             return {str(name): _score(name, value) for name, value in named.items()}
         inner = frame
     else:
         return {}
-    for each in inner[:MOST_COLUMNS]:
+    for each in inner[:_MOST_COLUMNS]:
         found = _scores_of(each, depth + 1)
         if found:
             return found
     return {}
-
-
-def _category(entry: Mapping[str, Any]) -> str:
-    keys = ("categoryName", "category_name", "displayName", "display_name", "name")
-    return next((str(entry[key]) for key in keys if entry.get(key)), "")
 
 
 def _score(name: object, value: Any) -> float:
@@ -323,8 +319,8 @@ def _expression_tracks(
         for name, entry in (expressions.get(group) or {}).items()
         if isinstance(entry, dict) and type(entry.get("node")) is int
     }
-    if len(nodes) > MOST_COLUMNS:
-        raise InvalidFileError(f"{len(nodes)} expressions: expected at most {MOST_COLUMNS}")
+    if len(nodes) > _MOST_COLUMNS:
+        raise InvalidFileError(f"{len(nodes)} expressions: expected at most {_MOST_COLUMNS}")
     tracks = {}
     for channel in animation["channels"]:
         name = nodes.get(channel["target"].get("node"))
@@ -342,10 +338,8 @@ def _weight_tracks(content: dict[str, Any], binary: bytes, animation: Mapping[st
     """
     found: list[Weights] = []
     channels = [each for each in animation["channels"] if each["target"]["path"] == "weights"]
-    if len(channels) > MOST_COLUMNS:
-        raise InvalidFileError(
-            f"{len(channels)} meshes with weights: expected at most {MOST_COLUMNS}"
-        )
+    if len(channels) > _MOST_COLUMNS:
+        raise InvalidFileError(f"{len(channels)} meshes with weights: expected at most {_MOST_COLUMNS}")
     for channel in channels:
         node = content["nodes"][channel["target"]["node"]]
         mesh = content["meshes"][node["mesh"]]

@@ -26,14 +26,14 @@ from humangs_jax.motion.rules import (
     UNDER,
 )
 
-SHOWN = 12
+_SHOWN = 12
 """Names of joints in an error."""
-Places = Float[np.ndarray, "s 3"]
-Pair = tuple[list[int], list[int]]
+_Places = Float[np.ndarray, "s 3"]
+_Pair = tuple[list[int], list[int]]
 
 
 def matched(
-    names: Sequence[str], parents: Sequence[int], rest: Places, posed: Places
+    names: Sequence[str], parents: Sequence[int], rest: _Places, posed: _Places
 ) -> dict[str, int]:
     """Index of the file's joint for each of ours that it has. rest, posed: places in the rest pose
     and in the first frame.
@@ -57,7 +57,7 @@ def matched(
             what = "joints that do not hang below each other"
             if missing:
                 what = f"no joint for {', '.join(missing)}"
-            found = ", ".join(names[:SHOWN])
+            found = ", ".join(names[:_SHOWN])
             raise InvalidFileError(f"{what}: {EXPECTED_NAMES}, got {found}")
         body = {
             f"{side}_{name}"
@@ -153,7 +153,7 @@ def _path(joint: int, children: list[list[int]], reach: np.ndarray) -> list[int]
 
 
 def _limbs(
-    plain: Sequence[str], parents: Sequence[int], lengths: np.ndarray, posed: Places
+    plain: Sequence[str], parents: Sequence[int], lengths: np.ndarray, posed: _Places
 ) -> dict[str, int] | None:
     """The joints of arms, legs, pelvis and head by the tree; None where it is not one of a
     person.
@@ -167,7 +167,7 @@ def _limbs(
     for i in reversed(range(len(parents))):
         reach[i] += max((reach[child] for child in children[i]), default=0.0)
 
-    def pair_below(joint: int) -> Pair | None:
+    def pair_below(joint: int) -> _Pair | None:
         """Gives the bending joints of the two longest limbs below a joint with matching bones."""
         paths = [_path(child, children, reach) for child in children[joint]]
         limbs = [limb for limb in (_bends(path, lengths) for path in paths) if limb]
@@ -218,11 +218,11 @@ def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
 def _sided(
     plain: Sequence[str],
     parents: Sequence[int],
-    posed: Places,
+    posed: _Places,
     pelvis: int,
-    legs: Pair,
+    legs: _Pair,
     chest: int,
-    arms: Pair,
+    arms: _Pair,
 ) -> dict[str, int]:
     up = unit(posed[chest] - posed[pelvis])
     toes = [posed[leg[3]] - posed[leg[2]] for leg in legs if len(leg) > 3]
@@ -263,7 +263,7 @@ def _side(plain: Sequence[str], limb: Sequence[int]) -> str:
 # --------------------------------------------------------------------------------------------------
 
 
-def _match_toes(source: dict[str, int], parents: Sequence[int], rest: Places) -> None:
+def _match_toes(source: dict[str, int], parents: Sequence[int], rest: _Places) -> None:
     for side in SIDES:
         ankle = source[f"{side}_ankle"]
         below = [

@@ -21,7 +21,7 @@ from humangs_jax.motion import MotionError
 from humangs_jax.motion.rules import ORTHONORMAL
 from humangs_jax.motion.vectors import hint_for, values_of
 
-INSIDE = (
+_INSIDE = (
     "smpl_params_global",
     "smplx_world",
     "smpl_params_incam",
@@ -31,17 +31,17 @@ INSIDE = (
     "smpl",
 )
 """Keys of what was found of a person, the best first."""
-LISTS = ("people", "persons", "annots", "results")
+_LISTS = ("people", "persons", "annots", "results")
 """Keys of all people."""
-IDS = ("id", "smpl_id", "track_id", "personID", "person_id")
+_IDS = ("id", "smpl_id", "track_id", "personID", "person_id")
 """Keys of the number of a person."""
-FRAMES = ("frame_ids", "frames", "frame", "frame_id")
+_FRAMES = ("frame_ids", "frames", "frame", "frame_id")
 """Keys of the frames in which a person was seen."""
-FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
+_FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
 """Where the files of a folder may lie."""
-OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
+_OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
 """Suffixes of files of one person each; others are of one frame each."""
-DEEPEST = 6
+_DEEPEST = 6
 """Levels of lists and maps in which people are looked for."""
 SHOWN = 12
 """Keys of a file in an error."""
@@ -74,7 +74,7 @@ def read_people(path: Path) -> list[Person]:
     files = _files(path) if path.is_dir() else [path]
     alone = not path.is_dir() and path.suffix.lower() != ".json"
     check_limit("frames", len(files), "files")
-    if not alone and files[0].suffix.lower() not in OF_ONE:
+    if not alone and files[0].suffix.lower() not in _OF_ONE:
         people = _stacked(_frames(files))
     else:
         people = []
@@ -115,8 +115,8 @@ def _files(folder: Path) -> list[Path]:
     def natural(file):
         return [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
 
-    for place in (folder / name for name in FOLDERS):
-        for suffix in (".json", ".npz", *OF_ONE):
+    for place in (folder / name for name in _FOLDERS):
+        for suffix in (".json", ".npz", *_OF_ONE):
             files = [
                 file for file in visible(place.glob("*" + suffix)) if file.name != "camera.npy"
             ]
@@ -145,25 +145,25 @@ def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
 
 def _found(content: Any, name: str, depth: int) -> list[Person]:
     content = objects(content)
-    if depth > DEEPEST:
+    if depth > _DEEPEST:
         return []
     # a list of people, a person, a person one level deeper, or people by name
     if isinstance(content, dict):
         form = format_of(content)
         if form is not None:
             return _split(content, form, name)
-        for key in INSIDE:
+        for key in _INSIDE:
             if isinstance(content.get(key), dict):
-                beside = {other: value for other, value in content.items() if other not in INSIDE}
+                beside = {other: value for other, value in content.items() if other not in _INSIDE}
                 return _found(beside | content[key], name, depth + 1)
-        for key in LISTS:
+        for key in _LISTS:
             if isinstance(objects(content.get(key)), dict | list):
                 return _found(content[key], name, depth + 1)
         named = [(str(key), each) for key, each in content.items()]
     elif isinstance(content, list | tuple):
         named = []
         for i, each in enumerate(content):
-            key = _first(IDS, each) if isinstance(each, dict) else None
+            key = _first(_IDS, each) if isinstance(each, dict) else None
             named.append((str(i) if key is None else _word(each[key]), each))
     else:
         return []
@@ -198,7 +198,7 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     # numbers of the people, where the file has one for each
     count = len(arrays[poses])
     numbers = np.arange(count)
-    key = _first(IDS, values)
+    key = _first(_IDS, values)
     if key is not None and np.size(as_array(values[key])) == count:
         numbers = np.ravel(as_array(values[key]))
     people = []
@@ -245,7 +245,7 @@ def _off_rotations(array: np.ndarray) -> float:
 
 
 def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
-    key = _first(FRAMES, values)
+    key = _first(_FRAMES, values)
     if key is None:
         return None
     try:

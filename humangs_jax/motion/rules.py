@@ -47,8 +47,6 @@ NO_PLACES = "the file has no positions ({}): people stay in place"
 # Names of joints
 # --------------------------------------------------------------------------------------------------
 
-_BONES = (("proximal",), ("intermediate",), ("distal",))
-
 
 def _finger(finger: str, i: int) -> tuple[str, ...]:
     """Names of the i-th joint of a finger, from 1 at the palm; Biped counts fingers from the
@@ -61,9 +59,9 @@ def _finger(finger: str, i: int) -> tuple[str, ...]:
         for w in words
         for form in (f"hand{w}{i}", f"{w}{i}", f"{w}0{i}", f"f{w}0{i}", f"f{w}{i}", f"{w}finger{i}")
     ]
-    bones = _BONES
+    bones = (("proximal",), ("intermediate",), ("distal",))
     if finger == "thumb":
-        bones = ("metacarpal", "proximal"), ("intermediate", "proximal"), ("distal",)
+        bones = (("metacarpal", "proximal"), ("intermediate", "proximal"), ("distal",))
     plain += [w + bone for w in words for bone in bones[i - 1]]
     return (*plain, f"finger{number}{i - 1 or ''}")
 
@@ -241,22 +239,16 @@ def up_axis(
     # the floor decides where it speaks clearly
     here, there = _floors(points, (usual, stands), fps)
     if here < ON_THE_FLOOR <= there and here <= 0.5 * there:
-        return (
-            stands,
-            (
-                f"{stands} is up, not {usual} as usual in such files: people stand and step on a"
-                " floor below it"
-            ),
-        )
+        usually = f"{stands} is up, not {usual} as usual in such files"
+        return stands, f"{usually}: people stand and step on a floor below it"
     # else the axis along which people stand, unless they are on their hands
     contradicted = there < ON_THE_FLOOR <= here and there <= 0.5 * here
-    if (
-        stands in also
-        and not contradicted
-        and not (_opposite(stands, usual) and _on_hands(points, usual))
-    ):
+    opposite = stands.lstrip("-") == usual.lstrip("-")
+    lowest = (points[::2] @ upright_matrix(usual)[1]).argmin(axis=1)
+    on_hands = float(np.isin(lowest, HANDS).mean()) > 0.5
+    if stands in also and not contradicted and not (opposite and on_hands):
         return stands, f"{stands} is up, not {usual}: people stand along it"
-    if contradicted or _opposite(stands, usual):
+    if contradicted or opposite:
         return usual, ""
     lying = f"{usual} is up, as usual in such files, and people lie along {stands}"
     return usual, f"{lying}; if they should stand: --motion-up={stands} (in Python up={stands!r})"
@@ -281,14 +273,6 @@ def _floors(
     if max(rests) >= ON_THE_FLOOR:
         return rests
     return [stays[0], stays[1] if stays[1] >= TREADMILL else 0.0]
-
-
-def _opposite(a: str, b: str) -> bool:
-    return a.lstrip("-") == b.lstrip("-") and a != b
-
-
-def _on_hands(points: Float[np.ndarray, "pairs s 3"], up: str) -> bool:
-    return float(np.isin((points[::2] @ upright_matrix(up)[1]).argmin(axis=1), HANDS).mean()) > 0.5
 
 
 def joint_places(

@@ -119,7 +119,7 @@ def retargeted(
     relative = [
         own if p < 0 else _transposed(world[p]) @ own for p, own in zip(PARENTS, world, strict=True)
     ]
-    rotations = np.stack([_rotation(turn) for turn in relative], axis=1)
+    rotations = np.stack([Rotation.from_matrix(turn).as_rotvec() for turn in relative], axis=1)
     # the pelvis follows the file's, and the soles stand as high as the file's do
     moves = scale * places[:, source["pelvis"]]
     soles = None
@@ -131,11 +131,11 @@ def retargeted(
     return rotations, moves - joints[0], note
 
 
-Source = Mapping[str, int]
+_Source = Mapping[str, int]
 """Our names of joints -> indices of the file's."""
 
 
-def _up_of(clip: Clip, source: Source, scale: float, standing: bool) -> tuple[str, str]:
+def _up_of(clip: Clip, source: _Source, scale: float, standing: bool) -> tuple[str, str]:
     """The axis that is up, and a note about it: BVH does not tell, a rest pose in which people
     stand does.
     """
@@ -156,22 +156,22 @@ _INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
 # --------------------------------------------------------------------------------------------------
 
 
-def _top(source: Source) -> str:
+def _top(source: _Source) -> str:
     return next(name for name in rules.TOPS if name in source)
 
 
-def _spine(clip: Clip, source: Source) -> Float[np.ndarray, "3"]:
+def _spine(clip: Clip, source: _Source) -> Float[np.ndarray, "3"]:
     return unit(clip.rest[source[_top(source)]] - clip.rest[source["pelvis"]])
 
 
-def _stands(clip: Clip, source: Source) -> bool:
+def _stands(clip: Clip, source: _Source) -> bool:
     legs = sum(clip.rest[source[f"{s}_ankle"]] - clip.rest[source[f"{s}_hip"]] for s in rules.SIDES)
     return float(unit(legs) @ _spine(clip, source)) < rules.STANDING
 
 
 def _body_turns(
     clip: Clip,
-    source: Source,
+    source: _Source,
     joints: Float[np.ndarray, "j 3"],
     turns: Float[np.ndarray, "m s 3 3"],
     places: Float[np.ndarray, "m s 3"],
@@ -190,9 +190,8 @@ def _body_turns(
         elif name not in source:
             world.append(world[parent])
         elif child is None:
-            if by_motion and name.endswith(
-                "_ankle"
-            ):  # no toes tell where the foot points: as in T-pose on average
+            # no toes tell where the foot points: as in T-pose on average
+            if by_motion and name.endswith("_ankle"):
                 align = _mean(_transposed(world[parent]) @ turns[:, source[name]]).T
             world.append(turns[:, source[name]] @ align)
         else:
@@ -218,7 +217,7 @@ def _body_turns(
 
 def _pelvis_turns(
     clip: Clip,
-    source: Source,
+    source: _Source,
     turns: Float[np.ndarray, "m s 3 3"],
     places: Float[np.ndarray, "m s 3"],
 ) -> Float[np.ndarray, "m 3 3"]:
@@ -272,7 +271,7 @@ def _pelvis_turns(
 
 
 def _pelvis_frame(
-    clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]
+    clip: Clip, source: _Source, joints: Float[np.ndarray, "j 3"]
 ) -> Float[np.ndarray, "3 3"]:
     theirs = clip.rest[source["left_hip"]] - clip.rest[source["right_hip"]]
     top = joints[_INDEX[_top(source)]] - joints[0]
@@ -309,18 +308,18 @@ def _untwist(
 # --------------------------------------------------------------------------------------------------
 
 
-def _leg_length(places: Float[np.ndarray, "s 3"], index: Source) -> float:
+def _leg_length(places: Float[np.ndarray, "s 3"], index: _Source) -> float:
     bones = (("left_hip", "left_knee"), ("left_knee", "left_ankle"))
     return sum(float(np.linalg.norm(places[index[b]] - places[index[a]])) for a, b in bones)
 
 
-def _feet(source: Source) -> list[list[str]]:
+def _feet(source: _Source) -> list[list[str]]:
     """Our names of the joints that may touch the floor: of both sides by kind."""
     present = [[name for name in kind if name in source] for kind in rules.FEET]
     return [found for found in present if found]
 
 
-def _soles(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> dict[str, float]:
+def _soles(clip: Clip, source: _Source, joints: Float[np.ndarray, "j 3"]) -> dict[str, float]:
     """How high the joints of the file's feet are above the lowest of them in a rest pose that
     stands, in our metres.
     """
@@ -332,7 +331,7 @@ def _soles(clip: Clip, source: Source, joints: Float[np.ndarray, "j 3"]) -> dict
 
 
 def _steps(
-    heights: Float[np.ndarray, "m s"], source: Source, soles: dict[str, float] | None
+    heights: Float[np.ndarray, "m s"], source: _Source, soles: dict[str, float] | None
 ) -> Float[np.ndarray, " m"]:
     """(m,) how high the feet are above the floor, which is where they are lowest.
 
@@ -352,7 +351,7 @@ def _steps_of_body(
     world: Sequence[Float[np.ndarray, "m 3 3"]],
     joints: Float[np.ndarray, "j 3"],
     moves: Float[np.ndarray, "m 3"],
-    source: Source,
+    source: _Source,
 ) -> Float[np.ndarray, " m"]:
     places = {0: moves}
 
@@ -368,7 +367,3 @@ def _steps_of_body(
 
 def _transposed(matrices: Float[np.ndarray, "*b i j"]) -> Float[np.ndarray, "*b j i"]:
     return np.swapaxes(matrices, -1, -2)
-
-
-def _rotation(matrices: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
-    return Rotation.from_matrix(matrices).as_rotvec()

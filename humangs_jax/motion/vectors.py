@@ -17,9 +17,7 @@ from humangs_jax.io.reading import InvalidFileError
 from humangs_jax.io.restricted_pickle import as_array
 from humangs_jax.motion.rules import COLUMNS
 
-MOTION_X = "(m,322)"
-"""The key under which an array of Motion-X is read."""
-POSES = "(m,165/156/72/66)"
+_POSES = "(m,165/156/72/66)"
 """The key under which an array of poses is read."""
 _PARTS = {
     "root_orient": (0, 3),
@@ -28,16 +26,14 @@ _PARTS = {
     "pose_jaw": (156, 159),
     "trans": (309, 312),
 }
-COLUMNS_OF_MOTION_X = 322
+_COLUMNS_OF_MOTION_X = 322
 _RENDER = (
     "make rotations of them, as MDM's `python -m visualize.render_mesh` does (*_smpl_params.npy)"
 )
-FEATURES = {263: "HumanML3D", 251: "KIT-ML"}
+_FEATURES = {263: "HumanML3D", 251: "KIT-ML"}
 """Columns of vectors of features, and of which data set they are."""
-JOINTS = {22: "HumanML3D's new_joints", 21: "KIT-ML's new_joints"}
+_JOINTS = {22: "HumanML3D's new_joints", 21: "KIT-ML's new_joints"}
 """Joints in space, and of which data set they are."""
-RESULTS = {"motion", "text", "lengths"}
-"""Keys of the joints in space that MDM samples."""
 
 
 def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
@@ -48,28 +44,28 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
     shape = array.shape
     columns = shape[-1] if shape else 0
     # rotations, in one of the layouts that are read
-    if array.ndim == 2 and columns == COLUMNS_OF_MOTION_X:
+    if array.ndim == 2 and columns == _COLUMNS_OF_MOTION_X:
         parts = {key: array[:, first:end] for key, (first, end) in _PARTS.items()}
-        return {MOTION_X: array, **parts}
+        return {"(m,322)": array, **parts}
     if array.ndim == 2 and columns in COLUMNS:
-        return {POSES: array}
+        return {_POSES: array}
     if array.ndim == 4 and shape[2:] == (3, 3):
-        return {POSES: array}
+        return {_POSES: array}
     # arrays of other programs that are known, and are no rotations
-    if array.ndim == 2 and columns in FEATURES:
+    if array.ndim == 2 and columns in _FEATURES:
         raise InvalidFileError(
-            f"{columns} features a frame of {FEATURES[columns]}, not rotations: recover the joints"
+            f"{columns} features a frame of {_FEATURES[columns]}, not rotations: recover the joints"
             f" and {_RENDER}"
         )
     if array.ndim == 3 and columns == 3:
         whose = ""
-        if shape[1] in JOINTS:
-            whose = f" ({JOINTS[shape[1]]})"
+        if shape[1] in _JOINTS:
+            whose = f" ({_JOINTS[shape[1]]})"
         wanted = "expected a row of axis-angles a frame"
         raise InvalidFileError(
             f"{shape[1]} joints in space{whose}, or axis-angles in three axes: {wanted}; {_RENDER}"
         )
-    known = ", ".join(map(str, (COLUMNS_OF_MOTION_X, *COLUMNS)))
+    known = ", ".join(map(str, (_COLUMNS_OF_MOTION_X, *COLUMNS)))
     raise InvalidFileError(
         f"an array of shape {shape}: expected (frames, columns) with {known} columns, or a dict of"
         " arrays by name"
@@ -78,7 +74,7 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
 
 def hint_for(values: Mapping[Any, Any]) -> str:
     """Gives a hint about values that are not a motion; "" for none."""
-    if values.keys() >= RESULTS:
+    if values.keys() >= {"motion", "text", "lengths"}:
         return f"; these are joints in space that MDM sampled: {_RENDER}"
     return ""
 
@@ -97,14 +93,14 @@ def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[
         raise InvalidFileError(f"{rotations}: expected real numbers, got {six.dtype}")
     if last:
         six = six.transpose(2, 0, 1)
-    changed: dict[str, Any] = {rotations: matrices_of(six)}
+    changed: dict[str, Any] = {rotations: _matrices_of(six)}
     if moves in values:
         places = np.asarray(as_array(values[moves]))
         changed[moves] = places.T if last else places
     return {**values, **changed}
 
 
-def matrices_of(six: Float[np.ndarray, "*b 6"]) -> Float[np.ndarray, "*b 3 3"]:
+def _matrices_of(six: Float[np.ndarray, "*b 6"]) -> Float[np.ndarray, "*b 3 3"]:
     """Rotation matrices of their first two rows; not finite where these are zero or parallel."""
     a, b = np.asarray(six[..., :3], np.float64), np.asarray(six[..., 3:], np.float64)
     with np.errstate(all="ignore"):

@@ -48,21 +48,16 @@ WEIGHTS = 8
 
 The shipped body has at most 7; leaving out the eighth costs nothing there.
 """
-STEPS = 65535
-SMALLEST_SCALE = 1e-7
+_STEPS = 65535
+_SMALLEST_SCALE = 1e-7
 """Metres; keeps the logarithm finite for flat Gaussians.
 
 A thousandth of eps2d for a camera at any distance.
 """
-SMALLEST_RANGE = 1e-6
+_SMALLEST_RANGE = 1e-6
 """Least range of quantized values: keeps the division finite where all are the same."""
 SHAPE_STEP = 1e-4
 """Metres."""
-SHAPE_TOLERANCE = 1e-3
-"""Metres; a body explains an avatar if its vertices, in the shape that fits best, are this near
-(root mean square).
-"""
-DRAWN_FIELDS = ("near", "alpha_min", "alpha_max", "jacobian_margin")
 
 
 @dataclasses.dataclass
@@ -134,23 +129,27 @@ def pack(
     how = SPLAT_PRESETS[avatar.rendering]
     vertices = np.asarray(avatar.rest_vertices, np.float64)
     # the page draws by the same rules as the renderer, which it gets as numbers
+    drawn = {
+        name: getattr(how, name) for name in ("near", "alpha_min", "alpha_max", "jacobian_margin")
+    }
+    drawn["eps2d"] = added_variance(avatar.gaussians.pixel_footprint, how.eps2d)
+    # metres; one for all Gaussians, whose photos were taken from similar distances; 0: none
+    drawn["low_pass"] = 0.0
+    if avatar.gaussians.pixel_footprint is not None:
+        drawn["low_pass"] = float(np.median(avatar.gaussians.pixel_footprint))
     header: dict[str, Any] = {
         "version": VERSION,
         "parents": avatar.parents,
         "joint_names": avatar.joint_names,
         "skinning": avatar.skinning,
-        "splatting": {name: getattr(how, name) for name in DRAWN_FIELDS}
-        | {
-            "eps2d": added_variance(avatar.gaussians.pixel_footprint, how.eps2d),
-            "low_pass": _median_footprint(avatar),
-        },
+        "splatting": drawn,
         "rest_bounds": [vertices.min(0).tolist(), vertices.max(0).tolist()],
     }
     arrays: dict[str, np.ndarray] = {}
     # axis-angles fit 16 bits with the step of the largest
     if motion is not None:
         rotations = np.asarray(motion.rotations, np.float64)
-        step = max(float(np.abs(rotations).max()), SMALLEST_RANGE) / 32767
+        step = max(float(np.abs(rotations).max()), _SMALLEST_RANGE) / 32767
         arrays["rotations"] = np.rint(rotations / step).astype("<i2")
         arrays["translations"] = np.asarray(motion.translations, "<f4")
         header["motion"] = {
@@ -169,13 +168,6 @@ def pack(
     return _joined(header, arrays)
 
 
-def _median_footprint(avatar: Avatar) -> float:
-    """Metres; one for all Gaussians, whose photos were taken from similar distances. 0: none."""
-    if avatar.gaussians.pixel_footprint is None:
-        return 0.0
-    return float(np.median(avatar.gaussians.pixel_footprint))
-
-
 def largest_weights(
     weights: Float[np.ndarray, "g j"],
 ) -> tuple[Int[np.ndarray, "g 8"], Int[np.ndarray, "g 8"]]:
@@ -190,15 +182,15 @@ def largest_weights(
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :WEIGHTS]
     kept = np.take_along_axis(weights, joints, axis=1)
     kept /= kept.sum(1, keepdims=True)
-    whole = np.rint(kept * STEPS).astype(np.int64)
-    whole[:, 0] += STEPS - whole.sum(1)
+    whole = np.rint(kept * _STEPS).astype(np.int64)
+    whole[:, 0] += _STEPS - whole.sum(1)
     joints[whole == 0] = 0  # columns beyond the last joint among them
     return joints, whole
 
 
-def fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | None:
+def _fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | None:
     """The shape coefficients of `body` with which it has the avatar's vertices; None if it cannot
-    have them.
+    have them to a millimetre (root mean square).
     """
     target = np.asarray(avatar.rest_vertices, np.float64)
     if body.template.shape != target.shape or len(body.parents) != len(avatar.parents):
@@ -207,7 +199,7 @@ def fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | N
     offsets = (target - np.asarray(body.template, np.float64)).reshape(-1)
     betas = np.linalg.lstsq(directions, offsets, rcond=None)[0]
     error = np.sqrt(np.mean(np.square(directions @ betas - offsets)))
-    return betas if error < SHAPE_TOLERANCE else None
+    return betas if error < 1e-3 else None
 
 
 def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any, Any]]:
@@ -229,7 +221,7 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
         np.asarray(x, np.float64) for x in (g.means, g.quats, g.scales, g.opacities, g.colors)
     )
     # sizes span orders of magnitude: their logarithms lose the same share everywhere
-    logs = np.log(np.maximum(scales, SMALLEST_SCALE))
+    logs = np.log(np.maximum(scales, _SMALLEST_SCALE))
     header["means"], arrays["means"] = _quantized(means, means.min(0), means.max(0))
     header["scales"], arrays["scales"] = _quantized(logs, logs.min(), logs.max())
     # colors may leave [0, 1]
@@ -242,7 +234,7 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
             harmonics, harmonics.min(), harmonics.max()
         )
     arrays["quats"] = np.rint(unit_quats(quats) * 32767).astype("<i2")
-    arrays["opacities"] = np.rint(opacities * STEPS).astype("<u2")
+    arrays["opacities"] = np.rint(opacities * _STEPS).astype("<u2")
     joints, weights = largest_weights(np.asarray(avatar.skinning_weights))
     arrays["weights"], arrays["weight_joints"] = weights.astype("<u2"), joints.astype("u1")
     arrays["rest_joints"] = np.asarray(avatar.rest_joints, "<f4")
@@ -262,7 +254,7 @@ def _pack_shape(
     """Add how each shape coefficient moves the vertices; the Gaussians of a vertex move with it
     (they are vertex-major).
     """
-    betas = fitted_shape(avatar, body)
+    betas = _fitted_shape(avatar, body)
     vertices = len(avatar.rest_vertices)
     if betas is None or len(avatar.gaussians.means) % vertices:
         raise ValueError(f"the body '{body.name}' does not explain the avatar's vertices")
@@ -279,8 +271,8 @@ def _pack_shape(
 def _quantized(
     values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float
 ) -> tuple[dict[str, Any], np.ndarray]:
-    low, high = np.asarray(low), np.maximum(high, np.asarray(low) + SMALLEST_RANGE)
-    whole = np.rint((values - low) / (high - low) * STEPS).astype("<u2")
+    low, high = np.asarray(low), np.maximum(high, np.asarray(low) + _SMALLEST_RANGE)
+    whole = np.rint((values - low) / (high - low) * _STEPS).astype("<u2")
     return {"low": low.tolist(), "high": high.tolist()}, whole
 
 
@@ -303,13 +295,7 @@ def _joined(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Packed:
 # --------------------------------------------------------------------------------------------------
 
 
-SCRIPTS = (
-    *("kinematics", "scene", "face", "camera", "splatting", "motion_files", "skeletons", "glb"),
-    *("controls", "saving", "embedding", "main"),
-)
 SHADERS = ("whole.vert", "project.frag", "splat.vert", "splat.frag", "background.frag")
-LARGEST_FPS = 60.0
-"""Motions of more frames per second are thinned out: the page interpolates between frames."""
 _MARK = re.compile(r"\{\{(\w+)\}\}")
 
 
@@ -331,8 +317,9 @@ def page_html(
         walk = load_motion()
         motion = walk if walk.rotations.shape[1] == len(avatar.parents) else None
     if motion is not None and motion.rotations.shape[1] == len(avatar.parents):
-        if motion.fps > LARGEST_FPS:
-            motion = motion.at_rate(LARGEST_FPS)
+        # the page interpolates between frames
+        if motion.fps > 60.0:
+            motion = motion.at_rate(60.0)
         motion = grounded(
             motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents
         )
@@ -457,7 +444,7 @@ def known_body(avatar: Avatar) -> BodyModel | None:
     if len(avatar.rest_vertices) != len(body.template):
         body = gaussian_body(body, shipped_network())
     same = np.array_equal(body.faces, avatar.faces) and avatar.gaussians_per_vertex is not None
-    if same and fitted_shape(avatar, body) is not None:
+    if same and _fitted_shape(avatar, body) is not None:
         return body
     return None
 
@@ -483,6 +470,10 @@ def _template() -> str:
     """index.html with styles, shaders and scripts in their places; the avatar's are still
     marked.
     """
+    scripts = (
+        *("kinematics", "scene", "face", "camera", "splatting", "motion_files", "skeletons"),
+        *("glb", "controls", "saving", "embedding", "main"),
+    )
     parts = {
         "style": read_part("style.css"),
         "shaders": "\n".join(
@@ -490,6 +481,6 @@ def _template() -> str:
             for name in SHADERS
         ),
         "sorting": read_part("sorting.js"),  # runs twice: in the page, and as the text of a worker
-        "scripts": page_script(*SCRIPTS),
+        "scripts": page_script(*scripts),
     }
     return _MARK.sub(lambda mark: parts.get(mark[1], mark[0]), read_part("index.html"))

@@ -14,11 +14,6 @@ from humangs_jax.avatar.face import BLINKS, Face
 from humangs_jax.body.expressions import EYES
 from humangs_jax.body.motion import Motion
 
-SMALLEST_STEP = 1e-5
-"""Metres, of the offsets in the page."""
-STAYS = 65535
-"""The row of Gaussians that no expression moves."""
-
 
 def pack_face(
     avatar: Avatar, motion: Motion | None, header: dict[str, Any], arrays: dict[str, np.ndarray]
@@ -42,11 +37,11 @@ def pack_face(
         [np.asarray(face.expressions.directions), np.asarray(face.hidden_directions)]
     )
     directions = np.moveaxis(directions, -1, 0)
-    # one step for all offsets, so that the page scales them by one number
-    step = max(SMALLEST_STEP, float(np.abs(directions).max(initial=0)) / 32767)
-    # rows beyond the moved vertices stand for Gaussians that stay
+    # one step (metres) for all offsets, so that the page scales them by one number
+    step = max(1e-5, float(np.abs(directions).max(initial=0)) / 32767)
+    # rows beyond the moved vertices stand for Gaussians that no expression moves
     rows = np.asarray(face.row)
-    rows = np.where(rows < moved, rows, STAYS)
+    rows = np.where(rows < moved, rows, 65535)
     arrays["face_rows"] = np.concatenate([rows, moved + np.arange(hidden)]).astype("<u2")
     arrays["face_directions"] = np.rint(directions / step).astype("<i2")
     eyes = np.concatenate([np.asarray(face.eyes), np.zeros((hidden, 2))])
