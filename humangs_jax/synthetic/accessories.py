@@ -43,6 +43,7 @@ def build(
     """
     kind, sizes, fabric = garment.kind, garment.sizes, garment.fabric
     hat = functools.partial(hair.scalp_shell, rng, anatomy, hat=True)
+    # what is not made of its fabric
     if kind in ("glasses", "sunglasses"):
         return _glasses(anatomy, garment)
     if kind == "necklace":
@@ -51,6 +52,7 @@ def build(
         else:
             metal = color(0.6, 0.04, 0.72)
         return [(_necklace(anatomy, sizes["length"]), _painted(metal, 0.6))]
+    # hats with a brim or a peak
     if kind in ("cap", "brim_hat"):
         if kind == "cap":
             shell = hat(0.016, 0.0, crown=0.008)
@@ -59,6 +61,7 @@ def build(
         paint = _panelled if kind == "cap" else _ribboned
         albedo = functools.partial(paint, fabric)
         return [(join([shell, _hat_edge(rng, anatomy, garment)]), Material(albedo, wrinkles=0.05))]
+    # the rest is of soft cloth
     if kind == "scarf":
         surface = _scarf(rng, anatomy, sizes["thickness"], sizes["tails"], ease)
     elif kind == "beanie":
@@ -190,6 +193,7 @@ def _tail(
     thickness: float,
     ease: float,
 ) -> Surface:
+    """An end of a scarf that hangs down in front, on the chest."""
     rows = max(5, int(length / 0.03))
     y = np.linspace(start[1] + 0.01, start[1] - length, rows)
     x = side * (0.028 + 0.012 * np.linspace(0, 1, rows)) + 0.006 * np.sin(np.linspace(0, 3, rows))
@@ -358,10 +362,12 @@ def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> 
 
 
 def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) -> Surface:
+    """One shoe: rings around the foot, and around the shin above it."""
     x, y, _ = anatomy.skin.template.T
     own = np.flatnonzero((x * (1 - 2 * side) > 0) & (y < FLOOR + height + 0.06))
     points = anatomy.skin.vertices[own]
     floor = points[:, 1].min()
+    # heights of the rings, closest at the sole
     shaft = [height]
     if height > 0.1:
         shaft = np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1))
@@ -376,6 +382,7 @@ def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) 
     pairs = (thin.centers, thick.centers), (thin.radii, surfaces.blurred(thick, 2).radii)
     shape = surfaces.Boundaries(levels, *(a + (b - a) * shin for a, b in pairs))
     shape = surfaces.hanging(shape, 0.6)  # the sole is as wide as what is above it
+    # the sole: it reaches beyond the leather
     below = ((-sole, 0.0), (-sole, 0.0), (-0.3 * sole, 0.004), (0.004, 0.004), (0.006, 0.0))
     rows = [(floor + y, 0, extra) for y, extra in below] + [
         (level, i + 1, 0.0) for i, level in enumerate(levels[1:])

@@ -433,6 +433,7 @@ def to_silhouettes(
 
 
 def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: str) -> PeopleBank:
+    """People padded to one size."""
     # the sizes of the largest mesh, rounded up: few shapes are compiled
     vertices = -(-max(len(p["vertices"]) for p in people) // 1024) * 1024
     faces = -(-max(len(p["faces"]) for p in people) // 2048) * 2048

@@ -146,6 +146,7 @@ def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut)
     seed = int(rng.integers(1 << 20))
 
     def albedo(s: Spots):
+        """Skin, tanned arms, palms, knees and elbows; then the face."""
         x, y, z = np.abs(s.template[:, 0]), s.template[:, 1], s.template[:, 2]
         result = tones.skin * (1 + 0.035 * cloud(s.template) + 0.03 * blotches(s.template))[:, None]
         result = result * (1 - tones.tan * np.clip((x - 0.2) / 0.3, 0, 1) * (y > -0.1))[:, None]

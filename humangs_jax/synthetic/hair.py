@@ -308,6 +308,7 @@ def falling_tube(
     """
     skin, template = anatomy.skin, anatomy.skin.template
     to_rest, center = _skull(anatomy)
+    # silhouettes of the head without its ears, and of neck and shoulders
     scale = 1 + thickness / 0.09
     ears = (np.abs(template[:, 0]) > 0.0735) & (template[:, 1] > 0.26) & (template[:, 1] < 0.36)
     head = (
@@ -322,22 +323,24 @@ def falling_tube(
     points = skin.vertices[trunk]
     back = blurred(boundaries(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.02), 2)
 
+    # rings from the crown down: a dome, then a tube
     top = _CROWN + (_CROWN - SKULL[1]) * (scale - 1)
     dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))
     rows = np.concatenate([dome, np.arange(SKULL[1] - 0.02, min(bottom, 0.3), -0.022)])
     row_height, angle, faces = surfaces.tube(rows, surfaces.circle(60))
     height = to_rest(row_height)
     inner = center[1] + (height - center[1]) / scale
+    # the dome above the brim
     brim, summit = to_rest(0.385), center[1] + (to_rest(top) - center[1]) / scale
-    vault = np.sqrt(
-        np.clip(1 - np.clip((inner - brim) / (summit - brim), 0, 1) ** 2, 0, 1)
-    )  # the dome above the brim
+    vault = np.sqrt(np.clip(1 - np.clip((inner - brim) / (summit - brim), 0, 1) ** 2, 0, 1))
     radius = scale * vault * falling.radius(np.minimum(inner, brim), angle)
+    # it lies on the back and what is worn there, and has waves
     on_back = back.radius(height, angle) + (0.034 + over) * smoothstep(-0.23, -0.17, -row_height)
     radius = np.maximum(radius, on_back * (row_height < 0.24))
     waves = ripples(rng, around(3, angle, height * 4), 1.2)
     radius = radius + smoothstep(0.0, 0.12, SKULL[1] - row_height) * wave * waves
     vertices = around(radius, angle, height, center[[0, 2]]).astype(np.float32)
+    # the hem, and the opening for the face
     signed = (angle + np.pi) % (2 * np.pi) - np.pi
     front = 0.15 if ends is None else ends
     lowest = [front, front, max(bottom, front), bottom, bottom]

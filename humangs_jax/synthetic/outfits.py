@@ -327,6 +327,7 @@ def _made(
 
 
 def _separates(rng: np.random.Generator, name: str, male: bool, outer: bool) -> list[Garment]:
+    """A top with trousers or a skirt, and what is worn below an open shirt."""
     style = _STYLES[name]
     kind = drawn(rng, style.tops)
     if male and kind == "blouse":
@@ -359,6 +360,7 @@ def _top(
     tucked: bool,
     outer: bool,
 ) -> Garment:
+    """A top of a kind. outer: whether something is worn over it."""
     long, short = WRIST - rng.uniform(0.0, 0.035), rng.uniform(0.27, 0.40)
     sleeve = row(rng, _SLEEVES, kind, long=long, short=short)
     necks = _NECKS
@@ -406,6 +408,7 @@ def _top(
 def _trousers(
     rng: np.random.Generator, style: _Style, male: bool, waist: float, tucked: bool, top: Garment
 ) -> Garment:
+    """Trousers that go with a top."""
     kind = drawn(rng, style.bottoms)
     if kind == "leggings" and male and rng.random() < 0.7:
         kind = "shorts"
@@ -439,6 +442,7 @@ def _trousers(
 
 
 def _skirt(rng: np.random.Generator, waist: float, tucked: bool) -> Garment:
+    """A skirt, narrow or flared."""
     kind = drawn(rng, {"short_skirt": 3, "pleated_skirt": 1.5, "long_skirt": 2})
     if kind == "long_skirt":
         end = rng.uniform(-1.1, -0.84)
@@ -461,6 +465,7 @@ def _skirt(rng: np.random.Generator, waist: float, tucked: bool) -> Garment:
 
 
 def _pleats(rng: np.random.Generator, kind: str) -> dict[str, float]:
+    """How many pleats a skirt has, and their depth in metres."""
     count, depth = (4, 10), (0.004, 0.016)
     if kind == "pleated_skirt":
         count, depth = (14, 24), (0.008, 0.014)
@@ -468,6 +473,7 @@ def _pleats(rng: np.random.Generator, kind: str) -> dict[str, float]:
 
 
 def _dress(rng: np.random.Generator, outer: bool) -> list[Garment]:
+    """A dress. outer: whether something is worn over it."""
     kind = drawn(rng, {"short_dress": 4, "long_dress": 3, "shirt_dress": 1.5})
     if kind == "long_dress":
         end = rng.uniform(-1.14, -0.85)
@@ -494,6 +500,7 @@ def _dress(rng: np.random.Generator, outer: bool) -> list[Garment]:
 
 
 def _outer(rng: np.random.Generator, style: _Style, worn: Sequence[Garment]) -> Garment:
+    """A jacket or a coat over what is worn."""
     kind = drawn(rng, style.coats)
     often_open = {"puffer": 0.4, "coat": 0.5, "cardigan": 0.85, "vest": 0.5}
     is_open = rng.random() < often_open.get(kind, 0.75)
@@ -524,6 +531,7 @@ def _outer(rng: np.random.Generator, style: _Style, worn: Sequence[Garment]) -> 
 def _shoes(
     rng: np.random.Generator, style: _Style, male: bool, worn: Sequence[Garment]
 ) -> list[Garment]:
+    """Shoes, and socks where they can be seen; boots go over narrow trousers only."""
     lower = next(g for g in worn if g.kind in BOTTOMS + SKIRTS + DRESSES)
     kind = drawn(rng, style.shoes)
     covered = lower.kind in BOTTOMS and lower.sizes["end"] < -1.0
@@ -572,6 +580,7 @@ def _fastened(
 def _extras(
     rng: np.random.Generator, style: _Style, male: bool, years: float, worn: Sequence[Garment]
 ) -> list[Garment]:
+    """What is carried, or worn around the neck, on the head and on the wrist."""
     kinds = {g.kind for g in worn}
     hooded = any("hood_up" in g.details for g in worn)
     result: list[Garment] = []

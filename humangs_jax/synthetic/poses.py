@@ -54,7 +54,7 @@ def _sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Ro
             rng, width
         )
         _, missed = take_stance(build, rotations, heading, stance)
-        if missed < 1e-6 and kin.excess(rotations, tuple(j for leg in kin.LEGS for j in leg)) < 0:
+        if missed < 1e-6 and kin.excess(rotations, (*kin.LEGS[0], *kin.LEGS[1])) < 0:
             return stance
     stance = _stand(rng, width)
     take_stance(build, rotations, heading, stance)
@@ -106,10 +106,12 @@ def _pair(
 
 
 def _stand(rng: np.random.Generator, width: float) -> Stance:
+    """Both feet on the ground."""
     return Stance(tuple(_pair(rng, width)), sink=rng.uniform(0.0, 0.015), roll=rng.normal(0, 0.02))
 
 
 def _contrapposto(rng: np.random.Generator, width: float) -> Stance:
+    """The weight on one foot, the other one relaxed in front."""
     feet, relaxed = _pair(rng, width), int(rng.integers(2))
     sign = 1 if relaxed == 0 else -1
     shift = rng.uniform(0.4, 1.0) * width * sign  # the standing foot comes below the pelvis
@@ -122,6 +124,7 @@ def _contrapposto(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _stride(rng: np.random.Generator, width: float) -> Stance:
+    """One foot in front of the other, as in walking."""
     feet = _pair(rng, 0.75 * width, spread=(-0.02, 0.03), turn_out=(-0.05, 0.2))
     front = int(rng.integers(2))
     length, share = rng.uniform(0.25, 0.85), rng.uniform(0.35, 0.6)
@@ -141,6 +144,7 @@ def _stride(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _wide(rng: np.random.Generator, width: float) -> Stance:
+    """Feet wide apart."""
     feet = _pair(rng, width, spread=(0.12, 0.35), turn_out=(0.05, 0.5))
     return Stance(
         tuple(feet), sink=rng.choice([0.0, rng.uniform(0, 0.15)]), roll=rng.normal(0, 0.03)
@@ -148,6 +152,7 @@ def _wide(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _squat(rng: np.random.Generator, width: float) -> Stance:
+    """Knees bent, on the heels or, further down, on the toes."""
     depth = rng.uniform(0.08, 0.42)
     feet = _pair(rng, width, spread=(0.03, 0.2), turn_out=(0.1, 0.6))
     heels = rng.uniform(0.2, 0.6) if depth > 0.3 else 0.0
@@ -156,6 +161,7 @@ def _squat(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _lunge(rng: np.random.Generator, width: float) -> Stance:
+    """One foot far in front, the other one far behind on its toes."""
     feet, front = _pair(rng, width, turn_out=(-0.05, 0.2)), int(rng.integers(2))
     feet[front] = dataclasses.replace(feet[front], z=rng.uniform(0.4, 0.7))
     feet[1 - front] = dataclasses.replace(
@@ -170,6 +176,7 @@ def _lunge(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _side_lunge(rng: np.random.Generator, width: float) -> Stance:
+    """Feet far apart, the weight on a bent leg."""
     feet, bent = _pair(rng, width, spread=(0.2, 0.4), turn_out=(0.1, 0.5)), int(rng.integers(2))
     sign = 1 if bent == 0 else -1
     feet = [dataclasses.replace(foot, x=foot.x - sign * rng.uniform(0.1, 0.3)) for foot in feet]
@@ -202,6 +209,7 @@ def _one_leg(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _tiptoe(rng: np.random.Generator, width: float) -> Stance:
+    """On the toes of both feet."""
     pitch = rng.uniform(0.3, 0.8)
     feet = [dataclasses.replace(foot, pitch=pitch) for foot in _pair(rng, width)]
     return Stance(tuple(feet), sink=rng.uniform(0, 0.03))

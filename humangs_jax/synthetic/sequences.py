@@ -111,6 +111,7 @@ class _Gait:
 
 
 def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
+    """Walking, straight or along a curve."""
     step, curved = rng.uniform(0.3, _LONG_STEP) * build.leg, rng.random() < 0.6
     cadence = rng.uniform(0.75, 1.05)
     bend = rng.normal(0, 0.16) if curved else 0.0
@@ -122,6 +123,7 @@ def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
 
 
 def _turn(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
+    """Turning on the spot."""
     cadence, step = rng.uniform(0.6, 0.9), rng.uniform(-0.02, 0.06)
     bend = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5)
     width = build.hip_width * rng.uniform(0.95, 1.3)
@@ -130,6 +132,7 @@ def _turn(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
 
 
 def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: _Gait) -> _Moves:
+    """Steps along a path, or on the spot: first the footprints, then the trunk, legs and arms."""
     start = rng.uniform(0, 1)
     if abs(gait.step) < 0.1 * build.leg:
         begin_heading = rng.uniform(-np.pi, np.pi)
@@ -140,43 +143,52 @@ def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: _
     def heading(p):
         return begin_heading + 2 * gait.bend * (p - start)
 
+    # where the feet are, and whether they are on the ground
     track = _path(heading, 2 * gait.step, start, phase[-1])
     feet = [tuple(_foot_at(build, gait, heading, track, side, p) for side in (0, 1)) for p in phase]
     planted = np.asarray([[(p + 0.5 * side) % 1 < _STANCE_SHARE for side in (0, 1)] for p in phase])
-
+    # the trunk sways over the foot that stands: left at a quarter stride
     rotations = np.zeros((frames, kin.JOINTS, 3))
-    sway = (
-        0.25 * gait.width * np.sin(2 * np.pi * (phase - 0.06))
-    )  # over the foot that stands: left at a quarter stride
-    lean = rng.normal(0.02, 0.02) + 0.12 * max(gait.step, 0) / build.leg
-    twist = 0.14 * gait.step / build.leg / 0.6
-    turns = np.empty((frames, 3, 3))
-    for i, p in enumerate(phase):
-        once = 2 * np.pi * p
-        roll = 0.05 * np.sin(once - 0.1) * min(1.0, gait.step / build.leg + 0.3)
-        turns[i] = kin.turned(y=heading(p) - twist * np.cos(once)) @ kin.turned(
-            x=0.4 * lean, z=roll
-        )
-        for joint, share in ((Joint.SPINE1, 0.3), (Joint.SPINE2, 0.4), (Joint.SPINE3, 0.3)):
-            rotations[i, joint] = (
-                np.asarray([0.6 * lean, 2 * twist * np.cos(once - 0.2), -0.8 * roll]) * share
-            )
-        look = np.clip(1.2 * gait.bend, -0.5, 0.5)  # to where the path leads
-        rotations[i, [Joint.NECK, Joint.HEAD]] = [
-            -0.3 * lean,
-            0.5 * look - 0.5 * twist * np.cos(once - 0.2),
-            0,
-        ]
-    rotations[:, Joint.PELVIS] = kin.rotation_vector(turns)
-    centers = np.stack([track(p) for p in phase])
-    centers += np.stack(
-        [kin.turned(y=heading(p))[:, 0] * s for p, s in zip(phase, sway, strict=True)]
-    )
+    turns = _carry_trunk(rng, build, rotations, phase, gait, heading)
+    sway = 0.25 * gait.width * np.sin(2 * np.pi * (phase - 0.06))
+    aside = [kin.turned(y=heading(p))[:, 0] * s for p, s in zip(phase, sway, strict=True)]
+    centers = np.stack([track(p) for p in phase]) + np.stack(aside)
+    # the pelvis is as high as the legs let it, and the legs reach the feet
     pelvis = _ride(build, turns, centers, feet)
     for i in range(frames):
         kin.place_feet(build, rotations[i], pelvis[i], feet[i])
     _swing_arms(rng, build, rotations, phase, gait)
     return rotations, pelvis, planted
+
+
+def _carry_trunk(
+    rng: np.random.Generator,
+    build: kin.Build,
+    rotations: Float[np.ndarray, "m j 3"],
+    phase: Float[np.ndarray, " m"],
+    gait: _Gait,
+    heading: _Heading,
+) -> Float[np.ndarray, "m 3 3"]:
+    """Set pelvis, spine and head in `rotations`: the pelvis turns and rolls with the steps, the
+    spine turns against it, and the head looks to where the path leads. Returns the pelvis's
+    rotations as matrices.
+    """
+    lean = rng.normal(0.02, 0.02) + 0.12 * max(gait.step, 0) / build.leg
+    twist = 0.14 * gait.step / build.leg / 0.6
+    look = np.clip(1.2 * gait.bend, -0.5, 0.5)
+    turns = np.empty((len(phase), 3, 3))
+    for i, p in enumerate(phase):
+        once = 2 * np.pi * p
+        roll = 0.05 * np.sin(once - 0.1) * min(1.0, gait.step / build.leg + 0.3)
+        facing = kin.turned(y=heading(p) - twist * np.cos(once))
+        turns[i] = facing @ kin.turned(x=0.4 * lean, z=roll)
+        against = 2 * twist * np.cos(once - 0.2)
+        for joint, share in ((Joint.SPINE1, 0.3), (Joint.SPINE2, 0.4), (Joint.SPINE3, 0.3)):
+            rotations[i, joint] = np.asarray([0.6 * lean, against, -0.8 * roll]) * share
+        sideways = 0.5 * look - 0.5 * twist * np.cos(once - 0.2)
+        rotations[i, [Joint.NECK, Joint.HEAD]] = [-0.3 * lean, sideways, 0]
+    rotations[:, Joint.PELVIS] = kin.rotation_vector(turns)
+    return turns
 
 
 def _path(heading: _Heading, stride: float, first: float, last: float) -> _Track:
@@ -254,8 +266,9 @@ def _swing_arms(
     """Arms hang and swing against the legs; a hanging pose found once, its swing about the axis of
     the shoulders.
     """
+    # arms hang beside straight legs
     stood = rotations[0].copy()
-    stood[[joint for leg in kin.LEGS for joint in leg]] = 0
+    stood[[*kin.LEGS[0], *kin.LEGS[1]]] = 0
     for side in (0, 1):
         for _ in range(_TRIES):
             if bend_arm(rng, build, stood, "hang", side) > 0.01:
@@ -267,9 +280,8 @@ def _swing_arms(
     ):
         collar, shoulder, elbow, wrist = ARMS[side]
         sign = 1 - 2 * side
-        forward = -sign * np.cos(
-            2 * np.pi * (phase - 0.04)
-        )  # the left arm is back when the left heel comes down
+        # the left arm is back when the left heel comes down
+        forward = -sign * np.cos(2 * np.pi * (phase - 0.04))
         base = kin.rotation_matrix(stood[shoulder])
         for i, f in enumerate(forward):
             rotations[i, shoulder] = kin.rotation_vector(kin.turned(x=-gait.swing * f) @ base)
@@ -321,6 +333,7 @@ def _key_pose(
     """(rotations, place of the pelvis on the ground plane, how much lower it is than it could
     be).
     """
+    # the trunk: the deeper the knees are bent, the further it leans
     rotations = np.zeros((kin.JOINTS, 3))
     sink = stance.sink * build.leg
     if rng.random() < 0.3:
@@ -329,17 +342,16 @@ def _key_pose(
     tilt, aside = 0.5 * stooped + rng.uniform(0, 0.05), rng.normal(0, 0.15)
     turn = kin.turned(y=heading + aside) @ kin.turned(x=tilt, z=stance.roll)
     rotations[Joint.PELVIS] = kin.rotation_vector(turn)
-    back = (
-        kin.turned(y=heading)
-        @ np.asarray([rng.normal(0, 0.02), 0, rng.normal(-0.08, 0.02)])
-        * build.leg
-    )
+    # the pelvis is a little behind the middle of the feet
+    offset = np.asarray([rng.normal(0, 0.02), 0, rng.normal(-0.08, 0.02)])
+    back = kin.turned(y=heading) @ offset * build.leg
     center = np.asarray(
         [0.5 * (feet[0].x + feet[1].x) + back[0], 0.0, 0.5 * (feet[0].z + feet[1].z) + back[2]]
     )
     height = kin.highest_pelvis(build, turn, center[0], center[2], feet, _SPARE) - sink
     kin.place_feet(build, rotations, np.asarray([center[0], height, center[2]]), feet)
     bend_trunk(rng, rotations, stance.lean + 1.2 * stooped, stance.roll)
+    # each arm takes the goal, of some, at which it is clearest of the body
     for side in (0, 1):
         best, best_clear = rotations, -np.inf
         for _ in range(_TRIES):

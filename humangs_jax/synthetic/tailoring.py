@@ -241,9 +241,12 @@ def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> n
 
 
 def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fit) -> Surface:
+    """The skin of a garment moved to where its cloth hangs."""
+    # a smooth surface at the distance of the ease
     below, arm, leg = (surface.attributes[name] for name in ("skin_point", "arm", "leg"))
     normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 2))
     points = smooth(below, surface.faces, 8, keep_hems=True) + fit.ease * normals
+    # on the trunk, out to the silhouettes of the slices above
     below_armpit = 1 - smoothstep(
         -0.03, 0.06, points[:, 1] - anatomy.joints[Joint.LEFT_SHOULDER, 1] + ARM_HEIGHT
     )
@@ -253,6 +256,7 @@ def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fi
     grown = radius + share * np.maximum(wanted - radius, 0)
     points = points.astype(np.float64)
     points[:, [0, 2]] *= (grown / np.maximum(radius, 1e-4))[:, None]
+    # on arms and legs, out to theirs, wider towards cuffs and hems
     for side, sign in ((0, 1), (1, -1)):
         boundary, along = anatomy.arms[side], np.abs(points[:, 0])
         start, end = boundary.levels[0] + 0.12, boundary.levels[-1] - 0.1
@@ -267,27 +271,26 @@ def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fi
             own = leg * (sign * points[:, 0] > 0)
             points = _push(points, (0, 2), points[:, 1], hanging(inner, fit.leg_hang), own, *wider)
     points = smooth(points, surface.faces, 3, keep_hems=True)
+    # smoother between the buttocks and below the belly
     x, y, _ = surface.template.T
     seat = np.exp(-((x / 0.045) ** 2)) * smoothstep(0.22, 0.28, -y) * (y > -0.5)
-    if seat.any():  # smoother between the buttocks and below the belly
-        points = points + seat[:, None] * (
-            smooth(points, surface.faces, 15, keep_hems=True) - points
-        )
+    if seat.any():
+        smoother = smooth(points, surface.faces, 15, keep_hems=True)
+        points = points + seat[:, None] * (smoother - points)
+    # folds, by coordinates that are as smooth as the points
     outer = surfaces.vertex_normals(points, surface.faces)
-    cloth = smooth(
-        surface.attributes["cloth"], surface.faces, 10, keep_hems=True
-    )  # as the points were
+    cloth = smooth(surface.attributes["cloth"], surface.faces, 10, keep_hems=True)
     template = smooth(surface.template, surface.faces, 8, keep_hems=True)
-    points = (
-        points
-        + _fold_heights(rng, sewn_coordinates(cloth, template), arm, leg, fit)[:, None] * outer
-    )
+    heights = _fold_heights(rng, sewn_coordinates(cloth, template), arm, leg, fit)
+    points = points + heights[:, None] * outer
+    # nothing comes nearer to the skin than what is worn below
     distance = np.sum((points - below) * surface.attributes["normals"], -1)
     least = max(0.55 * fit.ease, fit.inner)
     points = points + np.maximum(least - distance, 0)[:, None] * surface.attributes["normals"]
     hems = np.unique(surfaces.boundary_edges(surface.faces))
     points[hems] = smooth(points, surface.faces, 4, keep_hems=True)[hems]
-    side, thighs = np.sign(x), leg > 0.6  # trouser legs do not cross the middle
+    # trouser legs do not cross the middle
+    side, thighs = np.sign(x), leg > 0.6
     points[:, 0] = np.where(thighs, side * np.maximum(side * points[:, 0], 0.004), points[:, 0])
     return surface.moved(points).with_attributes(cloth=cloth, template=template)
 
