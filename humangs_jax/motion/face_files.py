@@ -339,7 +339,9 @@ def _weight_tracks(content: dict[str, Any], binary: bytes, animation: Mapping[st
     found: list[Weights] = []
     channels = [each for each in animation["channels"] if each["target"]["path"] == "weights"]
     if len(channels) > _MOST_COLUMNS:
-        raise InvalidFileError(f"{len(channels)} meshes with weights: expected at most {_MOST_COLUMNS}")
+        raise InvalidFileError(
+            f"{len(channels)} meshes with weights: expected at most {_MOST_COLUMNS}"
+        )
     for channel in channels:
         node = content["nodes"][channel["target"]["node"]]
         mesh = content["meshes"][node["mesh"]]
