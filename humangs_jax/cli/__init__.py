@@ -104,6 +104,7 @@ def execute(arguments: Sequence[str]) -> int:
     from humangs_jax.cli.options import check_options
     from humangs_jax.core import progress
 
+    # options of every command are taken out first
     screen.heard.clear()
     everywhere = {"--quiet", "--verbose", "--version"}
     given = everywhere & set(arguments)
@@ -121,9 +122,8 @@ def execute(arguments: Sequence[str]) -> int:
         sys.stdout.flush()
         return 0
     except BrokenPipeError:
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # Python flushes once more at its end
+        # Python flushes once more at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except KeyboardInterrupt:
         return _interrupted()
@@ -132,18 +132,17 @@ def execute(arguments: Sequence[str]) -> int:
             return _interrupted()
         if isinstance(error, ValueError | OSError):
             return _failed(error, verbose)
-        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(
-            error
-        ):  # numpy; XLA, whose text has many lines
-            return _failed(
-                MemoryError(f"out of memory: {(str(error).splitlines() or [''])[0]}"), verbose
-            )
+        # numpy; XLA, whose text has many lines
+        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+            lines = str(error).splitlines() or [""]
+            return _failed(MemoryError(f"out of memory: {lines[0]}"), verbose)
         raise
     finally:
         progress.end()
 
 
 def _prepare(verbose: bool) -> None:
+    """What a whole program needs before JAX is imported: Ctrl-C, silence, memory and caches."""
     from humangs_jax.cli.screen import end_within_seconds, silence
 
     end_within_seconds()
@@ -173,6 +172,7 @@ def _parsed(arguments: list[str]) -> Command:
     from humangs_jax.cli.options import UsageError, described, option_names
     from humangs_jax.cli.parsing import parsed
 
+    # completion needs the options of all commands
     name, *options = arguments
     if name == "--tyro-print-completion" or name == "--tyro-write-completion":
         import tyro
@@ -187,6 +187,7 @@ def _parsed(arguments: list[str]) -> Command:
         if near:
             hint = f"did you mean {near[0]!r}?"
         raise UsageError(f"{name!r} is no command: {hint}")
+    # unknown options are refused by name before tyro sees the words
     command = described(_command(name))
     known = option_names(command) | {"--help"}
     for word in options:
@@ -198,10 +199,10 @@ def _parsed(arguments: list[str]) -> Command:
             near = difflib.get_close_matches(option, known, n=1)
             hint = f": did you mean {near[0]}?" if near else ""
             raise UsageError(f"{option}: no option of humangs {name}{hint}")
+    # --help ends with examples
     words = 2 if arguments[:2] == ["import", "cameras"] else 1
-    typed = " ".join(arguments[:words])
     try:
-        return parsed(command, typed, options)
+        return parsed(command, " ".join(arguments[:words]), options)
     except SystemExit:
         say("\n".join(["examples:", *(f"  {example}" for example in command.examples)]))
         raise

@@ -109,6 +109,7 @@ def _value_after(words: Sequence[str], option: str) -> str:
 
 
 def _wrong_value(command: type[Any], option: str, given: str) -> str:
+    """A value that an option does not take: what it takes, and the nearest word or the default."""
     choices = _choices(_kind(command, option))
     near = difflib.get_close_matches(given, choices, n=1)
     if near:

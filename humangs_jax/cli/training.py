@@ -215,6 +215,7 @@ class Train:
             from humangs_jax.training.loop import TrainingInterrupted, train
             from humangs_jax.training.sources import people_on_disk, training_people
 
+            # losses whose networks are missing leave the configuration
             files = self.networks
             asked = read_config(self.config)
             installed = bool(asked.loss.lpips or asked.loss.vgg16)
@@ -224,6 +225,7 @@ class Train:
             settings = fitting_losses(asked, networks)
             if self.steps is not None:
                 settings = dataclasses.replace(settings, steps=self.steps)
+            # the network of given weights, drawn as it was trained
             variables = None
             if self.init_weights is not None:
                 variables, model = load_weights(self.init_weights)
@@ -244,6 +246,7 @@ class Train:
                 )
             tell(diagnosis)
             return
+        # all is saved when it is interrupted: the same command goes on
         interrupted = None
         with stage("training"):
             fsdp, out = self.fsdp, self.out
@@ -258,7 +261,7 @@ class Train:
                     networks=networks,
                     fsdp=fsdp,
                 )
-            except TrainingInterrupted as stopped:  # all is saved, the same command goes on
+            except TrainingInterrupted as stopped:
                 state, interrupted = stopped.state, stopped
         done = None if state is None else int(state.step)
         wrote(self.out, f"{done} of {settings.steps} steps; weights.safetensors, log.jsonl")

@@ -116,6 +116,7 @@ def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
 
 
 def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
+    """The person of a number, or the only one. Raises: MotionError, which lists the people."""
     names = [person.name for person in people]
     if number is None and len(people) == 1:
         return people[0]
@@ -139,6 +140,7 @@ def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
 
 
 def _frames(person: Person) -> int:
+    """In how many frames the person is."""
     form = format_of(person.values)
     if form:
         return max(len(np.atleast_1d(as_array(person.values[key]))) for key in form.keys)
@@ -150,16 +152,21 @@ def _frames(person: Person) -> int:
 
 
 def _posed(file: "_MotionFile", form: ArrayKeys) -> _Rotations:
+    """The rotations of all joints, from those of its parts: the first key says how many frames
+    there are.
+    """
     rotations: _Rotations | None = None
     for place, key in form.poses.items():
         if rotations is not None and key not in file.values:
             continue
         values = file.numbers(key, None)
+        # a single pose has no axis of frames
         if rotations is None:
             single = values.ndim == 1 or (
                 place == "root" and values.shape == (3, 3) and are_rotations(values)
             )
             rotations = np.zeros((1 if single else len(values), len(JOINT_NAMES), 3))
+        # a row of numbers a frame, or none where the frames are not those of the others
         count = len(rotations)
         if count == 1 or len(np.atleast_1d(values)) == count:
             flat = values.reshape(count, -1)
@@ -169,13 +176,11 @@ def _posed(file: "_MotionFile", form: ArrayKeys) -> _Rotations:
             part = _all(file, form, key, values, flat)
         else:
             part = _part(file, place, key, values, flat)
-        if (
-            form.pivot == "origin" and place == "all"
-        ):  # the root's own rotation, before that about the origin
+        # the root's own rotation comes before that about the origin
+        if form.pivot == "origin" and place == "all":
             part = part.copy()
-            part[:, 0] = (
-                Rotation.from_rotvec(rotations[:, 0]) * Rotation.from_rotvec(part[:, 0])
-            ).as_rotvec()
+            about, own = (Rotation.from_rotvec(turns[:, 0]) for turns in (rotations, part))
+            part[:, 0] = (about * own).as_rotvec()
         first = PLACES[place][0]
         rotations[:, first : first + part.shape[1]] = part
     assert rotations is not None
@@ -189,6 +194,7 @@ def _part(
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
 ) -> _Rotations:
+    """The rotations of a part of the body. Raises: MotionError for another number of joints."""
     most, (count, width) = PLACES[place][1], flat.shape
     of_smpl = place in ("limbs", "body")
     counts = (most, most + 2) if of_smpl else (most,)
@@ -215,20 +221,24 @@ def _all(
     fingers.
     """
     count, width = flat.shape
-    if form.pivot == "head" and width == 3 * 53:  # root, body, hands and jaw
+    # layouts of single programs: root, body, hands and jaw; without the root; with coefficients of
+    # hands
+    if form.pivot == "head" and width == 3 * 53:
         pose = flat.reshape(count, 53, 3)
         return np.concatenate(
             [pose[:, :22], pose[:, 52:], np.zeros_like(pose[:, :2]), pose[:, 22:52]], axis=1
         )
-    if form.pivot == "origin" and width == 69:  # without the root
+    if form.pivot == "origin" and width == 69:
         return np.pad(flat, ((0, 0), (3, 0))).reshape(count, -1, 3)[:, :22]
-    if form.pivot == "origin" and width in (78, 87):  # with coefficients of hands
+    if form.pivot == "origin" and width in (78, 87):
         file.notes.append(_NO_HANDS.format(6))
         return np.concatenate([flat[:, :66], flat[:, 78:]], axis=1).reshape(count, -1, 3)
+    # axis-angles or matrices of the joints of a body model
     if width in (75, *COLUMNS, *(3 * number for number in COLUMNS)):
         joints = width // 3 if width in (75, *COLUMNS) else width // 9
         pose = _axis_angles(file, key, flat, joints)
-        if joints < 52:  # the last two of 24 are whole hands, the last three of 25 jaw and eyes
+        # the last two of 24 are whole hands, the last three of 25 jaw and eyes
+        if joints < 52:
             return pose if joints == 25 else pose[:, :22]
         if joints == len(JOINT_NAMES):
             face = pose[:, 22:25]
@@ -247,6 +257,7 @@ def _all(
 def _axis_angles(
     file: "_MotionFile", key: str, flat: Float[np.ndarray, "m columns"], joints: int
 ) -> _Rotations:
+    """Axis-angles of axis-angles or matrices. Raises: MotionError where these are no rotations."""
     if flat.shape[1] == 3 * joints:
         return flat.reshape(len(flat), joints, 3)
     matrices = flat.reshape(-1, 3, 3)
@@ -267,19 +278,20 @@ def _placed(
     file: "_MotionFile", form: ArrayKeys, rotations: _Rotations
 ) -> Float[np.ndarray, "m 3"]:
     """(m, 3) translations; turns roots where cameras or the format's convention ask for it."""
+    # a file may have no positions
     count, key = len(rotations), file.first(form.moves)
     if key not in file.values and form.stays and key not in file.pickled:
         file.notes.append(NO_PLACES.format(", ".join(form.moves[:3])))
         return np.zeros((count, 3))
+    # a weak perspective: scales, then metres beside the axis
     moves = file.numbers(key, None)
-    if (
-        moves.size == 4 * count and moves.shape[0] == count
-    ):  # a weak perspective: scales, then metres beside the axis
+    if moves.size == 4 * count and moves.shape[0] == count:
         file.notes.append(f"{key} does not tell how far away people are: they stay at one distance")
         moves = np.concatenate([moves.reshape(count, 4)[:, 2:], np.zeros((count, 1))], axis=1)
     if moves.size != 3 * count or moves.shape[-1] != 3 or (count > 1 and len(moves) != count):
         raise MotionError(file.path, key, f"expected shape ({count}, 3), got {moves.shape}")
     moves = moves.reshape(count, 3)
+    # in metres
     if form.scaling is not None:
         scale = MILLIMETRES
         if form.scaling in file.values:
@@ -287,26 +299,22 @@ def _placed(
         if not scale > 0:
             raise MotionError(file.path, form.scaling, f"expected a positive number, got {scale}")
         moves = moves / scale
+    # of the pelvis, from those of the origin, the pelvis or the head
     if form.pivot == "origin":
-        return (
-            moves
-            + Rotation.from_rotvec(file.numbers(form.poses["root"], None).reshape(count, 3)).apply(
-                PELVIS
-            )
-            - PELVIS
-        )
+        root = file.numbers(form.poses["root"], None).reshape(count, 3)
+        return moves + Rotation.from_rotvec(root).apply(PELVIS) - PELVIS
     if form.pivot == "joint":
         moves = moves - PELVIS
     if form.pivot == "head":
         joints = skeleton.shipped_joints()
         moves = moves - joint_places(joints, rotations, np.zeros((count, 3)))[:, _HEAD]
+    # from the axes of a camera that moves to those of the world
     camera = _cameras(file, count)
     if camera is None:
         return moves
     turns, places = camera
-    rotations[:, 0] = (
-        Rotation.from_matrix(turns) * Rotation.from_rotvec(rotations[:, 0])
-    ).as_rotvec()
+    root = Rotation.from_rotvec(rotations[:, 0])
+    rotations[:, 0] = (Rotation.from_matrix(turns) * root).as_rotvec()
     return np.einsum("mab,mb->ma", turns, moves + PELVIS) + places - PELVIS
 
 
@@ -448,6 +456,10 @@ def _clip_of_points(file: Any, fps: float) -> Clip:
 def _of_frames(
     file: Any, key: str, shape: tuple[int, ...], count: int | None = None
 ) -> Float[np.ndarray, "m ..."]:
+    """Numbers of a shape for each frame; one frame, or an axis of one person, is accepted.
+
+    Raises: the file's error, naming the key.
+    """
     values = file.numbers(key, None)
     if values.size == np.prod(shape):
         values = values.reshape(1, *shape)

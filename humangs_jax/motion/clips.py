@@ -13,7 +13,7 @@ linearly.
 """
 
 import re
-from collections.abc import Container, Sequence
+from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,20 +88,23 @@ def read_bvh(path: Path, options: object = None) -> Clip:
 def _tree(
     text: str,
 ) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "s 3"], list[list[str]]]:
+    """Names, parents, offsets and channels of the joints that a file begins with.
+
+    Raises: InvalidFileError.
+    """
+    # each word, and the name behind ROOT, JOINT and End
     found = _WORD.finditer(text, len("HIERARCHY") + text.index("HIERARCHY"))
-    words = ((match[1] or match[0], match[2]) for match in found)  # and the name that follows
-
-    def number():
-        return _number(next(words)[0])
-
+    words = ((match[1] or match[0], match[2]) for match in found)
     names, parents, offsets, channels = [], [], [], []
-    open_joints, waiting = [], None  # of the braces that are open; None for the end of a limb
+    # joints whose braces are open, None for the end of a limb; and what waits for its brace
+    open_joints, waiting = [], None
     try:
         for word, name in words:
             here = open_joints[-1] if open_joints else None
             if name is not None:
                 waiting = (word, " ".join(name.split()))
             elif word == "{" and waiting is not None:
+                # a joint begins, or the end of a limb, which is none
                 if waiting[0] == "End":
                     open_joints.append(None)
                 else:
@@ -115,24 +118,16 @@ def _tree(
             elif word == "}" and open_joints:
                 open_joints.pop()
             elif word == "OFFSET" and open_joints:
-                offset = np.asarray([number() for _ in range(3)])
+                offset = np.asarray([_number(next(words)[0]) for _ in range(3)])
                 if here is not None:
                     offsets[here] = offset
             elif word == "CHANNELS" and here is not None:
-                amount = number()
-                channels[here] = [
-                    next(words)[0].lower() for _ in range(int(min(max(amount, 0), 7)))
-                ]
-                if amount != len(channels[here]) or any(
-                    name not in _CHANNELS for name in channels[here]
-                ):
-                    raise InvalidFileError(
-                        f"joint {names[here]}: expected up to 6 channels such as Xrotation"
-                    )
+                channels[here] = _channels(words, names[here])
             else:
                 raise InvalidFileError(f"unknown word {word}")
     except StopIteration:
         raise InvalidFileError("cut short") from None
+    # what a whole tree has
     if open_joints or waiting is not None or not names:
         what = "a brace of the joints is open" if names else "no joints"
         raise InvalidFileError(f"cut short: {what}")
@@ -141,7 +136,20 @@ def _tree(
     return tuple(names), tuple(parents), np.stack(offsets), channels
 
 
+def _channels(words: Iterator[tuple[str, str | None]], joint: str) -> list[str]:
+    """The channels of a joint, in lower case, from the words behind CHANNELS.
+
+    Raises: InvalidFileError; StopIteration where the words end.
+    """
+    amount = _number(next(words)[0])
+    channels = [next(words)[0].lower() for _ in range(int(min(max(amount, 0), 7)))]
+    if amount != len(channels) or not set(channels) <= set(_CHANNELS):
+        raise InvalidFileError(f"joint {joint}: expected up to 6 channels such as Xrotation")
+    return channels
+
+
 def _number(word: str) -> float:
+    """A finite number. Raises: InvalidFileError."""
     try:
         value = float(word)
     except ValueError:
@@ -152,6 +160,7 @@ def _number(word: str) -> float:
 
 
 def _numbers(text: str) -> Float[np.ndarray, " n"]:
+    """All numbers of the frames. Raises: InvalidFileError."""
     try:
         values = np.fromstring(text, np.float64, sep=" ")
     except ValueError as error:
@@ -169,6 +178,7 @@ def _posed(
     channels: list[list[str]],
     numbers: Float[np.ndarray, "m n"],
 ) -> tuple[Float[np.ndarray, "m s 3 3"], Float[np.ndarray, "m s 3"]]:
+    """Rotations (m, s, 3, 3) and places (m, s, 3) of the joints in the world."""
     frames = len(numbers)
     turns, moves = np.empty((frames, len(parents), 3, 3)), np.empty((frames, len(parents), 3))
     at = 0
@@ -304,6 +314,7 @@ def _joints(
 
 
 def _next_joint(parents: Sequence[int], joint: int, joints: Container[int]) -> int:
+    """The nearest of the joints above a joint; -1 for none."""
     joint = parents[joint]
     while joint != -1 and joint not in joints:
         joint = parents[joint]
@@ -313,6 +324,7 @@ def _next_joint(parents: Sequence[int], joint: int, joints: Container[int]) -> i
 def _tracks(
     content: dict[str, Any], binary: bytes, animation: dict[str, Any], wanted: Container[int]
 ) -> Tracks:
+    """What moves the wanted nodes, by node and path. Raises: InvalidFileError."""
     tracks: dict[tuple[int, str], Any] = {}
     for channel in animation["channels"]:
         node, path = channel["target"].get("node"), channel["target"]["path"]

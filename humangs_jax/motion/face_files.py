@@ -216,6 +216,7 @@ def _scores_of(frame: Any, depth: int) -> dict[str, float]:
     """
     if depth > _DEEPEST:
         return {}
+    # an object of scores, a list of categories, or either further inside
     if isinstance(frame, dict):
         named = {arkit_name(str(name)): value for name, value in frame.items()}
         named.pop(None, None)

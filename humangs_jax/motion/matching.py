@@ -93,6 +93,7 @@ def _plain(names: Sequence[str]) -> list[str]:
 
 
 def _named(plain: Sequence[str]) -> dict[str, int]:
+    """Our joints by known names; a joint of the file is taken once, by the first that wants it."""
     source: dict[str, int] = {}
 
     def find(ours: str, theirs: Sequence[str]) -> None:
@@ -224,6 +225,7 @@ def _sided(
     chest: int,
     arms: _Pair,
 ) -> dict[str, int]:
+    """Limbs as our joints: left and right by their names, else by where they are in space."""
     up = unit(posed[chest] - posed[pelvis])
     toes = [posed[leg[3]] - posed[leg[2]] for leg in legs if len(leg) > 3]
     forward = np.sum(toes, axis=0) if toes else np.array([0.0, 0, 1])
@@ -264,6 +266,7 @@ def _side(plain: Sequence[str], limb: Sequence[int]) -> str:
 
 
 def _match_toes(source: dict[str, int], parents: Sequence[int], rest: _Places) -> None:
+    """Where the toes have no known name: what is furthest from the ankle below it."""
     for side in SIDES:
         ankle = source[f"{side}_ankle"]
         below = [

@@ -112,6 +112,11 @@ def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
 
 
 def _files(folder: Path) -> list[Path]:
+    """The files of a motion in a folder, in the order of the numbers in their names.
+
+    Raises: InvalidFileError for none.
+    """
+
     def natural(file):
         return [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
 
@@ -134,6 +139,7 @@ def _numbers(file: Path) -> list[str]:
 
 
 def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
+    """The people of a file: of lists of people by frame, or anywhere in its content."""
     frames = _listed_frames(content)
     if frames is not None:
         return _stacked([(f"frame {i}", each) for i, each in enumerate(frames)])
@@ -144,6 +150,7 @@ def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
 
 
 def _found(content: Any, name: str, depth: int) -> list[Person]:
+    """The people in some content. name: where it names none; depth: levels above it."""
     content = objects(content)
     if depth > _DEEPEST:
         return []
@@ -245,6 +252,7 @@ def _off_rotations(array: np.ndarray) -> float:
 
 
 def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
+    """Numbers of the frames in which a person was seen; None where they are not told."""
     key = _first(_FRAMES, values)
     if key is None:
         return None
