@@ -154,9 +154,12 @@ def check(small: bool) -> Iterator[Measurement]:
             *(jax.tree_util.tree_leaves_with_path(found[name]) for name in ("device", "CPU")),
             strict=True,
         )
-        relative = lambda a, b: float(
-            np.linalg.norm(np.float64(a) - b) / (np.linalg.norm(np.float64(b)) + 1e-300)
-        )
+
+        def relative(a, b):
+            return float(
+                np.linalg.norm(np.float64(a) - b) / (np.linalg.norm(np.float64(b)) + 1e-300)
+            )
+
         return {
             jax.tree_util.keystr(path, simple=True, separator="."): relative(a, b)
             for (path, a), (_, b) in pairs
@@ -250,7 +253,10 @@ def reconstructed(small: bool) -> Iterator[Measurement]:
 
     def measure(refined):
         (variables, config), capture, times = load_weights(), load_capture(DEMO_CAPTURE), {}
-        first = lambda: reconstruct(variables, config, capture)
+
+        def first():
+            return reconstruct(variables, config, capture)
+
         run = functools.partial(refine, first(), capture, steps=0) if refined else first
         for which in ("first", "second"):
             began = perf_counter()
@@ -310,7 +316,10 @@ def frames(small: bool) -> Iterator[Measurement]:
     def measure(size: int) -> dict[str, Any]:
         avatar = reconstruct(*load_weights(), load_capture(DEMO_CAPTURE))
         motion = load_motion()
-        draw = lambda: list(motion_frames(avatar, motion, FrameSettings(size=size), progress=False))
+
+        def draw():
+            return list(motion_frames(avatar, motion, FrameSettings(size=size), progress=False))
+
         wall = float(medians({"all": draw}, 1)["all"][0])
         return {"frames a second": 1e3 * len(motion.translations) / wall}
 
@@ -327,9 +336,15 @@ def published_network(small: bool) -> Iterator[Measurement]:
         inputs = benchmark_inputs(config, 4, config.conventions.image_size)
         config, _, _ = foreground(inputs, config)
         together = jax.tree.map(lambda x: jnp.stack([x] * batch), inputs)
-        each = lambda x: apply_humangs(variables, x, config)[0].gaussians
+
+        def each(x):
+            return apply_humangs(variables, x, config)[0].gaussians
+
         make = jax.jit(jax.vmap(each))
-        run = lambda: jax.block_until_ready(make(together))
+
+        def run():
+            return jax.block_until_ready(make(together))
+
         wall = float(medians({"all": run}, 1 if small else 5)["all"][0])
         return {"ms": wall, "people a second": 1e3 * batch / wall}
 

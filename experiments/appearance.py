@@ -170,10 +170,15 @@ def scores_of(
     images: np.ndarray, alpha: np.ndarray, truth: Any, networks: dict[str, Any]
 ) -> dict[str, float]:
     masks, errors = truth.masks, np.square(np.clip(images, 0, 1) - truth.images).mean(-1)
-    decibels = lambda squared: float(-10 * np.log10(np.maximum(squared, 1e-10)).mean())
-    faces = lambda images: np.stack(
-        [details(image, truth, i)[0] for i, image in enumerate(images)]
-    ).astype(np.float32)
+
+    def decibels(squared):
+        return float(-10 * np.log10(np.maximum(squared, 1e-10)).mean())
+
+    def faces(images):
+        return np.stack([details(image, truth, i)[0] for i, image in enumerate(images)]).astype(
+            np.float32
+        )
+
     heads = faces(images), faces(truth.images)
     found = {
         "psnr": decibels(errors.mean((1, 2))),

@@ -88,8 +88,13 @@ def bodies_table(bodies: dict[str, Any]) -> str:
     columns = {key: COLUMNS[key] for key in keys}
     header = ["body", "vertices", "that carry Gaussians"]
     header += [f"{TASKS[task]}: {heading}" for task in tasks for heading, _ in columns.values()]
-    facts = lambda body: [body.get("body_vertices", "-"), body.get("vertices", "-")]
-    scores = lambda body: [number for task in tasks for number in cells(body[task], columns)]
+
+    def facts(body):
+        return [body.get("body_vertices", "-"), body.get("vertices", "-")]
+
+    def scores(body):
+        return [number for task in tasks for number in cells(body[task], columns)]
+
     return markdown_table(
         header, [[name, *facts(body), *scores(body)] for name, body in bodies.items()]
     )
@@ -157,9 +162,8 @@ def turned_subdivision(body: BodyModel) -> BodyModel:
     # each side gives the triangle at its own tail; its twin gives the one at the other end
     turned = np.stack([tails, across, middles], axis=-1)
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
-    linear = {
-        name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None
-    }
+    linear = {name: getattr(body, name) for name in names if getattr(body, name) is not None}
+    linear = {name: np.asarray(value) for name, value in linear.items()}
     grown = {name: np.concatenate([x, x[faces].mean(axis=1)]) for name, x in linear.items()}
     return replace(
         body,

@@ -318,14 +318,20 @@ def triangulate(
     quads: np.ndarray, uv_quads: np.ndarray, vertices: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cut each quad along its shorter diagonal."""
-    diagonal = lambda a, b: np.linalg.norm(vertices[quads[:, a]] - vertices[quads[:, b]], axis=1)
+
+    def diagonal(a, b):
+        return np.linalg.norm(vertices[quads[:, a]] - vertices[quads[:, b]], axis=1)
+
     first = (diagonal(0, 2) <= diagonal(1, 3) * (1 + 1e-6))[:, None]
-    cut = lambda q: np.concatenate(
-        [
-            np.where(first, q[:, [0, 1, 2]], q[:, [0, 1, 3]]),
-            np.where(first, q[:, [0, 2, 3]], q[:, [1, 2, 3]]),
-        ]
-    )
+
+    def cut(q):
+        return np.concatenate(
+            [
+                np.where(first, q[:, [0, 1, 2]], q[:, [0, 1, 3]]),
+                np.where(first, q[:, [0, 2, 3]], q[:, [1, 2, 3]]),
+            ]
+        )
+
     return cut(quads), cut(uv_quads)
 
 

@@ -230,12 +230,11 @@ def moved_by(capture, centimeters: float):
 
 def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
     """The mask dilated, or eroded below 0."""
+    if pixels == 0:
+        return mask
+    change = ndimage.grey_dilation if pixels > 0 else ndimage.grey_erosion
     side = 2 * abs(pixels) + 1
-    return (
-        mask
-        if pixels == 0
-        else (ndimage.grey_dilation if pixels > 0 else ndimage.grey_erosion)(mask, (side, side))
-    )
+    return change(mask, (side, side))
 
 
 @change

@@ -54,7 +54,10 @@ class Costs:
 
     def times(self, count: int) -> "Costs":
         """That often."""
-        often = lambda counter: Counter({key: count * number for key, number in counter.items()})
+
+        def often(counter):
+            return Counter({key: count * number for key, number in counter.items()})
+
         return Costs(
             count * self.dots,
             count * self.convolutions,

@@ -231,19 +231,17 @@ def walked(call: Callable[[], object], *datum: type) -> list[str]:
     pytrees apart.
     """
     root, found = str(REPOSITORY / PACKAGE), {}
-    holds = lambda value: (
-        isinstance(value, datum)
-        or any(
-            isinstance(each, (*datum, tuple)) and holds(each)
-            for each in (
-                value.values()
-                if isinstance(value, dict)
-                else value
-                if isinstance(value, tuple | list)
-                else ()
-            )
+
+    def holds(value):
+        """Whether a value is the datum, or a tuple, list or dict of it."""
+        inside = ()
+        if isinstance(value, dict):
+            inside = value.values()
+        elif isinstance(value, tuple | list):
+            inside = value
+        return isinstance(value, datum) or any(
+            isinstance(each, (*datum, tuple)) and holds(each) for each in inside
         )
-    )
 
     def watch(frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
@@ -288,16 +286,25 @@ def all_walks() -> dict[str, list[str]]:
     body, views = gaussian_body(capture.body, config.model), to_network_views(capture, 32)
     batch = jax.tree.map(lambda x: x[None], Example(views, hg.replace(views, depths=views.masks)))
     avatar: list[hg.Avatar] = []
-    photos = lambda: avatar.append(hg.reconstruct(state.variables, config.model, capture))
+
+    def photos():
+        return avatar.append(hg.reconstruct(state.variables, config.model, capture))
+
     found = {
         "walk: photos through reconstruct": walked(
             photos, hg.Capture, PreparedCapture, SubjectViews, HumanGSInputs
         )
     }
     gaussians = hg.animate(avatar[0], capture.pose(0))
-    image = lambda: hg.render(gaussians, capture.cameras[0])
+
+    def image():
+        return hg.render(gaussians, capture.cameras[0])
+
     found["walk: Gaussians through render"] = walked(image, hg.Gaussians)
-    loss = lambda: jax.eval_shape(lambda state: step.train_step(state, batch, body, config), state)
+
+    def loss():
+        return jax.eval_shape(lambda state: step.train_step(state, batch, body, config), state)
+
     traced = jax.jit(step.update, static_argnames=("config", "mesh"))
     with mock.patch.object(
         step, "compiled_update", lambda: traced

@@ -190,9 +190,12 @@ def other_day(subject: SyntheticSubject, rng: np.random.Generator) -> Lights:
 def together(photos: Sequence[Capture]) -> Capture:
     """Captures of one photo each as one capture, with a frame for each."""
     first = photos[0]
-    joined = lambda name: jax.tree.map(
-        lambda *leaves: np.concatenate(leaves), *(getattr(photo, name) for photo in photos)
-    )
+
+    def joined(name):
+        return jax.tree.map(
+            lambda *leaves: np.concatenate(leaves), *(getattr(photo, name) for photo in photos)
+        )
+
     return dataclasses.replace(
         first,
         images=joined("images"),

@@ -54,7 +54,10 @@ def first_run(
         }
         with tempfile.TemporaryDirectory() as folder:
             root = Path(folder)
-            measure = lambda case: lambda: measured(root / case[0].name, *case, small)
+
+            def measure(case):
+                return lambda: measured(root / case[0].name, *case, small)
+
             rows = run.rows({name: measure(case) for name, case in cases.items()}, {"small": small})
     run.show(table_of(rows), rows)
     if run.publish:

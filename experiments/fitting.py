@@ -97,7 +97,10 @@ def walking(model, seed) -> FitCase:
     azimuths = rng.uniform(0, 2 * np.pi) + np.arange(4) * (2 * np.pi / 4)
     K, middle = intrinsics_from_fov(1.0, SIZE, SIZE), jnp.asarray(joints.mean((0, 1)))
     cameras = orbit(middle, 3.4, jnp.asarray(azimuths, jnp.float32), 0.15, K, SIZE, SIZE)
-    still = lambda array: np.broadcast_to(np.asarray(array), (FRAMES, *array.shape))
+
+    def still(array):
+        return np.broadcast_to(np.asarray(array), (FRAMES, *array.shape))
+
     return FitCase(
         betas,
         rotations,
@@ -255,9 +258,10 @@ def landmark_errors(model, people, seen, fit) -> dict:
     from one view.
     """
     truth, known = np.stack([case.landmarks for case in people]), np.asarray(model.known)
-    off = lambda points: float(
-        1000 * np.linalg.norm(np.asarray(points) - truth, axis=-1)[..., known].mean()
-    )
+
+    def off(points):
+        return float(1000 * np.linalg.norm(np.asarray(points) - truth, axis=-1)[..., known].mean())
+
     found = {"mean_landmark_error_mm": off(fit.landmarks)}
     if seen.points.shape[2] > 1:
         plain, robust = (
@@ -326,9 +330,12 @@ def fit_sequences(
         for way, s in ways.items()
     }
     rows = run.rows(each, {"people": people, "kind": ALL})
-    show = lambda value: (
-        "-" if value is None else f"{value:.0f}" if value >= 99.5 else f"{value:.1f}"
-    )
+
+    def show(value):
+        if value is None:
+            return "-"
+        return f"{value:.0f}" if value >= 99.5 else f"{value:.1f}"
+
     keys = {"others_mm": "frames left alone", "spoilt_mm": "spoilt", "tremble_mm": "acceleration"}
     table = [
         [name, *(show(rows[f"{name}: {way}"][key]) for key in keys for way in ways)]

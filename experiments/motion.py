@@ -168,7 +168,10 @@ def motion_fingers(run: Run, people: int = 1, poses: int = 2) -> None:
         for name, kind in (("without", MEDIAPIPE_33), ("with", MEDIAPIPE_69)):
             columns = [columns_of(seen, kind is MEDIAPIPE_69) for seen, _ in rows]
             columns = np.asarray(columns).reshape(poses, len(HAND_VIEWS), len(kind.names), 6)
-            stacked = lambda x: np.asarray(x).reshape(poses, len(HAND_VIEWS), *x[0].shape)
+
+            def stacked(x):
+                return np.asarray(x).reshape(poses, len(HAND_VIEWS), *x[0].shape)
+
             observations = make_observations(
                 columns[..., :2] + 0.5,
                 columns[..., 2],
@@ -203,7 +206,10 @@ def finger_errors(joints, truth):
     """
     found = []
     for side in ("left", "right"):
-        number = lambda name, side=side: JOINT_NAMES.index(f"{side}_{name}")
+
+        def number(name, side=side):
+            return JOINT_NAMES.index(f"{side}_{name}")
+
         palm = [number("wrist"), *(number(f"{each}1") for each in FINGERS if each != "thumb")]
         fingers = [number(f"{each}{k}") for each in FINGERS for k in (2, 3)]
         middle, true_middle = joints[palm].mean(0), truth[palm].mean(0)

@@ -72,7 +72,10 @@ def page(run: Run, size: int = 512, frames: int = 20) -> None:
             for name, each in avatars.items()
         ]
     header = ["", *(f"{row['gaussians']:,} Gaussians" for row in rows)]
-    show = lambda row, key: f"{row[key] / 1e6:.2f}" if key == "bytes" else f"{row[key]:.1f}"
+
+    def show(row, key):
+        return f"{row[key] / 1e6:.2f}" if key == "bytes" else f"{row[key]:.1f}"
+
     lines = [[label.format(size=size), *(show(row, key) for row in rows)] for label, key in SHOWN]
     run.show(markdown_table(header, lines), {"size": size} | dict(zip(avatars, rows, strict=True)))
 

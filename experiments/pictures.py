@@ -132,7 +132,8 @@ def readme_pictures(
     person, photos = Avatar.load(avatar), load_capture("demo_capture")
     shot = FrameSettings(size=size, azimuth=0.0)
 
-    drawn = lambda pose, shot: next(images(person, *turntable_views(person, pose, 1, shot), shot))
+    def drawn(pose, shot):
+        return next(images(person, *turntable_views(person, pose, 1, shot), shot))
 
     def posed(turns: Mapping[str, tuple[float, float, float]]) -> BodyPose:
         rotations = np.zeros((len(person.parents), 3), np.float32)

@@ -55,10 +55,13 @@ def evaluation_views(
             score_tasks(x, truth, start.lpips)
             for x in (drawn, draw_painted_body(painted_body(inputs), truth))
         )
-        compared = lambda task: {
-            f"baseline_{name}": baseline[task][name]
-            for name in ("psnr", "ssim", "psnr_fg", "lpips")
-        }
+
+        def compared(task):
+            return {
+                f"baseline_{name}": baseline[task][name]
+                for name in ("psnr", "ssim", "psnr_fg", "lpips")
+            }
+
         return {task: ours[task] | compared(task) for task in ours}
 
     chosen = 4 if 4 in views else max(views)

@@ -45,7 +45,9 @@ class Stage:
 
 def stages(out: Path, small: bool) -> list[Stage]:
     """The list, the most wanted first. small: for a rehearsal on a CPU."""
-    stage_of = lambda name: ("accelerator", "--stage", name, *(["--small"] * small))
+
+    def stage_of(name):
+        return ("accelerator", "--stage", name, *(["--small"] * small))
 
     def measure(name: str, seconds: float) -> Stage:
         return Stage(name, (*stage_of(name), "--json", str(out / f"{name}.json")), seconds)

@@ -219,7 +219,10 @@ def prepare(
 def _load(file, frame):
     with np.load(file) as stored:
         data = {name: stored[name] for name in stored.files}
-    as_share = lambda name: data[name].astype(np.float32) / 255
+
+    def as_share(name):
+        return data[name].astype(np.float32) / 255
+
     cameras = [
         Camera.from_opencv(K, m, SIZE, SIZE)
         for K, m in zip(data["K"], data["cam_from_world"], strict=True)
@@ -311,7 +314,10 @@ def careful_mask(
     """Where a photo differs from the background, and is no shadow, near BlazePose's mask; that mask
     where nothing is known.
     """
-    smooth = lambda image: ndimage.gaussian_filter(image, (1.0, 1.0, 0))
+
+    def smooth(image):
+        return ndimage.gaussian_filter(image, (1.0, 1.0, 0))
+
     ours, theirs = smooth(photo), smooth(room)
     different = np.abs(ours - theirs).max(-1) > DIFFERENT
     ratio = (ours + 0.02) / (theirs + 0.02)

@@ -120,7 +120,10 @@ def with_body_off(subject: Any, millimetres: float) -> Any:
         return subject
     poses, betas = subject.photos.poses[:1], subject.photos.betas
     poses, betas = body_off(poses, betas, millimetres, subject.seed)
-    moved = lambda capture: dataclasses.replace(capture, poses=poses, betas=betas)
+
+    def moved(capture):
+        return dataclasses.replace(capture, poses=poses, betas=betas)
+
     still = subject.held_out.select(task_views(subject.held_out)["novel"])
     return dataclasses.replace(subject, photos=moved(subject.photos), held_out=moved(still))
 
@@ -128,9 +131,10 @@ def with_body_off(subject: Any, millimetres: float) -> Any:
 def body_off(poses: Any, betas: Any, millimetres: float, seed: int) -> tuple[Any, Any]:
     """Poses (p,) and shape coefficients with the errors of a fit, the same of all poses."""
     rng = np.random.default_rng(seed)
-    off = lambda array, std: jnp.asarray(
-        millimetres * std * rng.normal(size=array.shape), jnp.float32
-    )
+
+    def off(array, std):
+        return jnp.asarray(millimetres * std * rng.normal(size=array.shape), jnp.float32)
+
     rotations = poses.rotations + off(poses.rotations[:1], np.radians(DEGREES))
     poses = replace(
         poses, rotations=rotations, translation=poses.translation + off(poses.translation[:1], 1e-3)
@@ -194,9 +198,10 @@ def refinement_means(rows: list[Any]) -> dict[str, Any]:
                     for row in rows
                 ]
             )
-            gain = lambda row, name=name, seconds=seconds: (
-                row[name][seconds]["novel"]["psnr"] - row[name]["0"]["novel"]["psnr"]
-            )
+
+            def gain(row, name=name, seconds=seconds):
+                return row[name][seconds]["novel"]["psnr"] - row[name]["0"]["novel"]["psnr"]
+
             found[name][seconds] = tasks | {"least_gain": min(map(gain, rows))}
     return found
 
@@ -311,7 +316,10 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
         raise ValueError(
             "evaluation_views and appearance are of different weights: measure them again"
         )
-    scored = lambda size, task: refined["means"]["all"][f"{size} 0 {task}"]["default"]
+
+    def scored(size, task):
+        return refined["means"]["all"][f"{size} 0 {task}"]["default"]
+
     columns = {"psnr": ("PSNR", 1), "psnr_fg": ("foreground PSNR", 1), "alex": ("LPIPS (Alex)", 3)}
     own = {"psnr": "psnr", "psnr_fg": "psnr_fg"} | (
         {"alex": "lpips"} if people["settings"].get("lpips_net") == "alex" else {}
@@ -343,10 +351,13 @@ def readme_times(demo: dict[str, Any]) -> str:
         "animate: one pose": "animate",
         f"render {views['held_out']} views": "render_held_out",
     }
-    seconds = lambda stage: [
-        f"{spent[stage]['compile']:.1f} s",
-        f"{significant(1000 * spent[stage]['run'])} ms",
-    ]
+
+    def seconds(stage):
+        return [
+            f"{spent[stage]['compile']:.1f} s",
+            f"{significant(1000 * spent[stage]['run'])} ms",
+        ]
+
     rows = [[name, *seconds(stage)] for name, stage in stages.items()]
     whole = [
         "everything, files included, without refinement (`--refine 0`)",

@@ -338,9 +338,10 @@ def stability(
         for c in COLUMNS
         if n != "float16" or c == "values"
     ]
-    show = lambda stage, name, column: (
-        f"{stage[name][column]['error']:.0e}" if column in stage.get(name, {}) else ""
-    )
+
+    def show(stage, name, column):
+        return f"{stage[name][column]['error']:.0e}" if column in stage.get(name, {}) else ""
+
     rows = [[title, *(show(stage, *pair) for pair in columns)] for title, stage in worst.items()]
     header = ["stage", *(f"{name}: {COLUMNS[column]}" for name, column in columns)]
     run.show(markdown_table(header, rows), {"seeds": seeds} | worst, "stability_shipped")
@@ -399,10 +400,13 @@ def observe(case, name):
     )
     wide = name == "float64"
     number = np.float64 if wide else np.float32
-    real = lambda x: jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating)
-    cast = lambda tree: jax.tree.map(
-        lambda x: np.asarray(x, number) if real(x) else np.asarray(x), tree
-    )
+
+    def real(x):
+        return jnp.issubdtype(jnp.asarray(x).dtype, jnp.floating)
+
+    def cast(tree):
+        return jax.tree.map(lambda x: np.asarray(x, number) if real(x) else np.asarray(x), tree)
+
     with (
         jax.enable_x64(wide),
         jax.default_matmul_precision("tensorfloat32" if name == "tf32" else "highest"),

@@ -80,11 +80,12 @@ def scene_fits(
         "few points, fit_scene": (few, growing),
         "no points, fit_scene": (None, growing),
     }
-    fit = lambda name: (
-        lambda: measured(
+
+    def fit(name):
+        return lambda: measured(
             *cases[name], truth, cameras, shown, hidden, checkpoint_of(checkpoints, name)
         )
-    )
+
     chosen = {name: fit(name) for name in cases if not only or name in only}
     settings = {"gaussians": gaussians, "photos": photos, "size": size, "steps": steps}
     rows = run.rows(chosen, {**settings, "points": points, "seed": seed})

@@ -45,14 +45,20 @@ def measure(repeats: int) -> dict[str, float]:
 
     variables, config = hg.load_weights()
     capture = hg.load_capture("demo_capture")
-    means = lambda: hg.reconstruct(variables, config, capture).gaussians.means
+
+    def means():
+        return hg.reconstruct(variables, config, capture).gaussians.means
+
     found["reconstruct"] = usual(means, repeats)
 
     avatar = hg.reconstruct(variables, config, capture)
     gaussians = hg.animate(avatar, capture.pose(0))
     camera = capture.resized(IMAGE).cameras[0]
     splat = hg.plan_buffers(gaussians, camera)
-    draw = lambda g: hg.render(g, camera, splat).rgb
+
+    def draw(g):
+        return hg.render(g, camera, splat).rgb
+
     programs = {"render": draw, "gradient": jax.grad(lambda g: jnp.mean(draw(g) ** 2))}
     for name, function in programs.items():
         lowered = jax.jit(function).lower(gaussians)

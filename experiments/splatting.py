@@ -442,7 +442,10 @@ def camera_differences(scene: Scene) -> dict[str, list[float]]:
             gaussians, camera, dataclasses.replace(SplatConfig(), **cuts), margin=1.5
         )
         gradient = np.asarray(both(jnp.zeros(6), gaussians, config)[1])
-        value = lambda twist, config=config: float(both(jnp.asarray(twist), gaussians, config)[0])
+
+        def value(twist, config=config):
+            return float(both(jnp.asarray(twist), gaussians, config)[0])
+
         results[name] = []
         for step in STEPS:
             slopes = [(value(step * axis) - value(-step * axis)) / (2 * step) for axis in np.eye(6)]

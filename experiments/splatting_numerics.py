@@ -282,7 +282,10 @@ def coincident(reverse: bool = False) -> Scene:
 def narrow(dtype: DTypeLike, *others: str) -> Scene:
     """Gaussians, and other arrays of the scene, in another dtype."""
     scene = ordinary()
-    cast = lambda name: jax.tree.map(lambda a: np.asarray(a, dtype), getattr(scene, name))
+
+    def cast(name):
+        return jax.tree.map(lambda a: np.asarray(a, dtype), getattr(scene, name))
+
     return dataclasses.replace(scene, **{name: cast(name) for name in ("gaussians", *others)})
 
 
@@ -292,7 +295,10 @@ def narrow_everything(dtype: DTypeLike) -> Scene:
 
 def _cases() -> list[Case]:
     one = functools.partial
-    ulp = lambda towards: float(np.nextafter(np.float32(NEAR), np.float32(towards)))
+
+    def ulp(towards):
+        return float(np.nextafter(np.float32(NEAR), np.float32(towards)))
+
     return [
         Case("ordinary", "nothing special", ordinary),
         *(Case("scales", f"{s:.0e} m", one(scaled, s)) for s in (1e-7, 1e-5, 1e-3, 1e-1, 1e1, 1e3)),
@@ -448,7 +454,10 @@ def relative_l2(found: np.ndarray, expected: np.ndarray) -> float:
 
 def natural(scene: Scene, gradients: tuple) -> dict[str, np.ndarray]:
     """Gradients by name, in float64 and in the units of the module docstring."""
-    wide = lambda tree: jax.tree.map(lambda a: np.asarray(a, np.float64), tree)
+
+    def wide(tree):
+        return jax.tree.map(lambda a: np.asarray(a, np.float64), tree)
+
     gaussians, pose = wide(scene.gaussians), wide(scene.pose)
     by_name = dict(zip(NAMES, jax.tree.leaves(wide(gradients)), strict=True))
     units = {
@@ -461,7 +470,10 @@ def natural(scene: Scene, gradients: tuple) -> dict[str, np.ndarray]:
 
 def compare(scene: Scene, found: tuple, expected: tuple) -> Outcome:
     """One (rendering, gradients) with another."""
-    wide = lambda a: np.asarray(a, np.float64)
+
+    def wide(a):
+        return np.asarray(a, np.float64)
+
     (image, gradients), (exact, exact_gradients) = found, expected
     pairs = natural(scene, gradients), natural(scene, exact_gradients)
     errors = {name: relative_l2(pairs[0][name], pairs[1][name]) for name in NAMES}

@@ -78,7 +78,8 @@ def tradeoff(
     only: knobs to measure, beside the default point
     image: draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png
     """
-    if unknown := set(only) - (knobs := {each.knob: None for each in points()}).keys():
+    knobs = {each.knob: None for each in points()}
+    if unknown := set(only) - knobs.keys():
         raise ValueError(f"--only {unknown.pop()}: expected some of {', '.join(knobs)}")
     settings = settings_of()
     result = json.loads(out.read_text()) if out.exists() else {}
@@ -255,13 +256,11 @@ class Bench:
         for _ in range(0 if same and point is not self.default else ITERATIONS):
             pairs.append((timed(lambda: self.make(settings))[1], self.default_make_ms()))
         own, default = np.median(pairs, axis=0) if pairs else (1.0, 1.0)
-        ratio = (
-            0.0
-            if point.start == "random colors"
-            else 1.0
-            if point is self.default
-            else float(own / default)
-        )
+        ratio = float(own / default)
+        if point is self.default:
+            ratio = 1.0
+        if point.start == "random colors":
+            ratio = 0.0
         with peak_memory() as peak:
             self.make(settings)
         refined, memory = 0.0, peak[0]
@@ -276,7 +275,10 @@ class Bench:
         MiB.
         """
         photos, avatar = self.photos(settings), self.make(settings)
-        run = lambda config: refine_with_report(avatar, photos, config)
+
+        def run(config):
+            return refine_with_report(avatar, photos, config)
+
         run(
             dataclasses.replace(settings, refine_steps=min(settings.refine_steps, 1)).refinement
         )  # compiles
@@ -306,8 +308,13 @@ class Bench:
         """Frames without end, in the poses of the held-out views."""
         poses, views = capture_views(avatar, self.person(0).held_out)
         cameras = views.resized(size, size)
-        turns = lambda: itertools.cycle(range(len(poses.rotations)))
-        pose = lambda i: jax.tree.map(lambda x: x[i], poses)
+
+        def turns():
+            return itertools.cycle(range(len(poses.rotations)))
+
+        def pose(i):
+            return jax.tree.map(lambda x: x[i], poses)
+
         renderings = draw(
             avatar, (pose(i) for i in turns()), (cameras[i] for i in turns()), how=how
         )

@@ -185,14 +185,12 @@ def rows_of(result: dict[str, Any]) -> list[Row]:
     rows = []
     for name, found in result["points"].items():
         row = {"name": name.removeprefix("preset "), **found["what"], **found}
-        people = found["people"]  # of docs/results: their number, and means
-        of_people = (
-            {task: found.get(task) for task in TASKS}
-            if isinstance(people, int)
-            else means(people)
-            if people
-            else {}
-        )
+        # docs/results have the number of people, and means
+        people, of_people = found["people"], {}
+        if isinstance(people, int):
+            of_people = {task: found.get(task) for task in TASKS}
+        elif people:
+            of_people = means(people)
         row |= {task: of_people.get(task) for task in TASKS}
         rows.append(row)
     return rows
@@ -223,10 +221,13 @@ def front_of(rows: list[Row]) -> list[Row]:
     reconstruction first.
     """
     ours = [row for row in compared(rows) if row["start"] == "network"]
-    no_longer = lambda a, b: all(a[key] <= EQUAL * b[key] for key in ("reconstruct", "frame"))
-    beaten = lambda row: any(
-        quality(other) > quality(row) and no_longer(other, row) for other in ours
-    )
+
+    def no_longer(a, b):
+        return all(a[key] <= EQUAL * b[key] for key in ("reconstruct", "frame"))
+
+    def beaten(row):
+        return any(quality(other) > quality(row) and no_longer(other, row) for other in ours)
+
     return sorted((row for row in ours if not beaten(row)), key=lambda row: row["reconstruct"])
 
 
@@ -252,7 +253,9 @@ def about(result: dict[str, Any]) -> str:
 
 
 def numbers(row: Row) -> list[str]:
-    share = lambda key: significant(row[key]) if row.get(key) is not None else ""
+    def share(key):
+        return significant(row[key]) if row.get(key) is not None else ""
+
     return [share("reconstruct"), share("frame"), *cells(row, SIZES, "")]
 
 
@@ -272,7 +275,10 @@ HEADINGS = [
 def point_table(rows: list[Row], result: dict[str, Any]) -> str:
     """All points; those of the front are bold."""
     front = {row["name"] for row in front_of(rows)}
-    named = lambda row: f"**{row['name']}**" if row["name"] in front else row["name"]
+
+    def named(row):
+        return f"**{row['name']}**" if row["name"] in front else row["name"]
+
     table = [[row["knob"], named(row), *numbers(row), *scores(row)] for row in rows]
     text = (
         f"{about(result)} {len(rows)} points; bold: no other point is better and as fast in both."
@@ -287,7 +293,10 @@ def preset_table(rows: list[Row], result: dict[str, Any]) -> str:
     if not presets:
         return "no preset has been measured"
     front, best = {row["name"] for row in front_of(rows)}, max(presets, key=quality)
-    lost = lambda row: [f"{best[task]['psnr'] - row[task]['psnr']:.2f}" for task in TASKS]
+
+    def lost(row):
+        return [f"{best[task]['psnr'] - row[task]['psnr']:.2f}" for task in TASKS]
+
     table = [
         [
             row["name"],

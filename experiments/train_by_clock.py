@@ -74,7 +74,10 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
     Raises: ValueError if no time is left to train.
     """
     began, body, (variables, model) = monotonic(), load_body(), load_weights(how.init_weights)
-    clock = lambda: monotonic() - began
+
+    def clock():
+        return monotonic() - began
+
     carrier, config = gaussian_body(body, model), configured(how)
     config = dataclasses.replace(
         config, model=dataclasses.replace(model, runtime=config.model.runtime)

@@ -430,7 +430,10 @@ def planned(samples: list[Sample]) -> Any:
         for sample in samples
         for view in sample.views
     ]
-    most = lambda name: max(getattr(plan, name) for plan in plans)
+
+    def most(name):
+        return max(getattr(plan, name) for plan in plans)
+
     return dataclasses.replace(
         plans[0], max_pairs=most("max_pairs"), max_rows=most("max_rows"), visibility=True
     )

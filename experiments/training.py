@@ -301,16 +301,24 @@ def training_cost(
 
 def step_cost(config: Any, mesh: Any) -> dict[str, Any]:
     body = gaussian_body(load_body(), config.model)
-    shapes = lambda tree: jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
+
+    def shapes(tree):
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
+
     state, networks = (
         jax.eval_shape(lambda: init_state(config)),
         jax.eval_shape(lambda: random_networks(config)),
     )
     batch = abstract_batch(config, len(body.parents), body.shape_directions.shape[-1])
-    placed = lambda tree, shardings: jax.tree.map(
-        lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), tree, shardings
-    )
-    everywhere = lambda tree: placed(tree, jax.tree.map(lambda _: sharding.replicated(mesh), tree))
+
+    def placed(tree, shardings):
+        return jax.tree.map(
+            lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), tree, shardings
+        )
+
+    def everywhere(tree):
+        return placed(tree, jax.tree.map(lambda _: sharding.replicated(mesh), tree))
+
     state = placed(state, sharding.state_shardings(state, mesh))
     batch = placed(batch, jax.tree.map(lambda _: sharding.batch_sharding(mesh), batch))
     step = jax.jit(update, static_argnames=("config", "mesh"), donate_argnames="state")
@@ -331,7 +339,9 @@ def abstract_batch(config: Any, joints: int, betas: int) -> Any:
     """Shapes of an `Example` with a leading axis of `config.batch_size` subjects."""
 
     def views(count: int, size: int) -> SubjectViews:
-        camera = lambda K, pose: Camera(K, pose, size, size)
+        def camera(K, pose):
+            return Camera(K, pose, size, size)
+
         return SubjectViews(
             images=jnp.zeros((count, size, size, 3)),
             masks=jnp.zeros((count, size, size)),
@@ -378,7 +388,8 @@ def training_curve(run: Run, logs: tuple[Path, ...], out: Path = Path("training.
     lines: list[dict[str, Any]] = []
     begins = []
     for path in logs:
-        begins.append(offset := max((line["step"] for line in lines), default=0))
+        offset = max((line["step"] for line in lines), default=0)
+        begins.append(offset)
         read = [json.loads(line) for line in path.read_text().splitlines()]
         lines += [line | {"step": line["step"] + offset} for line in read]
     trained = [line for line in lines if line.get("loss") is not None and "event" not in line]

@@ -140,7 +140,10 @@ def layered(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
     near, far = view.depth[seen[..., 0]].min(), view.depth[seen[..., 0]].max()
     palette = np.random.default_rng(3).uniform(0.15, 1, (len(avatar.joint_names) + 1, 3))
     palette[0] = 0
-    grey = lambda plane: np.repeat(plane[..., None], 3, axis=-1)
+
+    def grey(plane):
+        return np.repeat(plane[..., None], 3, axis=-1)
+
     return [
         ("R G B, premultiplied", view.rgba[..., :3]),
         ("A", grey(view.rgba[..., 3])),

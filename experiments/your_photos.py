@@ -115,7 +115,9 @@ def in_a_room(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def draw_figures(out: Path, points: np.ndarray) -> None:
-    read = lambda folder, i: read_image(out / "photos" / folder / f"cam{i}.png")[0]
+    def read(folder, i):
+        return read_image(out / "photos" / folder / f"cam{i}.png")[0]
+
     photos, masks = (
         np.stack([read(folder, i) for i in range(VIEWS)]) for folder in ("images", "masks")
     )

@@ -99,7 +99,10 @@ def variants() -> dict[str, Variant]:
     models = {name: make("bench") for name, make in SYSTEMS.items() if name not in PER_PERSON}
     paper, ours = models.pop("humangs"), models.pop("ours")
     encoder, reader, decoder = paper_parts(paper.architecture)
-    part = lambda about, **changes: Variant(paper.with_parts(**changes), about=about)
+
+    def part(about, **changes):
+        return Variant(paper.with_parts(**changes), about=about)
+
     found = {REFERENCE: Variant(paper)}
     found |= {
         name: Variant(model, 1 if name in TAKE_ONE else PHOTOS) for name, model in models.items()
@@ -282,10 +285,10 @@ def tested(method: Method, people: Path, count: int, moves: bool = True) -> dict
     for task, first in zip(TASKS, (True, False), strict=True):
         means = person_means([row for row in rows if (row.frame == 0) == first]).values()
         if first or moves:
-            found[task] = {
-                name: [round(x, 4) for row in means if (x := row[name]) is not None]
-                for name in SCORES
-            }
+            for name in SCORES:
+                known = (row[name] for row in means)
+                rounded = [round(x, 4) for x in known if x is not None]
+                found.setdefault(task, {})[name] = rounded
     return found
 
 
@@ -324,9 +327,10 @@ def difference(
     over all variants with several; Student's t with the degrees of freedom of Welch and
     Satterthwaite.
     """
-    values = lambda name, photos: np.asarray(
-        [x["scores"][str(photos)][task][score] for x in finished(runs, name)]
-    )
+
+    def values(name, photos):
+        return np.asarray([x["scores"][str(photos)][task][score] for x in finished(runs, name)])
+
     first, second = values(*a), values(*b)
     paired = first.mean(axis=0) - second.mean(axis=0)
     people, (seeds, freedom) = (
@@ -347,9 +351,8 @@ def seed_variance(runs: Mapping[str, Any], task: str, score: str) -> tuple[float
     """Variance of a run's mean by its seed, and its degrees of freedom."""
     squares, freedom = 0.0, 0
     for name in runs:
-        means = [
-            np.mean(own[task][score]) for x in finished(runs, name) if task in (own := headline(x))
-        ]
+        scores = [headline(run) for run in finished(runs, name)]
+        means = [np.mean(own[task][score]) for own in scores if task in own]
         if len(means) > 1:
             squares, freedom = squares + np.var(means) * len(means), freedom + len(means) - 1
     return (squares / freedom if freedom else 0.0), freedom

@@ -161,7 +161,10 @@ def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
     """The network's inputs of one subject, and its skinning weights (n, j) and joint transforms (j,
     4, 4).
     """
-    own = lambda name: jnp.asarray(arrays[name][index], dtype)
+
+    def own(name):
+        return jnp.asarray(arrays[name][index], dtype)
+
     images = jnp.moveaxis(own("in_image"), 1, -1)
     height, width = images.shape[1:3]
     fx, fy, cx, cy = np.moveaxis(arrays["in_fxfycxcy"][index].astype(np.float64), -1, 0)
@@ -193,7 +196,10 @@ def compute_stages(
     And TIES (g, 4, 4), TIE_LEVELS (g, 4): all readings of the posed rotations, see
     `nearest_candidates`.
     """
-    channels_first = lambda x: jnp.moveaxis(x, -1, 1)
+
+    def channels_first(x):
+        return jnp.moveaxis(x, -1, 1)
+
     encoder, reader, decoder = paper_parts(config.architecture)
     stages = intermediates(variables, inputs, config)
     features, outputs = stages["reader"], stages["decoder"]
@@ -209,9 +215,12 @@ def compute_stages(
         encoder_pixels(inputs, config.forward_context()),
         variables["params"]["encoder"]["tokenizer"]["texture"],
     )
-    heads = lambda name: stages[f"decoder.{name}_out"].reshape(
-        len(features.local), decoder.gaussians_per_vertex, -1
-    )
+
+    def heads(name):
+        return stages[f"decoder.{name}_out"].reshape(
+            len(features.local), decoder.gaussians_per_vertex, -1
+        )
+
     entering = [features.local]
     if features.global_token is not None:
         entering.append(
@@ -401,8 +410,8 @@ def parity(
 
 def _shown(column: dict[str, Any], name: str) -> str:
     error = column["stages"].get(name)
-    return (
-        "NOT COMPARED"
-        if error is None
-        else f"{error:.1e}" + ("" if error <= column["bound"] else " TOO LARGE")
-    )
+    if error is None:
+        return "NOT COMPARED"
+    if error <= column["bound"]:
+        return f"{error:.1e}"
+    return f"{error:.1e} TOO LARGE"

@@ -155,11 +155,15 @@ def additions() -> dict[str, Pair]:
 
 
 def claims() -> list[Claim]:
-    ours = lambda count=PHOTOS: (REFERENCE, count)
-    near = lambda name: tuple(Pair((REFERENCE, test), (name, test)) for test in NEAR)
-    part = lambda name, tests=(PHOTOS,), score="psnr": tuple(
-        Pair(ours(test), (name, test), score=score) for test in tests
-    )
+    def ours(count=PHOTOS):
+        return (REFERENCE, count)
+
+    def near(name):
+        return tuple(Pair((REFERENCE, test), (name, test)) for test in NEAR)
+
+    def part(name, tests=(PHOTOS,), score="psnr"):
+        return tuple(Pair(ours(test), (name, test), score=score) for test in tests)
+
     one, five = GAUSSIANS["THuman2.1"]
     return [
         Claim(

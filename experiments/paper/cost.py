@@ -143,7 +143,10 @@ def compare(
             lambda reader=reader, ctx=ctx: reader.init(jax.random.key(0), encoding, inputs, ctx)
         )
         variables = jax.tree.map(lambda x: np.full(x.shape, 0.02, x.dtype), shapes)
-        read = lambda v, e, x, reader=reader, ctx=ctx: reader.apply(v, e, x, ctx).local
+
+        def read(v, e, x, reader=reader, ctx=ctx):
+            return reader.apply(v, e, x, ctx).local
+
         traced = jax.jit(read).trace(variables, encoding, inputs)
         program = traced.lower().compile()
         sums = READ_OPERATIONS * views * vertices * width if name == "back-projection" else 0
@@ -173,7 +176,10 @@ def subject(width: int, views: int, vertices: int, size: int) -> tuple[Any, Any]
     normals = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=-1)
     points = jnp.asarray(0.25 * normals + heights[:, None] * [0, 1, 0], jnp.float32)
     normals = jnp.asarray(normals, jnp.float32)
-    all_views = lambda x: jnp.broadcast_to(x, (views, *x.shape))
+
+    def all_views(x):
+        return jnp.broadcast_to(x, (views, *x.shape))
+
     azimuths, K = jnp.arange(views) * (2 * np.pi / views), intrinsics_from_fov(0.8, size, size)
     inputs = HumanGSInputs(
         images=jnp.zeros((views, size, size, 3)),
@@ -197,7 +203,10 @@ def network_flops(name: str, photos: int) -> dict[str, float]:
     config = SYSTEMS[name]("published").with_conventions(tokens="all").with_runtime(dtype="float32")
     vertices = len(gaussian_body(load_body(), config).template)
     inputs = jax.eval_shape(lambda: subject(1, photos, vertices, config.conventions.image_size)[0])
-    forward = lambda v, x: apply_humangs(v, x, config)[0].gaussians
+
+    def forward(v, x):
+        return apply_humangs(v, x, config)[0].gaussians
+
     return counted(photos, vertices, forward, expected_variables(config), inputs)
 
 
@@ -220,10 +229,15 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
         inputs = HumanGSInputs(colors, camera, posed, points, colors, grid, grid > 0)
         return Encoding(tokens, None, jnp.zeros((), jnp.int32)), inputs, config.forward_context()
 
-    forward = lambda v, *given: reader.apply(v, *arguments(*given))
+    def forward(v, *given):
+        return reader.apply(v, *arguments(*given))
+
     tokens = jax.ShapeDtypeStruct((*grid.shape, getattr(reader, "width")), jnp.float32)  # noqa: B009 (of a TwoStreamReader)
     points = jax.ShapeDtypeStruct((POINTS, 3), jnp.float32)
-    make = lambda *given: reader.init(jax.random.key(0), *arguments(*given))
+
+    def make(*given):
+        return reader.init(jax.random.key(0), *arguments(*given))
+
     variables = jax.eval_shape(make, jax.ShapeDtypeStruct((8, 3), jnp.float32), tokens)
     return counted(photos, POINTS, forward, variables, points, tokens)
 

@@ -151,7 +151,10 @@ class Recolored(CaptureSource):
     def example(self, seed: int, index: int, input_count: int) -> Example:
         example = super().example(seed, index, input_count)
         order = np.random.default_rng([COLOR_STREAM, seed, index]).permutation(3)
-        change = lambda views: replace(views, images=views.images[..., order])
+
+        def change(views):
+            return replace(views, images=views.images[..., order])
+
         return replace(example, inputs=change(example.inputs), targets=change(example.targets))
 
 

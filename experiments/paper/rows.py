@@ -207,7 +207,9 @@ def measured(
 
     for case in cases(people, photos, body, views):
         # a frame that an input shows is no new pose
-        frames = lambda capture: set(np.asarray(capture.frames).tolist())
+        def frames(capture):
+            return set(np.asarray(capture.frames).tolist())
+
         seen = {pose_of(case.inputs, i) for i in frames(case.inputs)} if case.inputs else set()
         same = {i: pose_of(case.truth, i) in seen for i in frames(case.truth)}
         rows += [

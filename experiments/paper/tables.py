@@ -218,13 +218,17 @@ def ours(
         for row, (_, photos, task) in zip(found, columns, strict=True):
             known = row and (not cameras or row["photos"] == photos)
             cells.append(triple(row["animation" if task == "varying" else task]) if known else "-")
-        rows.append([name, cameras or ("1 photo" if count == 1 else f"{count} photos"), *cells])
+        given = "1 photo" if count == 1 else f"{count} photos"
+        rows.append([name, cameras or given, *cells])
     return rows
 
 
 def animation(names: list[str], measure: Measure, options: Any) -> str:
     """Table 1."""
-    seconds = lambda value: "-" if value is None else significant(value)
+
+    def seconds(value):
+        return "-" if value is None else significant(value)
+
     rows = [[name, PAPER, triple(x[:3]), *map(seconds, x[3:])] for name, x in ANIMATION.items()]
     for row in ours(names, measure, [(options.data, PHOTOS, "varying")]):
         found = measure(row[0], options.data, PHOTOS, varying=True)

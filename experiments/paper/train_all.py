@@ -111,12 +111,8 @@ def queue(seeds: int) -> list[tuple[str, int]]:
     others = [name for name, variant in variants().items() if variant.about]
     more = [(REFERENCE, seed) for seed in range(1, seeds)]
     order = [(name, 0) for name in systems] + more + [(name, 0) for name in others]
-    order += [
-        x
-        for seed in range(1, seeds)
-        for name in (*systems, *others)
-        if (x := (name, seed)) not in more
-    ]
+    every = [(name, seed) for seed in range(1, seeds) for name in (*systems, *others)]
+    order += [run for run in every if run not in more]
     return sorted(order, key=lambda run: run[0] in ADDED)
 
 
@@ -279,9 +275,10 @@ def ablations(report: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list
     photos.
     """
     runs, ready, found = report["runs"], trained_names(report), {}
-    scored = lambda name, test, task: (
-        name in ready and task in finished(runs, name)[0]["scores"].get(test, {})
-    )
+
+    def scored(name, test, task):
+        return name in ready and task in finished(runs, name)[0]["scores"].get(test, {})
+
     for part, other in ABLATIONS.items():
         lines = []
         for kind, task, score in itertools.product((COUNTS, NEAR), TASKS, ("psnr", "lpips_alex")):

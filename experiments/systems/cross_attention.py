@@ -100,11 +100,16 @@ class CrossBlock(nn.Module):
         self, x: Float[Array, "n d"], tokens: Float[Array, "l e"], count: Int[Array, ""] | None
     ) -> Float[Array, "n d"]:
         width, dtype = x.shape[-1], self.runtime.compute_dtype
-        dense = lambda features, name: nn.Dense(
-            features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name
-        )
-        heads = lambda y: y.reshape(len(y), -1, self.head_width)
-        rms = lambda y, name: nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name=name)(y)
+
+        def dense(features, name):
+            return nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
+
+        def heads(y):
+            return y.reshape(len(y), -1, self.head_width)
+
+        def rms(y, name):
+            return nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name=name)(y)
+
         q = rms(heads(dense(width, "q")(layer_norm(dtype, "norm1")(x))), "q_norm")
         k, v = jnp.split(dense(2 * width, "kv")(tokens), 2, axis=-1)
         k = rms(heads(k), "k_norm")

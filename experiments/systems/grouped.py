@@ -103,7 +103,8 @@ class GroupDecoder(Decoder):
         have.
         """
         vertices, groups = len(inputs.canonical_vertices), features.shape[1]
-        if vertices > (room := groups * self.group_size):
+        room = groups * self.group_size
+        if vertices > room:
             raise ValueError(
                 f"a body of {vertices} vertices: {groups} groups of decoder.group_size"
                 f" {self.group_size} have {room}"

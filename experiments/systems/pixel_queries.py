@@ -138,7 +138,10 @@ class QueryDriver(PixelDriver):
         if self.texture is not None:
             shape = (3, self.texture.resolution, self.texture.resolution, self.texture.channels)
             texture = self.param("texture", nn.initializers.normal(TEXTURE_STD), shape)
-            features = lambda ray, at: jnp.concatenate([ray, sample_triplane(texture, at)], axis=-1)
+
+            def features(ray, at):
+                return jnp.concatenate([ray, sample_triplane(texture, at)], axis=-1)
+
             seen, asked = features(seen, photos.pixels[..., 9:]), features(asked, query[..., 6:])
 
         def linear(features, name):
@@ -188,14 +191,20 @@ class FusionHead(nn.Module):
     def __call__(self, maps: list[Float[Array, "v h w d"]]) -> Float[Array, "v i j 3"]:
         if self.patch & (self.patch - 1):
             raise ValueError(f"driver.fusion: patch_size {self.patch}: expected a power of 2")
-        activate = lambda x: jax.nn.leaky_relu(x, SLOPE)
-        convolution = lambda features, name: Convolution(features, KAIMING, self.dtype, name=name)
+
+        def activate(x):
+            return jax.nn.leaky_relu(x, SLOPE)
+
+        def convolution(features, name):
+            return Convolution(features, KAIMING, self.dtype, name=name)
 
         def residual(x, name):
             inner = convolution(x.shape[-1], f"{name}_0")(activate(x))
             return x + convolution(x.shape[-1], f"{name}_1")(activate(inner))
 
-        project = lambda i: nn.Dense(self.hidden, dtype=self.dtype, name=f"project_{i}")(maps[i])
+        def project(i):
+            return nn.Dense(self.hidden, dtype=self.dtype, name=f"project_{i}")(maps[i])
+
         last = len(maps) - 1
         x = residual(project(last), f"fuse_{last}")
         for i in reversed(range(last)):

@@ -205,12 +205,16 @@ class ShellDecoder(Decoder):
         )
         channels = jnp.concatenate([2 * features.colors - 1, offsets[1:]])
         entering = jnp.moveaxis(channels, 0, 2).reshape(1, *covered.shape, -1)
-        nn.share_scope(self, network := UNet(self.widths, (sum(CHANNELS) * shells,)))
+        network = UNet(self.widths, (sum(CHANNELS) * shells,))
+        nn.share_scope(self, network)
         raw = network(entering)[0]
         raw = jnp.moveaxis(raw.reshape(*covered.shape, shells, -1), 2, 0)
         quats, scales, opacities = jnp.split(raw, (CHANNELS[0], CHANNELS[0] + CHANNELS[1]), axis=-1)
         shown = covered & features.seen.at[0].set(True)
-        flat = lambda x: x.reshape(-1, x.shape[-1])
+
+        def flat(x):
+            return x.reshape(-1, x.shape[-1])
+
         gaussians = Gaussians(
             means=flat(surface + offsets) * unit,
             quats=quaternion.normalize(flat(quats) + jnp.asarray(quaternion.IDENTITY, raw.dtype)),

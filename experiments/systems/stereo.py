@@ -140,7 +140,10 @@ class StereoDecoder(Decoder):
                 raw, self.planes + np.cumsum([0, *CHANNELS[:2]]), axis=-1
             )
             reach = (jax.nn.softmax(cost + scores) @ distances)[..., None]
-            flat = lambda x: x.reshape(-1, x.shape[-1])
+
+            def flat(x):
+                return x.reshape(-1, x.shape[-1])
+
             return Gaussians(
                 means=flat(origin + reach * rays),
                 quats=quaternion.normalize(

@@ -115,7 +115,10 @@ class TextureReader(Reader):
             points = texels.interpolate(vertices).reshape(-1, 3)
             pixels, depths = project_vertices(camera, points)
             visible = visible_vertices(pixels, depths, depth_map, size, grid) & covered & present
-            away = lambda x: safe_normalize(x, jnp.zeros(3))
+
+            def away(x):
+                return safe_normalize(x, jnp.zeros(3))
+
             cosines = jnp.sum(
                 away(texels.interpolate(normals).reshape(-1, 3)) * away(camera.center - points),
                 axis=-1,
@@ -164,7 +167,10 @@ class SurfaceDecoder(Decoder):
             )
         texture = features if isinstance(features, SurfaceTexture) else None
         unit, covered = subject_unit(inputs.canonical_vertices), texels.covered.reshape(-1)
-        flat = lambda values: texels.interpolate(values).reshape(len(covered), -1)
+
+        def flat(values):
+            return texels.interpolate(values).reshape(len(covered), -1)
+
         up = jnp.asarray([0.0, 0.0, 1.0])
         along = COVERAGE * jnp.sqrt(AREA / jnp.maximum(jnp.sum(covered), 1)) * unit
         root = jnp.zeros(inputs.skinning_weights.shape[1]).at[0].set(1.0)
@@ -231,7 +237,8 @@ class TextureDriver(GaussianDriver):
             PoseAttention(self.pose_width, self.pose_tokens, parent=None),
         )
         seen = jnp.concatenate([2 * texture.colors - 1, texture.seen[..., None]], axis=-1)
-        nn.share_scope(self, network := UNet(self.widths, tuple(NETS.values()), attention))
+        network = UNet(self.widths, tuple(NETS.values()), attention)
+        nn.share_scope(self, network)
         raw = network(
             seen[None], surface.positions[None], context=pose_vector(target.pose, self.joints)
         )
@@ -297,7 +304,10 @@ class PoseAttention(nn.Module):
         context = nn.Dense(self.tokens * features, name="pose_1")(hidden).reshape(
             self.tokens, features
         )
-        dense = lambda name: nn.Dense(features, use_bias=False, name=name)
+
+        def dense(name):
+            return nn.Dense(features, use_bias=False, name=name)
+
         queries, keys, values = dense("query")(x), dense("key")(context), dense("value")(context)
         attention = jax.nn.softmax(queries @ keys.T * features**-0.5, axis=-1)
         return x + dense("out")(attention @ values)

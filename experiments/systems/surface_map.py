@@ -43,7 +43,10 @@ class SurfaceMap:
 
         Equal bodies share them: they take seconds.
         """
-        plain = lambda x, dtype: None if x is None else np.asarray(x, dtype).tobytes()
+
+        def plain(x, dtype):
+            return None if x is None else np.asarray(x, dtype).tobytes()
+
         uvs = plain(body.uvs, np.float32), plain(body.uv_faces, np.int32)
         return _texels(plain(body.template, np.float32), plain(body.faces, np.int32), *uvs, self)
 
@@ -88,5 +91,8 @@ def _front_and_back(vertices, faces, size):
         )
         camera = Camera(jnp.eye(3), jnp.eye(4), size, size)
         seen.append(rasterize_mesh(jnp.asarray(points, jnp.float32), jnp.asarray(faces), camera))
-    beside = lambda name: np.concatenate([np.asarray(getattr(one, name)) for one in seen], axis=1)
+
+    def beside(name):
+        return np.concatenate([np.asarray(getattr(one, name)) for one in seen], axis=1)
+
     return beside("face_ids"), beside("barycentrics")

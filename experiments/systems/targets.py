@@ -67,7 +67,10 @@ class GaussianDriver(TargetDecoder):
             return posed, driven.tight_offsets
 
         posed, offsets = jax.lax.map(one, (targets.rotations, targets.translations))
-        flat = lambda x: None if x is None else x.reshape(-1, *x.shape[2:])
+
+        def flat(x):
+            return None if x is None else x.reshape(-1, *x.shape[2:])
+
         found = draw_posed(posed, targets, backgrounds, config)
         return found._replace(opacities=flat(posed.opacities), tight_offsets=flat(offsets))
 
@@ -123,9 +126,12 @@ class PixelDriver(TargetDecoder):
     @nn.nowrap
     def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
         images = self.images(variables, outputs, body, targets, config.model)
-        full = lambda rgb: Rendering(
-            rgb, jnp.ones(rgb.shape[:2]), jnp.zeros(rgb.shape[:2]), jnp.zeros((), jnp.int32)
-        )
+
+        def full(rgb):
+            return Rendering(
+                rgb, jnp.ones(rgb.shape[:2]), jnp.zeros(rgb.shape[:2]), jnp.zeros((), jnp.int32)
+            )
+
         return Drawn(jax.vmap(full)(images))
 
     @nn.nowrap

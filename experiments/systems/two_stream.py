@@ -71,7 +71,10 @@ class TwoStreamReader(Reader):
         check_views(inputs, self.most_views)
         tokens, count = image_tokens(encoding, inputs)
         positions = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
-        dense = lambda name: nn.Dense(self.width, kernel_init=INIT, name=name)
+
+        def dense(name):
+            return nn.Dense(self.width, kernel_init=INIT, name=name)
+
         embedded = dense("position_out")(
             jax.nn.silu(dense("position_in")(positional_encoding(positions)))
         )
@@ -128,9 +131,9 @@ class TwoStreamBlock(nn.Module):
         pooled: Float[Array, " d"],
     ) -> tuple[Float[Array, "n d"], Float[Array, "l d"]]:
         dtype, width, vertices = self.runtime.compute_dtype, self.width, len(points)
-        dense = lambda features, name: nn.Dense(
-            features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name
-        )
+
+        def dense(features, name):
+            return nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
 
         def modulations(name, number):
             made = nn.Dense(
@@ -143,9 +146,10 @@ class TwoStreamBlock(nn.Module):
             x = layer_norm(dtype, f"{name}_norm1")(x) * (1 + scale) + shift
             made = dense((2 + ask) * width, f"{name}_kvq")(x).reshape(len(x), -1, self.head_width)
             k, v, *q = jnp.split(made, 2 + ask, axis=1)
-            rms = lambda y, which: nn.RMSNorm(
-                epsilon=NORM_EPSILON, dtype=dtype, name=f"{name}_{which}_norm"
-            )(y)
+
+            def rms(y, which):
+                return nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name=f"{name}_{which}_norm")(y)
+
             return [rms(k, "k"), v, *(rms(y, "q") for y in q)]
 
         def update(x, seen, name, modulation):

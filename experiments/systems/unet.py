@@ -77,7 +77,9 @@ class UNet(nn.Module):
                 features, nn.initializers.normal(LAST_STD), self.dtype, name=f"{mark}out"
             )(x)
 
-        marks = lambda many: [""] if len(many) == 1 else [f"{i}_" for i in range(len(many))]
+        def marks(many):
+            return [""] if len(many) == 1 else [f"{i}_" for i in range(len(many))]
+
         scales = zip(
             *(encoded(x, mark) for x, mark in zip(given, marks(given), strict=True)), strict=True
         )
