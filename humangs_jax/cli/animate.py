@@ -31,15 +31,15 @@ if TYPE_CHECKING:
     from humangs_jax.body.motion import Motion
     from humangs_jax.geometry.camera import Camera
 
-RATE = Range(0.01, 1000.0)
+_RATE = Range(0.01, 1000.0)
 """Range of frames per second."""
-FINITE = at_least(-LARGEST)
+_FINITE = at_least(-LARGEST)
 """Range of any number."""
-VIDEO = OutputPath(VIDEOS.suffixes, folder=True)
+_VIDEO = OutputPath(VIDEOS.suffixes, folder=True)
 """Where images or a video go."""
-FROM_THE_SIDE = FrameSettings(azimuth=20.0)
+_FROM_THE_SIDE = FrameSettings(azimuth=20.0)
 """What `humangs animate` shows by default."""
-SPLATS = {
+_SPLATS = {
     suffix: each
     for each in (*EXPORTS.values(), *READ_ONLY.values())
     if not each.mesh
@@ -61,7 +61,7 @@ class Animate:
     )
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
-    shot: OmitArgPrefixes[FrameSettings] = FROM_THE_SIDE
+    shot: OmitArgPrefixes[FrameSettings] = _FROM_THE_SIDE
     motion: Annotated[
         Path | None,
         arg(
@@ -72,10 +72,10 @@ class Animate:
         ),
     ] = None
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
-    out: Annotated[Path, VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path(
+    out: Annotated[Path, _VIDEO, arg(help=f"The video to write. {VIDEOS.listed()}")] = Path(
         "animation.mp4"
     )
-    turn: Annotated[float, FINITE] = 0.0
+    turn: Annotated[float, _FINITE] = 0.0
     """Degrees that the camera travels around the avatar during the motion."""
     camera: Annotated[
         Path | None,
@@ -91,7 +91,7 @@ class Animate:
         off("follow the person: the camera stands still and sees everywhere that the person goes"),
     ] = True
     """The camera goes along with the person."""
-    fps: Annotated[float | None, RATE] = None
+    fps: Annotated[float | None, _RATE] = None
     """Frames per second of the video: the motion keeps its speed. Default: those of the motion."""
     start: float = 0.0
     """Begin at this second of the motion."""
@@ -107,7 +107,7 @@ class Animate:
     def run(self) -> None:
         if self.camera is not None:
             given = ["turn"] * (self.turn != 0) + ["no-follow"] * (not self.follow)
-            _require_no_circle("--camera", self.shot, FROM_THE_SIDE, given)
+            _require_no_circle("--camera", self.shot, _FROM_THE_SIDE, given)
         # an output that cannot be written is refused before anything is read
         with stage("starting"):
             from humangs_jax.avatar.attach_face import with_face_for
@@ -196,7 +196,7 @@ class Render:
     ] = None
     out: Annotated[
         Path,
-        VIDEO,
+        _VIDEO,
         arg(
             help=(
                 "Folder for view_000.png and so on, or a video of a turn:"
@@ -208,7 +208,7 @@ class Render:
     """T-pose, or A-pose with the arms down (circle only)."""
     views: Annotated[int | None, at_least(1)] = None
     """How many cameras on the circle. Default: 8; for a video, those of a turn of 4 seconds."""
-    fps: Annotated[float, RATE] = 24.0
+    fps: Annotated[float, _RATE] = 24.0
     """Frames per second of a video."""
     capture: Path | None = None
     """Take cameras and poses from this capture folder instead of a circle."""
@@ -235,7 +235,7 @@ class Render:
             raise UsageError(f"--exr: {self.out} is a video: expected a folder")
         self._require_one_kind_of_cameras()
         # Gaussians of other programs have no body to pose
-        if self.avatar.suffix.lower() in (*SPLATS, *OTHERS):
+        if self.avatar.suffix.lower() in (*_SPLATS, *OTHERS):
             return self._render_gaussians(views)
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
@@ -331,7 +331,9 @@ class Render:
             gaussians = load_gaussians(self.avatar)
             # a circle around the Gaussians, whose up axis the format tells
             if self.camera is None:
-                cameras = circle_cameras(gaussians, SPLATS[self.avatar.suffix.lower()], views, shot)
+                cameras = circle_cameras(
+                    gaussians, _SPLATS[self.avatar.suffix.lower()], views, shot
+                )
             else:
                 cameras = file_cameras(self.camera, shot)
         with stage("drawing"):

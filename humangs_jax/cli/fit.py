@@ -83,8 +83,8 @@ class Refinement:
     """
 
 
-Way = Literal["--refine", "--keypoints"]
-WAYS: dict[Way, set[str]] = {
+_Way = Literal["--refine", "--keypoints"]
+WAYS: dict[_Way, set[str]] = {
     "--refine": {"keypoints", "person", "fixed_cameras", "tight_clothes"},
     "--keypoints": {"person", "body", "smoothness", "fixed_cameras"},
 }
@@ -120,7 +120,7 @@ class Fit:
 
     def run(self) -> None:
         """Fit in the way that was asked for."""
-        way: Way = "--refine" if self.refinement.refine else "--keypoints"
+        way: _Way = "--refine" if self.refinement.refine else "--keypoints"
         for option in self._given():
             if option not in WAYS[way] and f"--{option}" != way:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
@@ -249,7 +249,7 @@ class Fit:
         suggest("humangs check", target)
 
 
-DEFAULT_SHEET = Path("check.png")
+_DEFAULT_SHEET = Path("check.png")
 """What `humangs check` writes."""
 
 
@@ -268,7 +268,7 @@ class Check:
     capture: Positional[Path]
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]
-    out: Annotated[Path, OutputPath((".png",))] = DEFAULT_SHEET
+    out: Annotated[Path, OutputPath((".png",))] = _DEFAULT_SHEET
     """The contact sheet to write, .png; that of the keypoints is NAME_fit.png beside it."""
 
     def run(self) -> None:
@@ -281,7 +281,7 @@ class Check:
 
             # files that nobody named must not replace those of others
             unasked = [sheet]
-            if self.out == DEFAULT_SHEET:
+            if self.out == _DEFAULT_SHEET:
                 unasked.append(self.out)
             check_ours(unasked, is_own_output, "choose another name by --out, or move it away")
             from humangs_jax.capture.detection.people import available

@@ -16,13 +16,13 @@ from humangs_jax.cli.screen import stage, suggest, tell, wrote
 from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import DATASETS
 
-RAW = DATASETS.where(lambda each: not each.lists)
+_RAW = DATASETS.where(lambda each: not each.lists)
 """Data sets that are preprocessed."""
 if TYPE_CHECKING:
     Kind = str
 else:
-    Kind = Literal[tuple(RAW)]
-TENSORS = OutputPath((".safetensors",))
+    Kind = Literal[tuple(_RAW)]
+_TENSORS = OutputPath((".safetensors",))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Preprocess:
         "humangs preprocess thuman THuman2.0 --body SMPLX_NEUTRAL.npz --out thuman",
         "humangs preprocess thuman THuman2.0 --body SMPLX_NEUTRAL.npz --shard 0/8 --out thuman",
     )
-    kind: Annotated[Positional[Kind], arg(help=RAW.listed())]
+    kind: Annotated[Positional[Kind], arg(help=_RAW.listed())]
     source: Positional[Path]
     """The data set; of thuman the folder that holds model/ and smplx/, of videos a subject or the
     folder of several.
@@ -284,9 +284,9 @@ class Convert:
     )
     checkpoint: Positional[Path]
     """.pt with a state dict under 'model', or that state dict as .safetensors."""
-    out: Annotated[Path, TENSORS] = Path("weights.safetensors")
+    out: Annotated[Path, _TENSORS] = Path("weights.safetensors")
     """The weights file to write."""
-    losses: Annotated[Path | None, TENSORS] = None
+    losses: Annotated[Path | None, _TENSORS] = None
     """Also write the loss networks that the checkpoint carries (VGG-19, LPIPS), for training and
     evaluation.
     """

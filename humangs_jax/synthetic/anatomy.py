@@ -272,7 +272,7 @@ ARMHOLE = 0.185
 """Distance from the middle at which sleeves are sewn on."""
 TRUNK_GIRTH = 0.16
 """Radius that turns angles around the trunk into metres of cloth."""
-LEG_GIRTH = 0.08
+_LEG_GIRTH = 0.08
 """The same for legs."""
 ARM_GIRTH = 0.06
 """The same for arms."""
@@ -336,7 +336,7 @@ def leg_coordinates(template: np.ndarray) -> np.ndarray:
     x, y, z = template.T
     knee = np.interp(-y, [0.358, 0.764, 1.159], [0.101, 0.130, 0.137])
     leg = np.stack(
-        [x - np.where(x < 0, -1.0, 1.0) * knee, y, z + 0.01, np.full_like(x, LEG_GIRTH)], -1
+        [x - np.where(x < 0, -1.0, 1.0) * knee, y, z + 0.01, np.full_like(x, _LEG_GIRTH)], -1
     )
     return leg.astype(np.float32)
 
@@ -351,7 +351,7 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
     """
     x, y, girth = template[:, 0], template[:, 1], cloth[:, 3]
     on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(girth - TRUNK_GIRTH) < SAME_GIRTH)
-    on_leg = (np.abs(girth - LEG_GIRTH) < SAME_GIRTH) & (y < -0.15) & (y > -1.3)
+    on_leg = (np.abs(girth - _LEG_GIRTH) < SAME_GIRTH) & (y < -0.15) & (y > -1.3)
     result = np.array(cloth)
     result[on_leg] = leg_coordinates(template[on_leg])
     x, y, z = template[on_arm].T

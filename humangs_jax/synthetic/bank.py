@@ -179,13 +179,13 @@ def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "
 # --------------------------------------------------------------------------------------------------
 
 
-FORMAT = "humangs-people"
+_FORMAT = "humangs-people"
 """Name of the format in its files."""
-VERSION = 2
+_VERSION = 2
 """Version of the format that is written and read."""
 UV_STEPS = 65535
 """Texture coordinates are stored in steps of one part of this."""
-MOST_MATERIALS = 32
+_MOST_MATERIALS = 32
 """Materials of a person, at most: arrays have room for as many."""
 
 
@@ -289,19 +289,19 @@ def build_bank(
 def save_bank(path: str | Path, bank: PeopleBank) -> None:
     """Write one .npz, whole or not at all."""
     fields = {name: np.asarray(getattr(bank, name)) for name in (*_ARRAYS, *_STATIC)}
-    write_npz(path, fields | {"format": np.asarray(FORMAT), "version": np.asarray(VERSION)})
+    write_npz(path, fields | {"format": np.asarray(_FORMAT), "version": np.asarray(_VERSION)})
 
 
 def load_bank(path: str | Path) -> PeopleBank:
     """Read a bank. Raises: FileNotFoundError; FileError if it holds no bank."""
     with reading(path, "bank of people"):
         arrays, _ = read_npz(path)
-        if str(arrays.get("format")) != FORMAT:
+        if str(arrays.get("format")) != _FORMAT:
             raise ValueError(f"{path}: not a bank of people")
         version = int(arrays["version"])
-        if version != VERSION:
+        if version != _VERSION:
             raise ValueError(
-                f"{path}: a bank of version {version}; this program reads version {VERSION}"
+                f"{path}: a bank of version {version}; this program reads version {_VERSION}"
             )
         missing = {*_ARRAYS, *_STATIC} - set(arrays)
         if missing:
@@ -365,7 +365,7 @@ def _person(
     supersample = 2 if texture_size <= 512 else 1  # fine patterns on coarse texels
     baked = bake_subject(subject, texture_size, supersample)
     surface, atlas, materials = subject.surface, baked.atlas, subject.materials
-    if len(materials) > MOST_MATERIALS or len(surface.vertices) > np.iinfo(np.uint16).max:
+    if len(materials) > _MOST_MATERIALS or len(surface.vertices) > np.iinfo(np.uint16).max:
         raise ValueError(
             f"seed {seed}: {len(materials)} pieces, {len(surface.vertices)} vertices: too many"
         )
@@ -373,7 +373,7 @@ def _person(
 
     def pad(values: Sequence[Any], kind: type) -> np.ndarray:
         """Numbers of the materials, with zeros up to the most that there may be."""
-        return np.pad(np.asarray(values), (0, MOST_MATERIALS - len(materials))).astype(kind)
+        return np.pad(np.asarray(values), (0, _MOST_MATERIALS - len(materials))).astype(kind)
 
     identities = [id(material) for material in materials]
     # stream 20 of a seed draws poses: others than those of written sets

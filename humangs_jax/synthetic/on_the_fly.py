@@ -39,9 +39,9 @@ from humangs_jax.synthetic.bank import SLOPE_STEP, SLOPE_ZERO, UV_STEPS, PeopleB
 from humangs_jax.synthetic.subject import APPEARANCES, SPLITS, SUPERSAMPLING, subject_key
 from humangs_jax.synthetic.surroundings import pick
 
-POSES = 2
+_POSES = 2
 """Poses of an example."""
-Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
+_Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
 """Numbers for the cameras of views, azimuths, poses, and shares of close cameras."""
 
 
@@ -61,7 +61,7 @@ class OnTheFlyConfig:
     target_size: Side = 256
     """Side of the targets, pixels."""
     mixed_pose_share: Share = 0.3
-    """Share of examples whose inputs show any of the `POSES`, as targets do; in the others all
+    """Share of examples whose inputs show any of the `_POSES`, as targets do; in the others all
     inputs show the first.
     """
     jitter: Spread = 0.7
@@ -182,7 +182,7 @@ def _draw_numbers(
     """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
     shapes = {
         "person": (),
-        "poses": (POSES, 2),
+        "poses": (_POSES, 2),
         "lights": (surroundings.LIGHT_NUMBERS,),
         "dyed": (),
     }
@@ -253,7 +253,7 @@ def _pose_person(
 
 def _plans(
     numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig, count: Int[Array, ""] | None
-) -> tuple[Plan, Plan]:
+) -> tuple[_Plan, _Plan]:
     """The plans of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses
     (v,), shares of close cameras (v,).
 
@@ -262,7 +262,7 @@ def _plans(
     azimuths = surroundings.azimuths_from(
         numbers["input_azimuths"], config.jitter, config.scattered_share, count
     )
-    own, other = (pick(numbers[name], POSES) for name in ("input_poses", "target_poses"))
+    own, other = (pick(numbers[name], _POSES) for name in ("input_poses", "target_poses"))
     own = jnp.where(numbers["mixed"] < config.mixed_pose_share, own, 0)
     anywhere = surroundings.azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
     close = jnp.full(config.target_views, 0.2)  # share of close cameras
@@ -275,7 +275,7 @@ def _plans(
 
 
 def _views(
-    bank: PeopleBank, scene: Scene, plan: Plan, config: OnTheFlyConfig, size: int
+    bank: PeopleBank, scene: Scene, plan: _Plan, config: OnTheFlyConfig, size: int
 ) -> SubjectViews:
     """Views of some of the scene's poses."""
 

@@ -19,7 +19,7 @@ from humangs_jax.synthetic.surfaces import choice
 
 _HAND_LENGTH = 0.6
 """Length from the wrist to a little beyond the knuckles, in lengths of the forearm."""
-Capsule = tuple[kin.Vector, kin.Vector, float]
+_Capsule = tuple[kin.Vector, kin.Vector, float]
 """Two ends and a radius, metres."""
 
 
@@ -250,7 +250,7 @@ class _Goal:
     """How much the collar is raised, radians."""
 
 
-GOALS = {
+_GOALS = {
     "hang": _Goal(0.36, (0.28, -1.0, 0.1), (-1.5, -1.05), (-0.25, 0.35), (0.05, 0.6)),
     "away": _Goal(0.14, (0.6, -0.85, 0.08), (-1.3, -0.7), flexed=(0.05, 0.6)),
     "hip": _Goal(0.09, (0.35, -0.82, 0.12)),
@@ -273,7 +273,7 @@ ARMS = (
 
 def draw_goal(rng: np.random.Generator) -> str:
     """The name of a goal."""
-    return choice(rng, {name: goal.odds for name, goal in GOALS.items()})
+    return choice(rng, {name: goal.odds for name, goal in _GOALS.items()})
 
 
 def bend_arm(
@@ -294,7 +294,7 @@ def bend_arm(
     collar, shoulder, elbow, wrist = ARMS[side]
     mirror = np.ones(3) if side == 0 else kin.MIRROR
     n = 400  # poses of the arm
-    wanted = GOALS[goal]
+    wanted = _GOALS[goal]
     rotations[collar] = (
         np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
     )
@@ -354,7 +354,7 @@ def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
 
 def _body_capsules(
     build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations
-) -> list[Capsule]:
+) -> list[_Capsule]:
     """Trunk, legs and head of a posed body: two ends (3,) and a radius each, metres."""
     sideways = 0.25 * (positions[Joint.LEFT_HIP] - positions[Joint.RIGHT_HIP])
     top = positions[Joint.NECK] + world[Joint.SPINE3] @ np.asarray([0, -0.06, 0])
@@ -370,7 +370,7 @@ def _body_capsules(
     return capsules
 
 
-def _arm_capsules(build: kin.Build, positions: kin.Rotations, side: int) -> list[Capsule]:
+def _arm_capsules(build: kin.Build, positions: kin.Rotations, side: int) -> list[_Capsule]:
     """Upper arm, forearm and hand of one side."""
     _, shoulder, elbow, wrist = (positions[joint] for joint in ARMS[side])
     radius = build.arm_radius + 0.01
@@ -378,7 +378,7 @@ def _arm_capsules(build: kin.Build, positions: kin.Rotations, side: int) -> list
 
 
 def _clearance(
-    build: kin.Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]
+    build: kin.Build, capsules: list[_Capsule], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
     """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
     distances = []
@@ -397,11 +397,11 @@ def _along(
     return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]
 
 
-FINGERS = ((0, 1.0), (1, 0.15), (3, -1.2), (2, -0.6))
+_FINGERS = ((0, 1.0), (1, 0.15), (3, -1.2), (2, -0.6))
 """Index, middle, pinky, ring, in the order of SMPL-X's joints: place among a gesture's curls, share
 of its spread.
 """
-GESTURES = {
+_GESTURES = {
     "relaxed": (0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25),
     "flat": (0.15, (0.03, 0.03, 0.04, 0.05), 0.0, 0.05),
     "spread": (0.1, (0.0, 0.0, 0.0, 0.0), 0.16, -0.3),
@@ -423,14 +423,17 @@ def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> 
         first, mirror = Joint.LEFT_HAND, np.ones(3)
     else:
         first, mirror = Joint.RIGHT_HAND, kin.MIRROR
-    goal, t = choice(rng, {name: odds for name, (odds, *_) in GESTURES.items()}), rng.beta(2.5, 1.0)
+    goal, t = (
+        choice(rng, {name: odds for name, (odds, *_) in _GESTURES.items()}),
+        rng.beta(2.5, 1.0),
+    )
     blends = (
         (1 - t) * np.asarray(a) + t * np.asarray(b)
-        for a, b in zip(GESTURES["relaxed"], GESTURES[goal], strict=True)
+        for a, b in zip(_GESTURES["relaxed"], _GESTURES[goal], strict=True)
     )
     _, curls, spread, thumb = blends
     thumb = thumb + rng.normal(0, 0.08)
-    for finger, (place, splay) in enumerate(FINGERS):
+    for finger, (place, splay) in enumerate(_FINGERS):
         curl = curls[place] * rng.uniform(0.85, 1.15) + rng.normal(0, 0.03)
         # from the palm outwards each knuckle has a share of the curl
         for bone, share in enumerate((0.85, 1.0, 0.7)):

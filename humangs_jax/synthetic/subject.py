@@ -391,8 +391,8 @@ _POINT_STEP = 1 << 15
 _shaded_vertices = jax.jit(surroundings.shaded_vertices)
 _seen_from_behind = jax.jit(surroundings.seen_from_behind)
 _light_points = jax.jit(surroundings.light_points)
-Ids = Int[np.ndarray, " m"]
-Values = Float[np.ndarray, "m 3"]
+_Ids = Int[np.ndarray, " m"]
+_Values = Float[np.ndarray, "m 3"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -464,12 +464,12 @@ def render_view(
 
 def light_points(
     posed: PosedSubject,
-    face_ids: Ids,
-    weights: Values,
-    albedo: Values,
-    slopes: Values,
+    face_ids: _Ids,
+    weights: _Values,
+    albedo: _Values,
+    slopes: _Values,
     eye: Array | None = None,
-) -> Values:
+) -> _Values:
     """Colors (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the
     weights of the corners.
 
@@ -501,7 +501,7 @@ def light_points(
     return np.concatenate(colors)
 
 
-def spots_at(subject: SyntheticSubject, face_ids: Ids, weights: Values) -> Spots:
+def spots_at(subject: SyntheticSubject, face_ids: _Ids, weights: _Values) -> Spots:
     """Points on faces, given by the weights of their corners, as materials see them."""
     attributes = subject.surface.attributes
     values = np.concatenate([attributes["cloth"], attributes["template"]], axis=1)
@@ -510,7 +510,7 @@ def spots_at(subject: SyntheticSubject, face_ids: Ids, weights: Values) -> Spots
     return Spots(blended[:, :4], blended[:, 4:])
 
 
-def paint(subject: SyntheticSubject, face_ids: Ids, spots: Spots) -> tuple[Values, Values]:
+def paint(subject: SyntheticSubject, face_ids: _Ids, spots: Spots) -> tuple[_Values, _Values]:
     """The materials at points on given faces: albedo (m, 3) and slope (m, 3) of the painted
     folds.
     """

@@ -24,13 +24,13 @@ from humangs_jax.synthetic.anatomy import Vector
 from humangs_jax.synthetic.fabrics import ALBEDO_LIMIT
 from humangs_jax.synthetic.surfaces import Points, choice
 
-VERTICAL_FOV = np.deg2rad(60.0)
+_VERTICAL_FOV = np.deg2rad(60.0)
 """Vertical field of view, radians."""
-ELEVATION = np.deg2rad(np.asarray([-5.0, 15.0]))
+_ELEVATION = np.deg2rad(np.asarray([-5.0, 15.0]))
 """Range of elevations of cameras, radians."""
 DISTANCE_FACTOR = (1.8, 2.2)
 """Range of distances in bounding radii: nearer than 1.7 the frame cuts heads and feet."""
-CLOSE_FACTOR = (0.8, 1.7)
+_CLOSE_FACTOR = (0.8, 1.7)
 """Range of distances of close views, which show parts of the person."""
 CLOSE_SPREAD = 0.85
 """Close cameras look at points up to this share of the way from the middle of the person to its
@@ -41,8 +41,8 @@ CLEARANCE = 0.3
 CAMERA_NUMBERS = 5
 """Random numbers of a camera."""
 Angles = Float[np.ndarray, " v"]
-Number = Float[Array, ""] | float
-Each = Float[Array | np.ndarray, "3 ..."]
+_Number = Float[Array, ""] | float
+_Each = Float[Array | np.ndarray, "3 ..."]
 """Values of three lights or channels."""
 
 
@@ -69,7 +69,7 @@ def cameras_around(
     """
     center, radius = bounding_sphere(vertices)
     distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
-    elevations = rng.uniform(*ELEVATION, len(azimuths))
+    elevations = rng.uniform(*_ELEVATION, len(azimuths))
     # padded to a multiple of 4096: few shapes are compiled
     points = np.pad(vertices - center, ((0, -len(vertices) % 4096), (0, 0)), mode="edge")
     near = _nearest_distances(
@@ -84,15 +84,15 @@ def cameras_around(
 def close_cameras(
     rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int
 ) -> Camera:
-    """A batch of cameras that see parts: `CLOSE_FACTOR` bounding radii away from points between
+    """A batch of cameras that see parts: `_CLOSE_FACTOR` bounding radii away from points between
     middle and surface.
     """
     center, radius = bounding_sphere(vertices)
     count = len(azimuths)
     towards = vertices[rng.integers(len(vertices), size=count)]
     targets = center + rng.uniform(0, CLOSE_SPREAD, (count, 1)) * (towards - center)
-    distances = radius * rng.uniform(*CLOSE_FACTOR, count)
-    elevations = rng.uniform(*ELEVATION, count)
+    distances = radius * rng.uniform(*_CLOSE_FACTOR, count)
+    elevations = rng.uniform(*_ELEVATION, count)
     flat = np.cos(elevations)
     directions = np.stack(
         [flat * np.sin(azimuths), np.sin(elevations), flat * np.cos(azimuths)], -1
@@ -115,7 +115,7 @@ def _orbits(
     elevations: Float[Array, " v"],
 ) -> Camera:
     """Makes a batch of cameras, one for each target that is looked at."""
-    K = intrinsics_from_fov(VERTICAL_FOV, size, size)
+    K = intrinsics_from_fov(_VERTICAL_FOV, size, size)
 
     def one(target, distance, azimuth, elevation):
         cameras = orbit(target, distance[None], azimuth[None], elevation[None], K, size, size)
@@ -128,8 +128,8 @@ def camera_from(
     u: Array,
     vertices: Float[Array, "n 3"],
     count: Int[Array, ""] | int,
-    azimuth: Number,
-    close: Number,
+    azimuth: _Number,
+    close: _Number,
     size: int,
 ) -> Camera:
     """A square camera of `size` pixels that looks at a posed person from an azimuth.
@@ -142,8 +142,8 @@ def camera_from(
     center = 0.5 * (low + high)
     radius = jnp.sqrt(jnp.max(jnp.sum((vertices - center) ** 2, -1)))
     near = is_close < close
-    elevation = _within(ELEVATION, tilt)
-    factor = jnp.where(near, _within(CLOSE_FACTOR, spread), _within(DISTANCE_FACTOR, spread))
+    elevation = _within(_ELEVATION, tilt)
+    factor = jnp.where(near, _within(_CLOSE_FACTOR, spread), _within(DISTANCE_FACTOR, spread))
     towards_vertex = vertices[pick(place, count)] - center
     target = center + jnp.where(near, CLOSE_SPREAD * outwards, 0.0) * towards_vertex
     along = _along_axes(vertices - target, azimuth, elevation)
@@ -152,7 +152,7 @@ def camera_from(
     beside = CLEARANCE**2 - (above * above + aside * aside)
     clear = jnp.max(jnp.where(beside > 0, ahead + jnp.sqrt(jnp.maximum(beside, 0)), -jnp.inf))
     distance = jnp.maximum(factor * radius, jnp.where(near, clear, _nearest_distance(*along)))
-    K = intrinsics_from_fov(VERTICAL_FOV, size, size).astype(vertices.dtype)
+    K = intrinsics_from_fov(_VERTICAL_FOV, size, size).astype(vertices.dtype)
     eye = target + distance * _axes(azimuth, elevation)[0]
     return look_at(eye, target, jnp.asarray((0.0, 1.0, 0.0), vertices.dtype), K, size, size)
 
@@ -163,7 +163,7 @@ def _nearest_distance(
     """Least distance from the origin at which a camera that looks at it has all points within 98 %
     of its square frame.
     """
-    slope = 0.98 * np.tan(VERTICAL_FOV / 2)
+    slope = 0.98 * np.tan(_VERTICAL_FOV / 2)
     return jnp.max(jnp.maximum(jnp.abs(above), jnp.abs(aside)) / slope + ahead)
 
 
@@ -180,7 +180,7 @@ def _within(limits: tuple[float, float] | Float[np.ndarray, "2"], share: Scalar)
     return limits[0] + (limits[1] - limits[0]) * share
 
 
-def _axes(azimuth: Number, elevation: Scalar) -> tuple[Vector3, Vector3, Vector3]:
+def _axes(azimuth: _Number, elevation: Scalar) -> tuple[Vector3, Vector3, Vector3]:
     """Unit vectors towards a camera, up and right in its image."""
     sa, ca, se, ce = jnp.sin(azimuth), jnp.cos(azimuth), jnp.sin(elevation), jnp.cos(elevation)
     zero = jnp.zeros_like(sa)
@@ -192,7 +192,7 @@ def _axes(azimuth: Number, elevation: Scalar) -> tuple[Vector3, Vector3, Vector3
 
 
 def _along_axes(
-    points: Float[Array, "n 3"], azimuth: Number, elevation: Scalar
+    points: Float[Array, "n 3"], azimuth: _Number, elevation: Scalar
 ) -> tuple[Float[Array, " n"], ...]:
     """Coordinates (n,) along `_axes`; written out: matrix products are of low precision on GPU and
     TPU.
@@ -239,10 +239,10 @@ WHITEST = 0.97
 """Brightness that they approach."""
 LIGHT_NUMBERS = 28
 """Random numbers of a scene of lights."""
-WARM = np.asarray([1.0, 0.0, -1.0])
+_WARM = np.asarray([1.0, 0.0, -1.0])
 """Direction of a warm color in RGB."""
 
-SCENES = {
+_SCENES = {
     "studio": (0.34, (-0.8, 0.8), (0.5, 1.0), (0.5, 0.75), (0.18, 0.34), (0.68, 0.82), 0.0, 0.68),
     "overcast": (0.22, (-3.1, 3.1), (0.7, 1.2), (0.15, 0.4), (0.05, 0.2), (0.85, 1.02), -0.03, 0.6),
     "sun": (0.2, (-3.1, 3.1), (0.45, 1.1), (0.85, 1.2), (0.08, 0.25), (0.56, 0.74), 0.10, 0.68),
@@ -252,11 +252,12 @@ SCENES = {
 """Kinds of light: odds; azimuth and elevation of the key light (radians), its strength, that of the
 fill, the sky's; how much warmer the key is than the sky; and the ground's brightness against the
 sky's."""
-_SCENES = np.asarray([np.hstack(row) for row in SCENES.values()], np.float32)
+_SCENE_ROWS = np.asarray([np.hstack(row) for row in _SCENES.values()], np.float32)
+"""The same as numbers, for the device."""
 
 
-Vectors = Float[Array, "*p 3"]
-Values = Float[Array, "*p"]
+_Vectors = Float[Array, "*p 3"]
+_Values = Float[Array, "*p"]
 
 
 @pytree_dataclass
@@ -279,7 +280,7 @@ def sample_lights(rng: np.random.Generator) -> Lights:
     """A studio, an overcast or a sunny day, a lit room or a window; exposed and balanced by a
     camera that errs.
     """
-    scene = SCENES[choice(rng, {name: row[0] for name, row in SCENES.items()})]
+    scene = _SCENES[choice(rng, {name: row[0] for name, row in _SCENES.items()})]
     _, azimuths, heights, key, fill, sky_range, warmth, bounce = scene
     azimuth = rng.uniform(*azimuths) * rng.choice([-1, 1])
     angles = azimuth + np.asarray(
@@ -288,7 +289,7 @@ def sample_lights(rng: np.random.Generator) -> Lights:
     elevations = np.asarray([rng.uniform(*heights), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)])
     power = np.asarray([rng.uniform(*key), rng.uniform(*fill), rng.uniform(0.4, 1.2) * fill[1]])
     tint = rng.uniform(-0.03, 0.03, (3, 3))
-    sky = rng.uniform(*sky_range) * (1 + rng.uniform(-0.02, 0.02, 3) - 0.5 * warmth * WARM)
+    sky = rng.uniform(*sky_range) * (1 + rng.uniform(-0.02, 0.02, 3) - 0.5 * warmth * _WARM)
     exposure = np.exp(rng.normal(0.06, 0.12))
     balance = rng.normal(0, 0.045)
     green = rng.normal(0, 0.012)
@@ -299,9 +300,9 @@ def sample_lights(rng: np.random.Generator) -> Lights:
 
 def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
     """The scenes of `sample_lights` on the device; u: `LIGHT_NUMBERS` numbers in [0, 1)."""
-    odds = np.cumsum(_SCENES[:, 0])
+    odds = np.cumsum(_SCENE_ROWS[:, 0])
     # the first number chooses the scene, as its odds say
-    row = jnp.asarray(_SCENES)[jnp.sum(u[0] * odds[-1] >= odds[:-1])]
+    row = jnp.asarray(_SCENE_ROWS)[jnp.sum(u[0] * odds[-1] >= odds[:-1])]
     azimuth, height, key, fill, sky = row[1:11].reshape(5, 2)
     warmth, bounce = row[11], row[12]
 
@@ -320,7 +321,7 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
     )
     power = jnp.stack([within(key, u[9]), within(fill, u[10]), within((0.4, 1.2), u[11]) * fill[1]])
     tint = within((-0.03, 0.03), u[12:21].reshape(3, 3))
-    color = within(sky, u[21]) * (1 - 0.5 * warmth * WARM)
+    color = within(sky, u[21]) * (1 - 0.5 * warmth * _WARM)
     # exposure and white balance err as those of real cameras
     normal = ndtri(jnp.clip(u[22:25], 1e-4, 1 - 1e-4))
     exposure = 0.12 * normal[0] + 0.06
@@ -336,32 +337,32 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
 
 def _lights(
     numpy: ModuleType,
-    angles: Each,
-    elevations: Each,
-    power: Each,
-    tint: Each,
-    warmth: Number,
-    sky: Each,
-    ground: Each,
-    gain: Each,
+    angles: _Each,
+    elevations: _Each,
+    power: _Each,
+    tint: _Each,
+    warmth: _Number,
+    sky: _Each,
+    ground: _Each,
+    gain: _Each,
 ) -> Lights:
     """numpy: the module of the arrays' kind."""
     flat = numpy.cos(elevations)
     directions = numpy.stack(
         [flat * numpy.sin(angles), numpy.sin(elevations), flat * numpy.cos(angles)], -1
     )
-    strengths = power[:, None] * (1 + tint + warmth * np.outer([1.0, 0.0, 0.0], WARM))
+    strengths = power[:, None] * (1 + tint + warmth * np.outer([1.0, 0.0, 0.0], _WARM))
     return Lights(
         *(jnp.asarray(x, jnp.float32) for x in (directions, strengths, sky, ground, gain))
     )
 
 
 def shaded_vertices(
-    vertices: Vectors,
-    normals: Vectors,
+    vertices: _Vectors,
+    normals: _Vectors,
     direction: Float[Array, "3"],
     faces: Int[Array, "f 3"] | None = None,
-) -> tuple[Values, Values]:
+) -> tuple[_Values, _Values]:
     """(n,) openness in [0.35, 1] and (n,) share of the light from `direction` that arrives, in
     [DARKEST, 1].
 
@@ -444,12 +445,12 @@ def seen_from_behind(
 def light_points(
     lights: Lights,
     corners: Array,
-    weights: Vectors,
+    weights: _Vectors,
     behind: Array,
-    albedo: Vectors,
-    slopes: Vectors,
-    sheen: Values,
-) -> Vectors:
+    albedo: _Vectors,
+    slopes: _Vectors,
+    sheen: _Values,
+) -> _Vectors:
     """Colors (p, 3) of points on faces.
 
     corners: (p, 15) normal (3), openness and share of the key light of each corner of the point's
@@ -467,8 +468,13 @@ def light_points(
 
 
 def shade(
-    lights: Lights, albedo: Vectors, normals: Vectors, openness: Values, lit: Values, sheen: Values
-) -> Vectors:
+    lights: Lights,
+    albedo: _Vectors,
+    normals: _Vectors,
+    openness: _Values,
+    lit: _Values,
+    sheen: _Values,
+) -> _Vectors:
     """Colors in [0, 1] of points; normals are unit, `lit` is the share of the key light that
     arrives.
     """
@@ -487,7 +493,7 @@ def shade(
     return rolled_off(jnp.minimum(albedo, ALBEDO_LIMIT) * light * lights.gain)
 
 
-def rolled_off(colors: Vectors) -> Vectors:
+def rolled_off(colors: _Vectors) -> _Vectors:
     """Colors from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns
     out at once.
     """
@@ -498,7 +504,7 @@ def rolled_off(colors: Vectors) -> Vectors:
     )
 
 
-def _unit(vectors: Vectors) -> Vectors:
+def _unit(vectors: _Vectors) -> _Vectors:
     return vectors / (jnp.linalg.norm(vectors, axis=-1, keepdims=True) + 1e-9)
 
 
