@@ -138,14 +138,18 @@ def load_motion(
 
 
 def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array | None) -> Motion:
+    """The motion of a file that is there, checked. Raises: MotionError and what readers raise."""
     read = _reader(path)
 
     def body():
+        """The joints that will move; the shipped ones are read where they are needed."""
         if rest_joints is None:
             return skeleton.shipped_joints()
         return np.asarray(rest_joints, np.float64)
 
-    with np.errstate(all="ignore"):  # of numbers without sense, which are refused below
+    # skeletons are brought to the body, poses are turned upright; numbers without sense are refused
+    # below
+    with np.errstate(all="ignore"):
         found = read(path, options)
         if isinstance(found, skeleton.Clip):
             rate = skeleton.whole_rate(found.fps)
@@ -157,11 +161,13 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
             else:
                 axis, note = up, ""
             rotations, translations = turned_upright(found.rotations, found.translations, axis)
+    # joints, sizes and rates that a motion can have
     if rest_joints is not None and rotations.shape[1] != len(rest_joints):
         raise MotionError(
             path, "rotations", f"expected {len(rest_joints)} joints, got {rotations.shape[1]}"
         )
-    with np.errstate(over="ignore"):  # what is no float32 is infinite from here on
+    # what is no float32 is infinite from here on
+    with np.errstate(over="ignore"):
         rotations, translations = rotations.astype(np.float32), translations.astype(np.float32)
     if not np.isfinite(rotations).all():
         raise MotionError(path, "", "expected rotations and a skeleton of finite size")
@@ -181,17 +187,12 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
     # one frame in more than a minute and a half is no motion
     if rate < 0.01:
         raise MotionError(path, "", f"{rate:g} frames per second: expected at least 0.01")
-    if found.face is None:
-        names, faces = (), None
-    else:
-        names, faces = checked_track(found.face, len(rotations))
-    motion = Motion(
-        from_host(rotations),
-        from_host(translations),
-        rate,
-        None if faces is None else from_host(faces),
-        names,
-    )
+    names, faces = (), None
+    if found.face is not None:
+        names, values = checked_track(found.face, len(rotations))
+        faces = from_host(values)
+    motion = Motion(from_host(rotations), from_host(translations), rate, faces, names)
+    # what the user is told about the file
     if isinstance(found, Poses) and found.frames is not None:
         motion, filled = _without_gaps(motion, found.frames, path)
         note = "; ".join(filter(None, (note, filled)))
@@ -246,6 +247,7 @@ def _reader(path: Path) -> MotionFormat:
 
 
 def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
+    """The axis that is up in the world of poses, and a note about it, see `rules.up_axis`."""
     rotations, translations, usual = poses.rotations, poses.translations, poses.up
     stands = None
     if not poses.fixed:

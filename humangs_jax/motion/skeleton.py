@@ -353,6 +353,7 @@ def _steps_of_body(
     moves: Float[np.ndarray, "m 3"],
     source: _Source,
 ) -> Float[np.ndarray, " m"]:
+    """(m,) how high the lowest joint of our feet is above its place in the T-pose."""
     places = {0: moves}
 
     def place(j):

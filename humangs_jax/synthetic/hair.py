@@ -214,6 +214,7 @@ def _fringe(rng: np.random.Generator, haircut: Haircut) -> _Opening:
     phase = rng.uniform(0, 6.28, 3)
 
     def above(azimuths, height):
+        """How far points are above the edge, which has waves."""
         a = azimuths * haircut.side
         waves = zip((0.0035, 0.0025, 0.003), (23, 41, 9), phase, strict=True)
         return (

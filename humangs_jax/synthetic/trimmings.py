@@ -180,6 +180,7 @@ def _printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garmen
 
     # paint the print once, around its own middle
     def motif(result, x, y, where):
+        """The print on colors, at places in metres from its middle."""
         if kind in ("words", "number"):
             if framed and kind == "words":
                 box = band(np.abs(x), -1, (0.5 * width + 1.5) * cell) * band(

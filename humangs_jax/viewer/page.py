@@ -203,6 +203,7 @@ def _fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | 
 
 
 def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any, Any]]:
+    """Values of avatar and motion that have to be finite, by name."""
     values = {
         name: (getattr(avatar, name), FINITE)
         for name in ("skinning_weights", "rest_vertices", "rest_joints")
@@ -216,6 +217,7 @@ def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any,
 
 
 def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    """Add Gaussians, skinning and light to the header and the arrays, in 16 bits or fewer."""
     g = avatar.gaussians
     means, quats, scales, opacities, colors = (
         np.asarray(x, np.float64) for x in (g.means, g.quats, g.scales, g.opacities, g.colors)
@@ -277,6 +279,7 @@ def _quantized(
 
 
 def _joined(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Packed:
+    """The arrays one after the other; their types, shapes and places go into the header."""
     header["arrays"], parts, offset = {}, [], 0
     for name, array in arrays.items():
         data = np.ascontiguousarray(array).tobytes()
@@ -413,6 +416,7 @@ def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
 
     class Page(BaseHTTPRequestHandler):
         def do_GET(self):
+            """Answer with the text of the path, or that there is none."""
             content = pages.get(self.path.split("?")[0].replace("/index.html", "/"))
             data = b"" if content is None else content.encode()
             self.send_response(404 if content is None else 200)
