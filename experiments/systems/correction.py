@@ -112,6 +112,7 @@ class CorrectionMLP(GaussianDriver):
             raise ValueError(
                 f"driver.gaussians_per_vertex {per_vertex}: the decoder gives another number"
             )
+        # an MLP reads the features of a vertex and the pose
         vector = jnp.broadcast_to(
             pose_vector(target.pose, self.joints), (len(local), 3 * (self.joints - 1))
         )
@@ -123,9 +124,9 @@ class CorrectionMLP(GaussianDriver):
         gaussians, offsets = apply_corrections(
             outputs.gaussians, raw.reshape(-1, CHANNELS), self.offset_scale
         )
-        driven = offsets.reshape(
-            len(local), per_vertex, 3
-        )  # of a body of 1.8 m, metres are normalised units
-        if outputs.tight_offsets is not None:  # the canonical ones stay small, too
+        # of a body of 1.8 m, metres are normalised units
+        driven = offsets.reshape(len(local), per_vertex, 3)
+        # the canonical ones stay small, too
+        if outputs.tight_offsets is not None:
             driven = jnp.concatenate([outputs.tight_offsets, driven], axis=1)
         return replace(outputs, gaussians=gaussians, tight_offsets=driven)

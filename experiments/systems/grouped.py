@@ -109,6 +109,7 @@ class GroupDecoder(Decoder):
                 f"a body of {vertices} vertices: {groups} groups of decoder.group_size"
                 f" {self.group_size} have {room}"
             )
+        # a token an attribute: each gives that attribute of all vertices of its group
         first = {"scales": self.initial_log_scale, "opacities": INITIAL_OPACITY}
         raw = {}
         for token, (name, numbers) in zip(features, ATTRIBUTES.items(), strict=True):
@@ -121,6 +122,7 @@ class GroupDecoder(Decoder):
                 ),
                 name=name,
             )(token).reshape(room, numbers)[:vertices]
+        # offsets are limited, in units of the body
         unit = subject_unit(inputs.canonical_vertices)
         offsets = self.offset_scale * jnp.tanh(raw["offsets"] / self.offset_scale)
         gaussians = Gaussians(

@@ -103,10 +103,12 @@ class ShellTextureReader(Reader):
         covered = texels.covered
 
         def look(best, view):
+            """Take colors from a view where it faces the surface more than those before."""
             image, foreground, depth_map, camera, vertices, normals, present = view
             surface_normals = safe_normalize(texels.interpolate(normals), jnp.zeros(3))
             points = texels.interpolate(vertices) + steps[:, None, None, None] * surface_normals
             shape, points = points.shape[:-1], points.reshape(-1, 3)
+            # a point is seen inside of the photo, on the person, not behind the surface
             pixels, depths = project_vertices(camera, points)
             indices = texel_indices(pixels, size, size, grid)
             surface, person = (
@@ -129,6 +131,7 @@ class ShellTextureReader(Reader):
                 jnp.where(better[..., None], colors, best[1]),
             ), None
 
+        # one view after the other; what none has seen on the skin takes colors of its neighbours
         shape = (len(self.shells), *covered.shape)
         nothing = jnp.zeros(shape), jnp.full((*shape, 3), UNSEEN_COLOR)
         views = (
@@ -198,6 +201,7 @@ class ShellDecoder(Decoder):
                 "shell textures need texels, canonical_normals and skinning_weights of the inputs"
             )
         unit, shells = subject_unit(inputs.canonical_vertices), len(features.distances)
+        # the network reads colors and places of all shells
         covered = texels.covered
         surface = texels.interpolate(inputs.canonical_vertices / unit)
         offsets = features.distances[:, None, None, None] * safe_normalize(
@@ -210,6 +214,7 @@ class ShellDecoder(Decoder):
         raw = network(entering)[0]
         raw = jnp.moveaxis(raw.reshape(*covered.shape, shells, -1), 2, 0)
         quats, scales, opacities = jnp.split(raw, (CHANNELS[0], CHANNELS[0] + CHANNELS[1]), axis=-1)
+        # the skin is there where it was not seen, too; other shells are not
         shown = covered & features.seen.at[0].set(True)
 
         def flat(x):
@@ -224,8 +229,7 @@ class ShellDecoder(Decoder):
             ).reshape(-1),
             colors=flat(features.colors),
         )
-        rows = (
-            texels.interpolate(weights).at[..., 0].add(1.0 - covered)
-        )  # what shows nothing stays at the root
+        # what shows nothing stays at the root
+        rows = texels.interpolate(weights).at[..., 0].add(1.0 - covered)
         rows = jnp.tile(rows.reshape(-1, rows.shape[-1]), (shells, 1))
         return HumanGSOutputs(gaussians, skinning_weights=rows)

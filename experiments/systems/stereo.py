@@ -93,17 +93,16 @@ class StereoDecoder(Decoder):
     ) -> HumanGSOutputs:
         """See `parts.Decoder`. A photo without another one is compared with itself."""
         images, cameras, vertices = inputs.images, inputs.cameras, inputs.posed_vertices
-        size, grid, unit = (
-            (cameras.width, cameras.height),
-            ctx.conventions.pixel_grid,
-            subject_unit(inputs.canonical_vertices),
-        )
+        size, grid = (cameras.width, cameras.height), ctx.conventions.pixel_grid
+        unit = subject_unit(inputs.canonical_vertices)
+        # each photo is compared with the one that sees the person from the nearest direction
         middle = jnp.mean(vertices[0], axis=0)
         directions = safe_normalize(cameras.center - middle, jnp.zeros(3))
         near = jnp.where(
             inputs.present & ~jnp.eye(len(images), dtype=bool), directions @ directions.T, ABSENT
         )
         partners = jnp.argmax(near, axis=1)
+        # features that are compared, of unit length
         photos = jnp.concatenate([2 * images - 1, inputs.foreground[..., None]], axis=-1)
         maps = safe_normalize(
             UNet(self.widths, self.widths[:1], name="features")(photos), jnp.zeros(self.widths[0])
@@ -112,12 +111,14 @@ class StereoDecoder(Decoder):
         def sweep(
             camera: Camera, points: Float[Array, "n 3"], own: Array, other: Array, partner: Camera
         ) -> tuple[Array, ...]:
+            """How alike each pixel is to the other photo, for planes around the body."""
             origin, rays = pixel_rays(camera)
             reach = jnp.linalg.norm(points - origin, axis=-1)
             low, high = jnp.min(reach) - self.margin * unit, jnp.max(reach) + self.margin * unit
             distances = low + (high - low) * jnp.linspace(0, 1, self.planes)
 
             def common(distance: Array) -> Array:
+                """How alike the pixels are if they were that far away."""
                 pixels, _ = project_vertices(partner, (origin + distance * rays).reshape(-1, 3))
                 there = sample_bilinear(other, texel_indices(pixels, size, size, grid)).reshape(
                     own.shape
@@ -126,6 +127,7 @@ class StereoDecoder(Decoder):
 
             return jnp.moveaxis(jax.lax.map(common, distances), 0, -1), distances, origin, rays
 
+        # the network reads photos, features and costs, and gives scores and Gaussians a pixel
         others = jax.tree.map(lambda x: x[partners], (maps, cameras))
         costs, distances, origins, rays = jax.vmap(sweep)(cameras, vertices, maps, *others)
         raw = UNet(self.widths, (self.planes, sum(CHANNELS)), name="gaussians")(
@@ -135,6 +137,7 @@ class StereoDecoder(Decoder):
         def pixels(
             image: Array, seen: Array, raw: Array, cost: Array, distances: Array, *seen_from: Array
         ) -> Gaussians:
+            """A Gaussian a pixel of a photo, at the distance that the costs and scores expect."""
             origin, rays, focal = seen_from
             scores, quats, scales, opacities = jnp.split(
                 raw, self.planes + np.cumsum([0, *CHANNELS[:2]]), axis=-1

@@ -112,6 +112,7 @@ class TextureReader(Reader):
         size, grid = (inputs.cameras.width, inputs.cameras.height), ctx.conventions.pixel_grid
 
         def view(image, depth_map, camera, vertices, normals, present):
+            """Colors of the texels in a view, and their weights: by how much they face it."""
             points = texels.interpolate(vertices).reshape(-1, 3)
             pixels, depths = project_vertices(camera, points)
             visible = visible_vertices(pixels, depths, depth_map, size, grid) & covered & present
@@ -135,6 +136,7 @@ class TextureReader(Reader):
             inputs.posed_vertices / unit,
         )
         colors, weights = jax.vmap(view)(*arguments, inputs.posed_normals, inputs.present)
+        # the mean of the views that see a texel; grey where none does
         total = jnp.sum(weights, axis=0)
         mean = jnp.einsum("vtc,vt->tc", colors, safe_divide(weights, total), precision=EXACT)
         seen, shape = total > 0, texels.covered.shape
@@ -171,19 +173,19 @@ class SurfaceDecoder(Decoder):
         def flat(values):
             return texels.interpolate(values).reshape(len(covered), -1)
 
+        # flat Gaussians that cover the surface between them, in the axes of its normals
         up = jnp.asarray([0.0, 0.0, 1.0])
         along = COVERAGE * jnp.sqrt(AREA / jnp.maximum(jnp.sum(covered), 1)) * unit
         root = jnp.zeros(inputs.skinning_weights.shape[1]).at[0].set(1.0)
+        colors = jnp.full((len(covered), 3), UNSEEN_COLOR)
+        if texture is not None:
+            colors = texture.colors.reshape(-1, 3)
         gaussians = Gaussians(
             means=flat(inputs.canonical_vertices),
             quats=normal_frames(safe_normalize(flat(inputs.canonical_normals), up)),
             scales=jnp.broadcast_to(along * jnp.asarray([1.0, 1.0, THICKNESS]), (len(covered), 3)),
             opacities=jnp.where(covered, OPACITY, 0.0),
-            colors=(
-                jnp.full((len(covered), 3), UNSEEN_COLOR)
-                if texture is None
-                else texture.colors.reshape(-1, 3)
-            ),
+            colors=colors,
         )
         weights = jnp.where(covered[:, None], flat(inputs.skinning_weights), root)
         positions = texels.interpolate(inputs.canonical_vertices) / unit

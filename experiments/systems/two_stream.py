@@ -78,20 +78,18 @@ class TwoStreamReader(Reader):
         embedded = dense("position_out")(
             jax.nn.silu(dense("position_in")(positional_encoding(positions)))
         )
+        # neighbours along a curve through space share a point
         points, cluster = embedded, None
         if self.pooling > 1:
-            cluster, clusters = (
-                along_curve(positions, CURVE_REACH) // self.pooling,
-                -(-len(positions) // self.pooling),
-            )
+            cluster = along_curve(positions, CURVE_REACH) // self.pooling
+            clusters = -(-len(positions) // self.pooling)
             members = jax.ops.segment_sum(jnp.ones(len(positions)), cluster, clusters)
             points = jax.ops.segment_sum(embedded, cluster, clusters) / members[:, None]
         tokens = layer_norm(None, "token_norm")(dense("tokens")(tokens))
-        present = (
-            jnp.ones(len(tokens))
-            if count is None
-            else (jnp.arange(len(tokens)) < count).astype(jnp.float32)
-        )
+        # the mean token modulates every block
+        present = jnp.ones(len(tokens))
+        if count is not None:
+            present = (jnp.arange(len(tokens)) < count).astype(jnp.float32)
         pooled = jnp.sum(tokens * present[:, None], axis=0) / jnp.maximum(jnp.sum(present), 1)
         for index in range(self.blocks):
             last, sizes = index + 1 == self.blocks, (self.width, self.mlp_ratio, self.head_width)
@@ -130,18 +128,21 @@ class TwoStreamBlock(nn.Module):
         count: Int[Array, ""] | None,
         pooled: Float[Array, " d"],
     ) -> tuple[Float[Array, "n d"], Float[Array, "l d"]]:
+        """Points and tokens after attention to each other; the last block changes points alone."""
         dtype, width, vertices = self.runtime.compute_dtype, self.width, len(points)
 
         def dense(features, name):
             return nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
 
         def modulations(name, number):
+            """Shifts, scales and gates of one stream, 0 at first."""
             made = nn.Dense(
                 number * width, kernel_init=nn.initializers.zeros, name=f"{name}_modulation"
             )
             return jnp.split(made(jax.nn.silu(pooled)), number)
 
         def heads(x, name, modulation, ask):
+            """Keys and values of a stream, with queries if it asks."""
             shift, scale = modulation
             x = layer_norm(dtype, f"{name}_norm1")(x) * (1 + scale) + shift
             made = dense((2 + ask) * width, f"{name}_kvq")(x).reshape(len(x), -1, self.head_width)
@@ -153,6 +154,7 @@ class TwoStreamBlock(nn.Module):
             return [rms(k, "k"), v, *(rms(y, "q") for y in q)]
 
         def update(x, seen, name, modulation):
+            """A stream after what it has seen, and an MLP."""
             gate1, shift, scale, gate2 = modulation
             x = x + gate1 * dense(width, f"{name}_out")(seen.reshape(len(x), width))
             hidden = layer_norm(dtype, f"{name}_norm2")(x) * (1 + scale) + shift
@@ -165,16 +167,14 @@ class TwoStreamBlock(nn.Module):
             modulations("points", 6),
             modulations("tokens", 2 if self.last else 6),
         )
+        # both streams are one sequence for the attention
         k, v, q = heads(points, "points", of_points[:2], ask=True)
         token_k, token_v, *token_q = heads(tokens, "tokens", of_tokens[:2], ask=not self.last)
-        k, v, q = (
-            jnp.concatenate([k, token_k]),
-            jnp.concatenate([v, token_v]),
-            jnp.concatenate([q, *token_q]),
-        )
+        k, v = jnp.concatenate([k, token_k]), jnp.concatenate([v, token_v])
+        q = jnp.concatenate([q, *token_q])
         total = None if count is None else vertices + count
         seen = attention(q, k, v, total, self.runtime.attention)
         points = update(points, seen[:vertices], "points", of_points[2:])
-        return points, tokens if self.last else update(
-            tokens, seen[vertices:], "tokens", of_tokens[2:]
-        )
+        if self.last:
+            return points, tokens
+        return points, update(tokens, seen[vertices:], "tokens", of_tokens[2:])

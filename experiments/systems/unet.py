@@ -49,6 +49,7 @@ class UNet(nn.Module):
     def __call__(
         self, *given: Float[Array, "v h w _"], context: Any = None
     ) -> Float[Array, "v h w features"]:
+        """The features of maps. Raises: ValueError for maps that cannot be halved often enough."""
         coarsest, (_, height, width, _) = 2 ** (len(self.widths) - 1), given[0].shape
         if height % coarsest or width % coarsest:
             raise ValueError(
@@ -57,11 +58,13 @@ class UNet(nn.Module):
             )
 
         def convolved(x, width, name):
+            """Two convolutions."""
             for i in range(2):
                 x = jax.nn.relu(Convolution(width, KAIMING, self.dtype, name=f"{name}_{i}")(x))
             return x
 
         def encoded(x, mark):
+            """A map at every scale, finest first."""
             kept = []
             for i, width in enumerate(self.widths):
                 x = convolved(x if i == 0 else halved(x), width, f"{mark}down_{i}")
@@ -69,6 +72,7 @@ class UNet(nn.Module):
             return kept
 
         def decoded(x, features, mark):
+            """Features at the finest scale, with what the encoders kept of each."""
             for i, skip in reversed(list(enumerate(kept))):
                 x = convolved(
                     jnp.concatenate([doubled(x), skip], axis=-1), self.widths[i], f"{mark}up_{i}"
@@ -78,6 +82,7 @@ class UNet(nn.Module):
             )(x)
 
         def marks(many):
+            """Beginnings of names, none where there is one of a kind."""
             return [""] if len(many) == 1 else [f"{i}_" for i in range(len(many))]
 
         scales = zip(
