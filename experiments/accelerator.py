@@ -150,6 +150,7 @@ def check(small: bool) -> Iterator[Measurement]:
         return found
 
     def errors(found):
+        """{leaf: relative difference between the device and the CPU}."""
         pairs = zip(
             *(jax.tree_util.tree_leaves_with_path(found[name]) for name in ("device", "CPU")),
             strict=True,
@@ -166,17 +167,17 @@ def check(small: bool) -> Iterator[Measurement]:
         }
 
     def pass_once():
+        """The Gaussians of the shipped person."""
         variables, config = load_weights()
-        body, views = (
-            gaussian_body(load_body(), config),
-            to_network_views(load_capture(DEMO_CAPTURE), 256),
-        )
+        body = gaussian_body(load_body(), config)
+        views = to_network_views(load_capture(DEMO_CAPTURE), 256)
         inputs = jax.jit(prepare_inputs, static_argnames="config")(body, views, config)
         return errors(
             everywhere(lambda v, x: apply_humangs(v, x, config)[0].gaussians, variables, inputs)
         )
 
     def splat():
+        """An image of random Gaussians and its gradients."""
         scene = demo_scene(64 if small else 256, 1_000 if small else SCENES[0][0])
         gaussians, camera = scene
         config = plan_buffers(gaussians, camera)

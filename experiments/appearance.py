@@ -76,7 +76,8 @@ def appearance(
     def measure(seed):
         row: dict[str, Any] = {}
         person = functools.cache(lambda size: start.subject(seed, (VIEWS,), size))
-        for size, wrong in itertools.product(sorted(sizes), off):  # pictures are of the last
+        # every variant at every size of the photos, with the body off by so much
+        for size, wrong in itertools.product(sorted(sizes), off):
             subject = with_body_off(person(size), wrong)
             truth, inputs = subject.held_out, subject.inputs(VIEWS)
             drawn = {
@@ -88,6 +89,7 @@ def appearance(
                 f"{size} {wrong:g} {task}": {name: scores[name][task] for name in scores}
                 for task in scores[DEFAULT]
             }
+        # pictures are of the last
         view = frontal_view(subject.photos, truth, task_views(truth)["novel"].tolist())
         pictures = [truth.images[view], *(each.images[view] for each in drawn.values())]
         row["loose"] = looseness(person(min(sizes)).inputs(VIEWS), start.config)

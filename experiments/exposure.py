@@ -120,6 +120,7 @@ def exposure(
 
 def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, object]]:
     """Of each set of photos of a person what `exposure` shows."""
+    # cameras around the person, from the front on
     subject = make_subject(seed, body)
     posed = sample_pose(subject, 0)
     facing = np.asarray(matrix_from_axis_angle(jnp.asarray(posed.rotations[0])))
@@ -139,6 +140,7 @@ def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, objec
             )
         return together(photos)
 
+    # the same photos in one light, in flat light, and each on another day
     own = subject.lights
     flat = replace(
         own,
@@ -161,6 +163,7 @@ def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, objec
         views = [degrees.index(angle) for angle in angles]
         back = np.asarray([90 < angle < 270 or angle == 270 for angle in angles], int)
         photos = days.select(views)
+        # how far colors of points are from their true ones, by what gives the gains
         colors, seen = points_of(photos)
         common = gains_of(colors, seen)
         gains = {"photographed": np.ones_like(common), "common points": common}
@@ -171,6 +174,7 @@ def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, objec
             key: off(colors * each[:, None], in_flat, seen, parts, back)
             for key, each in gains.items()
         }
+        # in one light the gains should be 1
         same = one.select(views)
         points = points_of(same)
         moved = np.log(exposure_gains(same) * gains_of(*points))

@@ -147,6 +147,7 @@ def reconstruction_benchmark(
         "dtype": config.runtime.dtype,
         "repeats": repeats,
     }
+    # times of one size; memory of programs that are not run, for several numbers of views
     cases = {"time": functools.partial(benchmark, config, views, size, repeats)}
     for name, count in itertools.product(TOKENS, memory):
         cases[f"{name}, {count}"] = functools.partial(

@@ -79,12 +79,13 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
         return monotonic() - began
 
     carrier, config = gaussian_body(body, model), configured(how)
-    config = dataclasses.replace(
-        config, model=dataclasses.replace(model, runtime=config.model.runtime)
-    )  # room for tokens
+    # the network of the weights, with the room for tokens of the preset
+    model_config = dataclasses.replace(model, runtime=config.model.runtime)
+    config = dataclasses.replace(config, model=model_config)
     networks = load_loss_networks(lpips_net="alex", installed=True)
     state, average = (init_state(config, variables) for _ in range(2))
     average = average.params
+    # other processes make the people while the step compiles, for the shapes of one of them
     make = functools.partial(build_bank, body=body, split="train", displaced=carrier)
     seeds, processes = seeds_of("train", FIRST, how.people), max(1, (os.cpu_count() or 1) - 1)
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
@@ -99,15 +100,14 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
     examples = jax.jit(examples).lower(bank, 0).compile()
     print(f"{bank.people} people after {clock():.0f} s", flush=True)
 
+    # steps until the end, at a rate that falls with the time that is left
     out.mkdir(parents=True, exist_ok=True)
     start, saved, done, end, metrics = clock(), clock(), 0, 60 * how.minutes - RESERVE, {}
     with open(out / "log.jsonl", "w", buffering=1) as log:
-        while (now := clock()) < end:
-            rate = (
-                min(1.0, (done + 1) / WARM_UP)
-                * 0.5
-                * (1 + math.cos(math.pi * (now - start) / (end - start)))
-            )
+        while clock() < end:
+            now = clock()
+            left = 0.5 * (1 + math.cos(math.pi * (now - start) / (end - start)))
+            rate = min(1.0, (done + 1) / WARM_UP) * left
             batch = examples(bank, done)
             jax.block_until_ready(metrics)  # of the step before: the clock runs with the device
             state, average, metrics = step(state, average, batch, *given, rate)
@@ -127,6 +127,7 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
             f"--minutes {how.minutes:g}: people and compilation took {start:.0f} s, nothing is left"
             " for training"
         )
+    # the averaged weights, and their mean with those of the start
     trained = state_variables(average, state)
     mean = jax.tree.map(lambda a, b: START_SHARE * a + (1 - START_SHARE) * b, variables, trained)
     for name, made in {"weights": trained, "mean": mean}.items():

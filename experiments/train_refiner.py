@@ -355,6 +355,7 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
     variables = Refiner().init(
         jax.random.key(0), values, values, hidden, nothing, sample.graph, jnp.zeros(3)
     )
+    # weights to start from may have fewer layers than a `Refiner` has now
     if options.start:
         given = (load_refiner() if options.start == "shipped" else read_refiner(options.start))[
             "params"
@@ -380,6 +381,7 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
         "optimizer": optimizer.init(variables),
         "step": 0,
     }
+    # an earlier run is continued
     path = out / "state.msgpack"
     if path.is_file():
         state = serialization.from_bytes(state, path.read_bytes())
@@ -392,12 +394,14 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
     bar = tqdm(initial=int(state["step"]), total=options.steps, desc="steps")
     with bar, ThreadPoolExecutor(options.batch) as threads:
         try:
-            while (step := int(state["step"])) < options.steps:
+            while int(state["step"]) < options.steps:
+                step = int(state["step"])
                 if step % VALIDATE_EVERY == 0:
                     scores = validate(
                         state["variables"], validation, options.iterations, perceptual, splat
                     )
                     bar.write(f"step {step}: {scores} PSNR, LPIPS before and after each iteration")
+                # the gradients of a batch, a thread for each example
                 one = functools.partial(
                     step_gradient,
                     state["variables"],

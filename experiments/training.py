@@ -157,21 +157,19 @@ def training_steps(run: Run, only: tuple[str, ...] = ("small 256",), repeats: in
 
 
 def step_numbers(name: str, repeats: int) -> dict[str, Any]:
+    """Time, arithmetic and memory of a training step of a case."""
     jax.config.update("jax_enable_compilation_cache", False)
     config, body = settings(*CASES[name]), load_body()
     config = with_model(config, dtype="float32" if jax.default_backend() == "cpu" else "bfloat16")
-    networks, carrier, size = (
-        random_networks(config),
-        gaussian_body(body, config.model),
-        config.model.conventions.image_size,
-    )
+    networks, carrier = random_networks(config), gaussian_body(body, config.model)
+    size = config.model.conventions.image_size
+    # a batch, as the loader of a run makes it
     with tempfile.TemporaryDirectory() as folder:
         cache = CaptureCache([written_subject(Path(folder), config, body)], body)
         source = CaptureSource(cache, config.views, size, config.target_size, config.loss.depth > 0)
         batch = jax.block_until_ready(Loader(source, config.batch_size).batch_at(0))
-    if (
-        config.model.tokens == "foreground"
-    ):  # room for the person's foreground tokens, as a run would have
+    # room for the person's foreground tokens, as a run would have
+    if config.model.tokens == "foreground":
         first = jax.tree.map(lambda x: x[0], batch)
         inputs = jax.jit(prepare_inputs, static_argnames="config")(
             carrier, first.inputs, config.model
@@ -179,10 +177,9 @@ def step_numbers(name: str, repeats: int) -> dict[str, Any]:
         config = with_model(
             config, token_capacity=foreground(inputs, config.model)[0].runtime.token_capacity
         )
-    state, given = (
-        init_state(config, random_variables(config.model)),
-        (batch, carrier, networks, seed_numbers(config.seed)),
-    )
+    # the step is compiled apart from its runs
+    state = init_state(config, random_variables(config.model))
+    given = batch, carrier, networks, seed_numbers(config.seed)
     static, options = ("config", "mesh"), compiler_options()
     step = jax.jit(
         update, static_argnames=static, donate_argnames="state", compiler_options=options
@@ -197,6 +194,7 @@ def step_numbers(name: str, repeats: int) -> dict[str, Any]:
         state, found = program(state, *given)
         metrics.update({name: float(value) for name, value in jax.device_get(found).items()})
 
+    # in turns with a matrix product, which gives the peak of this run
     product, product_flops = matmul_program(config.model.runtime.dtype)
     times = medians({"matmul": product, "step": once}, repeats)
     (wall, cpu), model = map(float, times["step"]), config.model
