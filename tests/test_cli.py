@@ -80,10 +80,10 @@ def test_the_usage_of_an_import_can_be_typed_as_it_stands(humangs):
 
 
 def test_the_options_of_each_way_to_fit_exist():
-    parts = (fit.Detections, fit.Refinement, fit.Fit)
+    parts = (fit.Detections, fit.MaskFit, fit.Fit)
     options = {field.name for part in parts for field in dataclasses.fields(part)}
     for way, others in fit.WAYS.items():
-        assert others | {way.removeprefix("--")} <= options
+        assert others | {way.removeprefix("--").replace("-", "_")} <= options
 
 
 @pytest.mark.parametrize(("done", "code"), [(3, cli.INTERRUPTED), (5, 0)])

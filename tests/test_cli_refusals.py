@@ -233,9 +233,10 @@ BAD_USAGE = {
     ),
     "fit someone": "body.npz exists: --overwrite replaces it",
     FIT: "body.npz exists: --overwrite replaces it",
-    "fit someone --refine --bare": "--bare: is called --tight-clothes now",
-    "fit someone --tight-clothes": "--tight-clothes is for --refine, not for --keypoints",
-    "fit someone --refine --smoothness 0.1": "--smoothness is for --keypoints, not for --refine",
+    "fit someone --refine": "--refine: is called --to-masks now",
+    "fit someone --to-masks --bare": "--bare: is called --tight-clothes now",
+    "fit someone --tight-clothes": "--tight-clothes is for --to-masks, not for --keypoints",
+    "fit someone --to-masks --smoothness 0.1": "--smoothness is for --keypoints, not for --to-masks",
     f"{FIT} --smoothness -1 --out new": "--smoothness -1: expected at least 0",
 }
 REFUSED = [(line, cli.BAD_DATA, said) for line, said in BAD_DATA.items()]

@@ -51,7 +51,7 @@ MOST_OUTSIDE = 0.05
 """Share of the body's pixels: those outside of the mask take the background's color."""
 WIDER = (
     "{:.0%} of the body is outside the mask: it is wider than the person, or the pose is off; "
-    "`humangs fit CAPTURE --refine{}` fits {}shape and pose to the masks"
+    "`humangs fit CAPTURE --to-masks{}` fits {}shape and pose to the masks"
 )
 FIXED = (" --fixed-cameras", "")
 """What `WIDER` says where cameras are right."""

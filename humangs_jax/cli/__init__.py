@@ -153,7 +153,10 @@ def _prepare(verbose: bool) -> None:
     enable_compile_cache()
 
 
-RENAMED = {"fit": {"--bare": "--tight-clothes"}, "refine": {"--limit": "--refine"}}
+RENAMED = {
+    "fit": {"--bare": "--tight-clothes", "--refine": "--to-masks"},
+    "refine": {"--limit": "--refine"},
+}
 """Options of commands by the names that they had: an error says what they are called now."""
 
 

@@ -14,6 +14,7 @@ from humangs_jax.cli.captures import found_here, tell_found
 from humangs_jax.cli.options import (
     OutputPath,
     UsageError,
+    option_of,
     require_file,
     require_folder,
     require_replaceable,
@@ -63,10 +64,10 @@ class Detections:
 
 
 @dataclasses.dataclass(frozen=True)
-class Refinement:
-    """Refinement of a capture that has a body."""
+class MaskFit:
+    """Fit of a capture that has a body."""
 
-    refine: bool = False
+    to_masks: bool = False
     """Improve cameras, shape and poses by masks and keypoints: those of the fit, or --keypoints.
 
     Never worse than the start.
@@ -74,18 +75,18 @@ class Refinement:
     fixed_cameras: bool = False
     """Leave cameras as they are.
 
-    Else a fit to keypoints turns back those that they show to be turned, and --refine moves all.
+    Else a fit to keypoints turns back those that they show to be turned, and --to-masks moves all.
     """
     tight_clothes: bool = False
-    """With --refine, fill the masks: to measure a body in no or tight clothes.
+    """With --to-masks, fill the masks: to measure a body in no or tight clothes.
 
     Avatars are better without.
     """
 
 
-_Way = Literal["--refine", "--keypoints"]
+_Way = Literal["--to-masks", "--keypoints"]
 WAYS: dict[_Way, set[str]] = {
-    "--refine": {"keypoints", "person", "fixed_cameras", "tight_clothes"},
+    "--to-masks": {"keypoints", "person", "fixed_cameras", "tight_clothes"},
     "--keypoints": {"person", "body", "smoothness", "fixed_cameras"},
 }
 """The two ways to fit, by the option that chooses each, and their other options."""
@@ -96,15 +97,15 @@ class Fit:
     """Find the body in photos with cameras.
 
     Shape and poses come from 2D keypoints: those of --keypoints, or of the shipped detector. With
-    --refine: better cameras and poses from masks. docs: fitting.
+    --to-masks: better cameras and poses from masks. docs: fitting.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
         "humangs fit me --keypoints keypoints.json",
-        "humangs fit me --refine",
+        "humangs fit me --to-masks",
     )
     detections: OmitArgPrefixes[Detections]
-    refinement: OmitArgPrefixes[Refinement]
+    mask_fit: OmitArgPrefixes[MaskFit]
     capture: Positional[Path]
     """Folder with capture.json; its body.npz need not exist."""
     body: Path | None = None
@@ -120,16 +121,16 @@ class Fit:
 
     def run(self) -> None:
         """Fit in the way that was asked for."""
-        way: _Way = "--refine" if self.refinement.refine else "--keypoints"
+        way: _Way = "--to-masks" if self.mask_fit.to_masks else "--keypoints"
         for option in self._given():
-            if option not in WAYS[way] and f"--{option}" != way:
+            if option not in WAYS[way] and option_of(option) != way:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
                 raise UsageError(
-                    f"--{option.replace('_', '-')} is for {owners or 'captures'}, not for {way}"
+                    f"{option_of(option)} is for {owners or 'captures'}, not for {way}"
                 )
         self._check_places()
-        if way == "--refine":
-            self._refine()
+        if way == "--to-masks":
+            self._fit_to_masks()
         else:
             self._fit_keypoints()
 
@@ -137,7 +138,7 @@ class Fit:
         """Options of the ways of fitting whose value is not the default, in the order of the
         help.
         """
-        for part in (self.refinement, self.detections, self):
+        for part in (self.mask_fit, self.detections, self):
             for field in dataclasses.fields(part):
                 value = getattr(part, field.name)
                 chosen = not dataclasses.is_dataclass(value) and value != field.default
@@ -192,7 +193,7 @@ class Fit:
         if self.body is not None:
             body_file = str(self.body)
         with stage("fitting"):
-            fixed = self.refinement.fixed_cameras
+            fixed = self.mask_fit.fixed_cameras
             fitted = fit_photos(
                 photos,
                 keypoints,
@@ -211,7 +212,7 @@ class Fit:
         wrote(target, "body.npz, fit.npz and fit.json")
         suggest("humangs check", target)
 
-    def _refine(self) -> None:
+    def _fit_to_masks(self) -> None:
         with stage("starting"):
             from humangs_jax.capture.fitting.files import check_place, write_fitted
             from humangs_jax.capture.fitting.refine import (
@@ -229,11 +230,11 @@ class Fit:
             # without --keypoints those of an earlier fit
             keypoints, record = self.detections.read_or_recorded(self.capture, start)
         # cameras stay where nothing tells how they should move
-        fixed = self.refinement.fixed_cameras or cameras_are_unseen(start)
+        fixed = self.mask_fit.fixed_cameras or cameras_are_unseen(start)
         config = usual_config(
             record is not None,
             fixed_cameras=fixed,
-            bare=self.refinement.tight_clothes,
+            bare=self.mask_fit.tight_clothes,
             calibrated=start.calibrated,
         )
         with stage("refining cameras and body"):

@@ -167,7 +167,7 @@ def test_a_body_that_is_wider_than_the_person_is_warned_about(tmp_path):
     masks[:, : SIZE * 3 // 8] = 0  # the person without the upper part of the body
     slimmer = dataclasses.replace(right, masks=masks)
     for view in check_capture(slimmer, tmp_path / "check.png").views:
-        assert view.outside > 0.05 and "--refine` fits cameras" in view.warning
+        assert view.outside > 0.05 and "--to-masks` fits cameras" in view.warning
 
 
 @pytest.mark.parametrize("masks", [True, False])
