@@ -48,8 +48,8 @@ WEIGHTS = 8
 
 The shipped body has at most 7; leaving out the eighth costs nothing there.
 """
-_STEPS = 65535
-_SMALLEST_SCALE = 1e-7
+STEPS = 65535
+SMALLEST_SCALE = 1e-7
 """Metres; keeps the logarithm finite for flat Gaussians.
 
 A thousandth of eps2d for a camera at any distance.
@@ -182,8 +182,8 @@ def largest_weights(
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :WEIGHTS]
     kept = np.take_along_axis(weights, joints, axis=1)
     kept /= kept.sum(1, keepdims=True)
-    whole = np.rint(kept * _STEPS).astype(np.int64)
-    whole[:, 0] += _STEPS - whole.sum(1)
+    whole = np.rint(kept * STEPS).astype(np.int64)
+    whole[:, 0] += STEPS - whole.sum(1)
     joints[whole == 0] = 0  # columns beyond the last joint among them
     return joints, whole
 
@@ -223,7 +223,7 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
         np.asarray(x, np.float64) for x in (g.means, g.quats, g.scales, g.opacities, g.colors)
     )
     # sizes span orders of magnitude: their logarithms lose the same share everywhere
-    logs = np.log(np.maximum(scales, _SMALLEST_SCALE))
+    logs = np.log(np.maximum(scales, SMALLEST_SCALE))
     header["means"], arrays["means"] = _quantized(means, means.min(0), means.max(0))
     header["scales"], arrays["scales"] = _quantized(logs, logs.min(), logs.max())
     # colors may leave [0, 1]
@@ -236,7 +236,7 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
             harmonics, harmonics.min(), harmonics.max()
         )
     arrays["quats"] = np.rint(unit_quats(quats) * 32767).astype("<i2")
-    arrays["opacities"] = np.rint(opacities * _STEPS).astype("<u2")
+    arrays["opacities"] = np.rint(opacities * STEPS).astype("<u2")
     joints, weights = largest_weights(np.asarray(avatar.skinning_weights))
     arrays["weights"], arrays["weight_joints"] = weights.astype("<u2"), joints.astype("u1")
     arrays["rest_joints"] = np.asarray(avatar.rest_joints, "<f4")
@@ -274,7 +274,7 @@ def _quantized(
     values: np.ndarray, low: np.ndarray | float, high: np.ndarray | float
 ) -> tuple[dict[str, Any], np.ndarray]:
     low, high = np.asarray(low), np.maximum(high, np.asarray(low) + _SMALLEST_RANGE)
-    whole = np.rint((values - low) / (high - low) * _STEPS).astype("<u2")
+    whole = np.rint((values - low) / (high - low) * STEPS).astype("<u2")
     return {"low": low.tolist(), "high": high.tolist()}, whole
 
 
