@@ -423,7 +423,9 @@ def _pruned(
     return seen
 
 
-def _require_no_circle(option: str, shot: FrameSettings, usual: FrameSettings, given: list[str]) -> None:
+def _require_no_circle(
+    option: str, shot: FrameSettings, usual: FrameSettings, given: list[str]
+) -> None:
     """Refuse options of a circle of cameras beside an option that brings cameras. given: names of
     further options that do not go with it.
 

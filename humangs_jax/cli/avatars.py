@@ -186,10 +186,11 @@ class Reconstruct:
         )
         failed = []
         with stage("reconstructing"):
-            made = reconstruct_many(variables, config, load, self.batch)
-            for name, prepared, avatar, error in bar(
-                made, total=len(load), shown=several, desc="reconstruct"
-            ):
+            made = reconstruct_batch(variables, config, [*load.values()], self.batch or BATCH)
+            named = bar(
+                zip(load, made, strict=True), total=len(load), shown=several, desc="reconstruct"
+            )
+            for name, (prepared, avatar, error) in named:
                 # one of several that fails does not stop the others
                 if error is not None and not several:
                     raise error
