@@ -554,7 +554,7 @@ def test_a_kept_displacement_gives_the_avatar_of_one_that_is_computed(body, netw
     with compiled_programs() as programs:
         again = reconstruct(variables, config, kept)
     jax.tree.map(np.testing.assert_array_equal, again, computed)
-    assert "_reconstruct" not in programs
+    assert not [name for name in programs if "_reconstruct" in name]
 
 
 @pytest.mark.slow
@@ -623,7 +623,7 @@ def test_programs_are_compiled_once_per_bucket(body, network):
     with compiled_programs() as programs:
         for views in (17, 18, 19):
             reconstruct(variables, config, capture_of(body, 0, views))
-    assert programs.count("_reconstruct") == 1
+    assert len([name for name in programs if "_reconstruct" in name]) == 1
 
 
 def test_what_cannot_be_one_batch_is_named(body, network):
