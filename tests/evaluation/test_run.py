@@ -28,6 +28,8 @@ from humangs_jax.evaluation.kept import method_key
 from humangs_jax.io.images import write_png
 
 NAMES = ("front", "left", "back", "right")
+evaluate = functools.partial(hg.evaluate, protocol="lhm")
+"""Of all protocols the one whose LPIPS no package brings: that of VGG takes most of the time here."""
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +59,7 @@ def psnr(x, y):
 
 
 def test_every_image_is_a_row_and_means_are_in_their_order(people, tmp_path):
-    found = hg.evaluate(cases(people), method=predicting(people), protocol="lhm")
+    found = evaluate(cases(people), method=predicting(people), protocol="lhm")
     expected = {
         name: [psnr(*pair) for pair in zip(p, c.images, strict=True)]
         for name, (c, p) in people.items()
@@ -107,7 +109,7 @@ def test_every_image_is_a_row_and_means_are_in_their_order(people, tmp_path):
 
 
 def test_a_page_keeps_the_worst(people):
-    found = hg.evaluate(cases(people), method=predicting(people), page_images=3)
+    found = evaluate(cases(people), method=predicting(people), page_images=3)
     order = np.argsort([row.scores["psnr"] for row in found.rows])
     assert set(found.gallery.shots) == set(order[:3].tolist())
 
@@ -124,13 +126,13 @@ def test_people_who_are_scored_are_kept(people, tmp_path):
             raise KeyboardInterrupt
         return predicting(people)(case, background)
 
-    run = lambda **options: hg.evaluate(
+    run = lambda **options: evaluate(
         cases(people), method=method, keep=tmp_path / "kept", **{"page_images": 5, **options}
     )
     with pytest.raises(KeyboardInterrupt):
         run()
     stop.clear()
-    found, plain = run(), hg.evaluate(cases(people), method=predicting(people), page_images=5)
+    found, plain = run(), evaluate(cases(people), method=predicting(people), page_images=5)
     assert asked == ["ann", "bob", "bob"]
     assert (
         found.rows == plain.rows and found.about == plain.about and found.reasons == plain.reasons
@@ -148,15 +150,14 @@ def white(case, background):
     return Predicted(np.ones_like(case.truth.images), None, tuple(range(case.truth.view_count)))
 
 
-@pytest.mark.slow
 def test_scores_of_other_photos_views_or_people_are_never_taken_for_kept_ones(people, tmp_path):
     (ann, _), (bob, _) = people["ann"], people["bob"]
     brighter = dataclasses.replace(ann, images=np.clip(ann.images + 0.1, 0, 1))
     renamed = Case("ann", bob)
     run = lambda *cases, **options: (
-        hg.evaluate(cases, method=white, keep=tmp_path / "kept", page_images=0, **options).rows
+        evaluate(cases, method=white, keep=tmp_path / "kept", page_images=0, **options).rows
     )
-    plain = lambda *cases: hg.evaluate(cases, method=white, page_images=0).rows
+    plain = lambda *cases: evaluate(cases, method=white, page_images=0).rows
     first = Case("ann", ann)
     assert run(first) == plain(first)
     for other in (
@@ -172,7 +173,7 @@ def test_scores_of_other_photos_views_or_people_are_never_taken_for_kept_ones(pe
 def test_a_folder_of_scores_made_with_other_inputs_weights_or_body_is_refused(
     people, folders, tmp_path
 ):
-    run = lambda **options: hg.evaluate(
+    run = lambda **options: evaluate(
         folders, **{"method": white, "keep": tmp_path / "kept", "page_images": 0, **options}
     )
     views = {name: {"context": [0], "target": [1]} for name in people}
@@ -193,7 +194,7 @@ def test_scores_of_images_that_were_drawn_again_are_not_kept(people, folders, tm
     write_predictions(theirs, people)
     run = lambda: [
         row.scores["psnr"]
-        for row in hg.evaluate(folders, predictions=theirs, keep=tmp_path / "kept").rows
+        for row in evaluate(folders, predictions=theirs, keep=tmp_path / "kept").rows
     ]
     before = run()
     write_png(theirs / "bob" / "left.png", np.zeros((40, 32, 3)))
@@ -241,7 +242,7 @@ def test_predictions_are_found_by_file_name(people, folders, tmp_path):
     """Those of one program with alpha, of another without; one that numbers them; some missing."""
     for alpha in (False, True):
         write_predictions(tmp_path / f"theirs{alpha}", people, alpha)
-        found = hg.evaluate(folders, predictions=tmp_path / f"theirs{alpha}")
+        found = evaluate(folders, predictions=tmp_path / f"theirs{alpha}")
         expected = [
             psnr(np.rint(255 * p) / 255, np.rint(255 * c.images) / 255) for c, p in people.values()
         ]
@@ -255,12 +256,12 @@ def test_predictions_are_found_by_file_name(people, folders, tmp_path):
     one.mkdir()
     for i, image in enumerate(people["bob"][1]):
         write_png(one / f"view_{i:03d}.png", image)
-    assert len(hg.evaluate(folders / "bob", predictions=one).rows) == 4
+    assert len(evaluate(folders / "bob", predictions=one).rows) == 4
     for image in tmp_path.glob("theirsFalse/bob/*.png"):  # any of the formats of photos
         Image.open(image).save(image.with_suffix(".webp"), lossless=True)
         image.unlink()
     (tmp_path / "theirsFalse" / "bob" / "left.webp").unlink()
-    found = hg.evaluate(folders, predictions=tmp_path / "theirsFalse")
+    found = evaluate(folders, predictions=tmp_path / "theirsFalse")
     assert len(found.rows) == 7 and [file.endswith("bob/left.png") for file in found.missing] == [
         True
     ]
@@ -269,9 +270,9 @@ def test_predictions_are_found_by_file_name(people, folders, tmp_path):
 
 def test_views_whose_true_mask_is_empty_are_not_compared(people, folders, tmp_path, caplog):
     write_predictions(tmp_path / "theirs", people)
-    all_views = hg.evaluate(folders / "bob", predictions=tmp_path / "theirs" / "bob")
+    all_views = evaluate(folders / "bob", predictions=tmp_path / "theirs" / "bob")
     write_png(folders / "bob/masks/left.png", np.zeros(people["bob"][0].masks.shape[1:]))
-    found = hg.evaluate(folders / "bob", predictions=tmp_path / "theirs" / "bob")
+    found = evaluate(folders / "bob", predictions=tmp_path / "theirs" / "bob")
     assert [row.view for row in found.rows] == ["front", "back", "right"]
     kept = [row.scores for row in all_views.rows if row.view != "left"]
     assert [row.scores["psnr"] for row in found.rows] == [scores["psnr"] for scores in kept]
@@ -281,38 +282,38 @@ def test_views_whose_true_mask_is_empty_are_not_compared(people, folders, tmp_pa
 def test_what_is_wrong_is_one_line(people, folders, tmp_path):
     theirs = tmp_path / "theirs"
     with pytest.raises(FileNotFoundError, match="no such folder of predictions"):
-        hg.evaluate(folders, predictions=theirs)
+        evaluate(folders, predictions=theirs)
     theirs.mkdir()
     with pytest.raises(
         ValueError, match=r"no prediction was found; 8 were expected: .*ann/front\.png"
     ):
-        hg.evaluate(folders, predictions=theirs)
+        evaluate(folders, predictions=theirs)
     write_predictions(theirs, {"ann": people["ann"]})
     write_png(theirs / "ann" / "back.png", np.zeros((20, 30, 3)))
     with pytest.raises(
         ValueError, match=r"ann/back\.png: size 30 x 20, but the true image has 32 x 40"
     ):
-        hg.evaluate(folders, predictions=theirs)
+        evaluate(folders, predictions=theirs)
     write_png(theirs / "ann" / "back.png", np.zeros((40, 32, 4)))
     with pytest.raises(
         ValueError, match="1 of 4 images have an alpha channel: expected all or none"
     ):
-        hg.evaluate(folders, predictions=theirs)
+        evaluate(folders, predictions=theirs)
     with pytest.raises(ValueError, match="avatar and weights: expected one of them"):
-        hg.evaluate(folders, avatar=tmp_path, weights="w.safetensors")
+        evaluate(folders, avatar=tmp_path, weights="w.safetensors")
     with pytest.raises(
         ValueError, match=r"one avatar for 2 people: expected a folder with PERSON\.npz"
     ):
-        hg.evaluate(folders, avatar=tmp_path / "a.npz")
+        evaluate(folders, avatar=tmp_path / "a.npz")
     with pytest.raises(ValueError, match=r"no prediction was found; 2 were expected: .*ann\.npz"):
-        hg.evaluate(folders, avatar=theirs)
+        evaluate(folders, avatar=theirs)
     with pytest.raises(
         ValueError, match="no protocol 'ours': expected one of humangs, animatable-gaussians"
     ):
-        hg.evaluate(folders, predictions=theirs, protocol="ours")
+        evaluate(folders, predictions=theirs, protocol="ours")
     masks = capture_from(people["ann"][0].images)
     with pytest.raises(ValueError, match="ann: the protocol needs a mask for every view"):
-        hg.evaluate(Case("ann", masks), method=predicting(people), protocol="giga")
+        evaluate(Case("ann", masks), method=predicting(people), protocol="giga")
 
 
 def test_which_views_are_inputs_and_which_are_compared(people, folders, tmp_path):
@@ -404,7 +405,7 @@ def test_a_source_gives_people(people):
         seen.append((case.name, background))
         return Predicted(case.truth.images, None, (0, 1, 2))
 
-    found = hg.evaluate(People(people["ann"][0]), method=method, protocol="giga", body=small_body())
+    found = evaluate(People(people["ann"][0]), method=method, protocol="giga", body=small_body())
     assert seen == [("0000", 0.0), ("0001", 0.0), ("0002", 0.0)] and len(found.rows) == 9
 
 
@@ -465,7 +466,6 @@ def test_avatars_and_weights_are_drawn_on_the_protocols_background(tmp_path):
         assert nobody.means["iou"].mean == 0
 
 
-@pytest.mark.slow
 def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, monkeypatch, capsys):
     """Where its files are as they were."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -481,7 +481,15 @@ def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, mo
 
     monkeypatch.setattr(evaluation, "score_views", score_views)
     run = lambda *more: cli.execute(
-        ["evaluate", str(folders), "--predictions", str(tmp_path / "theirs"), *more]
+        [
+            "evaluate",
+            str(folders),
+            "--predictions",
+            str(tmp_path / "theirs"),
+            "--protocol",
+            "lhm",
+            *more,
+        ]
     )
     kept = lambda: [file.name for file in (tmp_path / "cache").rglob("person_*.json")]
     assert run() == cli.INTERRUPTED and [name[:11] for name in kept()] == ["person_ann_"]
