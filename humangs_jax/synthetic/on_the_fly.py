@@ -13,7 +13,6 @@ skinned, vertices follow a few joints each.
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Mapping
 
 import jax
@@ -24,6 +23,7 @@ from jax import lax
 from humangs_jax.body.model import joint_transforms
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Key, UInt8
 from humangs_jax.core.configuration import Capacity, Count, Share, Side, Spread, configuration, knob
+from humangs_jax.core.draws import uniform_by_name
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import pytree_dataclass, replace
@@ -179,7 +179,7 @@ def on_the_fly_example(
 def _draw_numbers(
     bank: PeopleBank, key: Key, config: OnTheFlyConfig
 ) -> dict[str, Float[Array, "..."]]:
-    """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
+    """All random numbers of an example, in [0, 1), by name."""
     shapes = {
         "person": (),
         "poses": (_POSES, 2),
@@ -190,11 +190,7 @@ def _draw_numbers(
     for name, count in (("input", config.input_views), ("target", config.target_views)):
         shapes |= {f"{name}_azimuths": (2 + 2 * count,), f"{name}_poses": (count,)}
         shapes |= {f"{name}_cameras": (count, surroundings.CAMERA_NUMBERS)}
-    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
-    parts = jnp.split(jax.random.uniform(key, (ends[-1],)), ends[:-1])
-    return {
-        name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)
-    }
+    return uniform_by_name(key, shapes)
 
 
 def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:

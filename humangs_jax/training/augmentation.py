@@ -6,7 +6,7 @@ a little off, as `humangs fit` leaves them.
 """
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.configuration import Range, Share, Spread, configuration
+from humangs_jax.core.draws import normal_of, uniform_by_name
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import Example
 from humangs_jax.data.views import SubjectViews
@@ -53,84 +54,86 @@ class Augmentation:
     """
 
 
+Numbers = dict[str, Float[Array, "..."]]
+"""`random_numbers`."""
+
+
+def random_numbers(key: Key, views: SubjectViews) -> Numbers:
+    """All random numbers of an example with such photos, uniform in [0, 1), by name."""
+    count, joints = views.rotations.shape[:2]
+    shapes = {"chosen": (), "betas": views.betas.shape}
+    shapes |= {"gains": (count, 1, 1, 1), "tints": (count, 1, 1, 3)}
+    shapes |= {"radii": (count,), "backgrounds": (count, 1, 1, 3)}
+    shapes |= {"turns": (count, 3), "shifts": (count, 3)}
+    shapes |= {"rotations": (joints, 3), "translation": (3,)}
+    return uniform_by_name(key, shapes, views.images.dtype)
+
+
 def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -> Example:
     """The example with other exposures, or with all of its inputs and betas disturbed.
 
     Pure and jittable.
     """
-    choice_key, betas_key, views_key = jax.random.split(key, 3)
+    numbers = random_numbers(key, example.inputs)
 
     def augmented(example):
         inputs, targets = example.inputs, example.targets
-        betas = inputs.betas + config.betas * jax.random.normal(
-            betas_key, inputs.betas.shape, inputs.betas.dtype
-        )
+        betas = inputs.betas + config.betas * normal_of(numbers["betas"])
         pelvis = shape_body(body, betas).joints[0]
-        inputs = augment_views(views_key, replace(inputs, betas=betas), pelvis, config)
+        inputs = augment_views(numbers, replace(inputs, betas=betas), pelvis, config)
         return replace(example, inputs=inputs, targets=replace(targets, betas=betas))
 
     def exposed(example):
         views = example.inputs
         outside = 1 - views.masks[..., None]
-        images = (
-            _gains(views_key, len(views.images), views.images.dtype, config)
-            * (views.images - outside)
-            + outside
-        )
+        images = _gains(numbers, config) * (views.images - outside) + outside
         return replace(example, inputs=replace(views, images=jnp.clip(images, 0, 1)))
 
-    chosen = jax.random.bernoulli(choice_key, config.share)
-    return jax.lax.cond(chosen, augmented, exposed, example)
+    return jax.lax.cond(numbers["chosen"] < config.share, augmented, exposed, example)
 
 
-def _gains(key: Key, count: int, dtype: Any, config: Augmentation) -> Float[Array, "v 1 1 3"]:
+def _gains(numbers: Numbers, config: Augmentation) -> Float[Array, "v 1 1 3"]:
     """(v, 1, 1, 3), one exposure for each photo."""
-    gain_key, tint_key = jax.random.split(key)
-    gain = config.exposure * jax.random.normal(gain_key, (count, 1, 1, 1), dtype)
-    return jnp.exp(gain + config.tint * jax.random.normal(tint_key, (count, 1, 1, 3), dtype))
+    gain = config.exposure * normal_of(numbers["gains"])
+    return jnp.exp(gain + config.tint * normal_of(numbers["tints"]))
 
 
 def augment_views(
-    key: Key, views: SubjectViews, pelvis: Float[Array, "3"], config: Augmentation
+    numbers: Numbers, views: SubjectViews, pelvis: Float[Array, "3"], config: Augmentation
 ) -> SubjectViews:
     """Photos, masks, cameras and poses.
 
-    pelvis: (3,) metres, in the rest pose: cameras turn about the posed one.
+    numbers: `random_numbers`. pelvis: (3,) metres, in the rest pose: cameras turn about the posed
+    one.
     """
-    photo_key, camera_key, pose_key, body_key = jax.random.split(key, 4)
-
-    def normal(key, like):
-        return jax.random.normal(key, like.shape, like.dtype)
-
-    rotations = views.rotations[0]
-    images, masks = augment_photos(photo_key, views.images, views.masks, config)
+    turns = math.radians(config.pose_degrees) * normal_of(numbers["rotations"])
+    images, masks = augment_photos(numbers, views.images, views.masks, config)
     return replace(
         views,
         images=images,
         masks=masks,
-        cameras=_augment_cameras(camera_key, views.cameras, views.translations + pelvis, config),
-        rotations=views.rotations + math.radians(config.pose_degrees) * normal(pose_key, rotations),
-        translations=views.translations
-        + config.body_metres * normal(body_key, views.translations[0]),
+        cameras=_augment_cameras(numbers, views.cameras, views.translations + pelvis, config),
+        rotations=views.rotations + turns,
+        translations=views.translations + config.body_metres * normal_of(numbers["translation"]),
     )
 
 
 def augment_photos(
-    key: Key, images: Float[Array, "v h w 3"], masks: Float[Array, "v h w"], config: Augmentation
+    numbers: Numbers,
+    images: Float[Array, "v h w 3"],
+    masks: Float[Array, "v h w"],
+    config: Augmentation,
 ) -> tuple[Float[Array, "v h w 3"], Float[Array, "v h w"]]:
     """Photos on white whose exposure, tint and masks are off.
 
     A photo is m f + (1 - m) of its mask m and the person's color f. It becomes m' (m g f + (1 - m)
     b) + (1 - m') with the gain g, the mask m' and the color b of a background.
     """
-    count = len(images)
-    gain_key, radius_key, background_key = jax.random.split(key, 3)
-    gain = _gains(gain_key, count, images.dtype, config)
-    radii = jax.random.randint(radius_key, (count,), -config.mask_pixels, config.mask_pixels + 1)
-    backgrounds = jax.random.uniform(background_key, (count, 1, 1, 3), images.dtype)
+    choices = 2 * config.mask_pixels + 1
+    radii = jnp.floor(choices * numbers["radii"]).astype(jnp.int32) - config.mask_pixels
     cut = _grown(masks, radii, config.mask_pixels)
     outside = 1 - masks[..., None]
-    seen = gain * (images - outside) + outside * backgrounds
+    seen = _gains(numbers, config) * (images - outside) + outside * numbers["backgrounds"]
     return jnp.clip(cut[..., None] * (seen - 1) + 1, 0, 1), cut
 
 
@@ -156,13 +159,11 @@ def _largest_near(images: Float[Array, "v h w"]) -> Float[Array, "v h w"]:
 
 
 def _augment_cameras(
-    key: Key, cameras: Camera, centers: Float[Array, "v 3"], config: Augmentation
+    numbers: Numbers, cameras: Camera, centers: Float[Array, "v 3"], config: Augmentation
 ) -> Camera:
     """Cameras that are turned about centres (v, 3) of the world, and shifted."""
-    turn_key, shift_key = jax.random.split(key)
-    dtype = centers.dtype
-    turns = math.radians(config.camera_degrees) * jax.random.normal(turn_key, centers.shape, dtype)
-    shifts = config.camera_metres * jax.random.normal(shift_key, centers.shape, dtype)
+    turns = math.radians(config.camera_degrees) * normal_of(numbers["turns"])
+    shifts = config.camera_metres * normal_of(numbers["shifts"])
     rotations = quaternion.matrix_from_axis_angle(turns)
     turned = jnp.einsum("vij,vj->vi", rotations, centers, precision="highest")
     moves = transform.make(rotations, centers - turned + shifts)

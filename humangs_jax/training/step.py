@@ -14,6 +14,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, Key, PyTree, Scalar, Shaped
+from humangs_jax.core.draws import uniform_by_name
 from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import inexact_leaves, replace
 from humangs_jax.data.loading import Example
@@ -44,9 +45,8 @@ Gradients = tuple[Scalar, PyTree, PyTree, Metrics]
 
 def random_backgrounds(key: Key, count: int, share: float) -> Float[Array, "v 3"]:
     """One color per target: random for about `share` of them, white for the rest."""
-    color_key, choice_key = jax.random.split(key)
-    colors = jax.random.uniform(color_key, (count, 3))
-    return jnp.where(jax.random.bernoulli(choice_key, share, (count, 1)), colors, 1.0)
+    numbers = uniform_by_name(key, {"colors": (count, 3), "choices": (count, 1)})
+    return jnp.where(numbers["choices"] < share, numbers["colors"], 1.0)
 
 
 def change_background(

@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from humangs_jax.core.draws import uniform_by_name
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader
 from humangs_jax.training import augmentation
-from humangs_jax.training.augmentation import Augmentation, augment_photos, augment_views
+from humangs_jax.training.augmentation import (
+    Augmentation,
+    augment_photos,
+    augment_views,
+    random_numbers,
+)
 from humangs_jax.training.config import tiny
 
 CONFIG = tiny()
@@ -46,7 +52,11 @@ def example(body, captures):
 
 @functools.partial(jax.jit, static_argnames="settings")
 def changed(seed, images, masks, settings=NOTHING):
-    return augment_photos(jax.random.key(seed), images, masks, settings)
+    count = len(images)
+    shapes = {"gains": (count, 1, 1, 1), "tints": (count, 1, 1, 3)}
+    shapes |= {"radii": (count,), "backgrounds": (count, 1, 1, 3)}
+    numbers = uniform_by_name(jax.random.key(seed), shapes)
+    return augment_photos(numbers, images, masks, settings)
 
 
 def test_without_disturbances_photos_stay(photos):
@@ -96,7 +106,9 @@ def test_cameras_turn_about_the_person_wherever_it_stands(example):
         dataclasses.replace(NOTHING, camera_degrees=2.0),
     )
     views = replace(views, translations=views.translations + jnp.asarray([5.0, 0.0, 0.0]))
-    turn = jax.jit(lambda key: augment_views(key, views, jnp.asarray(pelvis), settings))
+    turn = jax.jit(
+        lambda key: augment_views(random_numbers(key, views), views, jnp.asarray(pelvis), settings)
+    )
     before, after = (
         np.asarray(x.cameras.cam_from_world)[:, :3] for x in (views, turn(jax.random.key(5)))
     )
@@ -109,12 +121,21 @@ def test_cameras_turn_about_the_person_wherever_it_stands(example):
     assert degrees.min() > 0.05 and degrees.max() < 12
 
 
+def test_an_example_is_disturbed_by_one_draw_of_random_numbers(example, body):
+    """Each further draw of another shape costs 230 lines of program."""
+    settings = Augmentation(share=0.5)
+    program = jax.make_jaxpr(lambda key: augmentation.augment(key, example, body, settings))
+    assert str(program(jax.random.key(0))).count("random_bits[") == 1
+
+
 def test_all_photos_of_an_example_have_the_same_wrong_body(example):
     views, settings = (
         example.inputs,
         dataclasses.replace(NOTHING, pose_degrees=1.0, body_metres=0.01),
     )
-    off = jax.jit(lambda key: augment_views(key, views, jnp.zeros(3), settings))(jax.random.key(4))
+    off = jax.jit(
+        lambda key: augment_views(random_numbers(key, views), views, jnp.zeros(3), settings)
+    )(jax.random.key(4))
     for name in ("rotations", "translations"):
         change = np.asarray(getattr(off, name) - getattr(views, name))
         np.testing.assert_allclose(change, np.repeat(change[:1], len(change), 0), atol=ROUNDING)
