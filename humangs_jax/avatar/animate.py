@@ -25,6 +25,7 @@ from humangs_jax.body.model import (
 )
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
+from humangs_jax.core.loops import over
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.records import record_values
 from humangs_jax.data.views import SubjectViews
@@ -239,8 +240,7 @@ def pixel_sizes(avatar: Avatar, views: SubjectViews) -> Float[Array, " g"]:
         inside = (pixels >= 0) & (pixels <= jnp.asarray([camera.width, camera.height]))
         return jnp.where(jnp.all(inside, axis=-1) & (depths > 0), depths / camera.K[0, 0], jnp.inf)
 
-    smallest = jnp.min(
-        jax.lax.map(in_photo, (views.rotations, views.translations, views.cameras)), axis=0
-    )
+    photos = views.rotations, views.translations, views.cameras
+    smallest = jnp.min(over(in_photo, photos), axis=0)
     found = jnp.isfinite(smallest)
     return jnp.where(found, smallest, jnp.max(jnp.where(found, smallest, 0.0)))

@@ -5,6 +5,7 @@ few sizes (`buffers.round_up`), and padding is masked.
 """
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -33,6 +34,7 @@ from humangs_jax.body.model import (
 from humangs_jax.core.array_types import Array, Bool, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
+from humangs_jax.core.loops import over
 from humangs_jax.core.processes import compile_ahead
 from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
@@ -508,8 +510,10 @@ def _same_body(one: PreparedCapture, other: PreparedCapture) -> bool:
 
 
 _prepare = jax.jit(prepare_inputs)
-_prepare_batch = jax.jit(
-    lambda body, batch, config: jax.lax.map(
-        lambda views: prepare_inputs(body, views, config), batch
-    )
-)
+
+
+@jax.jit
+def _prepare_batch(body: BodyModel, batch: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
+    """`prepare_inputs` of each person of a batch."""
+    pixels = math.prod(batch.images.shape[1:4])
+    return over(lambda views: prepare_inputs(body, views, config), batch, pixels)

@@ -17,6 +17,7 @@ from humangs_jax.body.resolution import decimate_with_kept, split_with_weights
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host, taken
 from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.loops import over
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import Capture
@@ -227,6 +228,12 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
         config.conventions.position_map
     ]
 
+    # views that are padding show nothing: a body of no extent has no pixel to draw
+    shown = posed
+    if views.view_count is not None:
+        present = jnp.arange(len(posed)) < views.view_count
+        shown = jnp.where(present[:, None, None], posed, posed[:, :1])
+
     def rasterize_view(arguments):
         vertices, camera = arguments
         return draw(vertices / unit, canonical, body.faces, camera, config.runtime.raster)
@@ -234,8 +241,9 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
     def normals(vertices):
         return vertex_normals(vertices, body.faces)
 
-    # one view after the other: a vmapped rasterizer would make every view pay for the fullest one
-    position_maps, depth_maps = jax.lax.map(rasterize_view, (posed, cameras))
+    # on a CPU one view after the other: side by side, every view would pay for the fullest one
+    pixels = cameras.width * cameras.height
+    position_maps, depth_maps = over(rasterize_view, (shown, cameras), pixels)
     # what the network looks at: the mask and the body, or the mask alone where there is one
     foreground = (views.masks > MASK_THRESHOLD) | (depth_maps >= 0)
     if config.conventions.pixels == "person":

@@ -36,6 +36,10 @@ LAYOUT = ("NHWC", "HWIO", "NHWC")
 KERNEL = 3
 REACH = KERNEL // 2 + 1
 """Texels of padding: a position may lie half outside, and its neighbours one texel further."""
+OUTSIDE = -4.0
+"""A texel index outside of every map, with its neighbourhood: reading there gives zeros, and costs
+its gradient nothing.
+"""
 PixelGrid = Literal["half_pixel", "mixed"]
 
 
@@ -71,7 +75,7 @@ def sample_bilinear(
     corner = jnp.floor(jnp.where(inside, absolute, -1.0))
     fraction = jnp.where(inside, indices, corner - origin) - (corner - origin)
     x0, y0 = jnp.moveaxis(corner.astype(jnp.int32), -1, 0)
-    rows = grid.reshape(height * width, channels)
+    texels = grid.reshape(height * width, channels)
 
     # weights of the texels at x0 and x0 + 1, and at y0 and y0 + 1
     along_x = (1 - fraction[..., 0], fraction[..., 0])
@@ -81,9 +85,12 @@ def sample_bilinear(
         for dx in (0, 1):
             x, y = x0 + dx, y0 + dy
             exists = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            weight = along_x[dx] * along_y[dy]
-            texel = rows.at[jnp.where(exists, y * width + x, 0)].get(mode="promise_in_bounds")
-            total = total + jnp.where(exists, weight, 0.0)[..., None] * texel
+            weight = jnp.where(exists, along_x[dx] * along_y[dy], 0.0)
+            # a gradient adds nothing for a texel that does not exist, instead of zeros to one place
+            texel = texels.at[jnp.where(exists, y * width + x, len(texels))].get(
+                mode="fill", fill_value=0
+            )
+            total = total + weight[..., None] * texel
     return total
 
 
@@ -123,9 +130,11 @@ def sample_neighborhoods(
     row_length = width + 2 * REACH
     rows = padded.reshape(-1, channels)
     top_left = (y0 + REACH - 1) * row_length + x0 + REACH - 1
+    top_left = jnp.where(inside, top_left, len(rows))
 
     def texel(i, j):
-        return rows.at[top_left + i * row_length + j].get(mode="promise_in_bounds")
+        # what lies outside adds nothing to a gradient, instead of zeros to one place
+        return rows.at[top_left + i * row_length + j].get(mode="fill", fill_value=0)
 
     across = []  # of each of the four texel rows, three taps
     for i in range(KERNEL + 1):

@@ -18,10 +18,12 @@ import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, PyTree
 from humangs_jax.core.configuration import Spread, Width, part
+from humangs_jax.core.loops import one_after_the_other, over
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.maps import (
     KERNEL,
+    OUTSIDE,
     PixelGrid,
     convolve_neighborhoods,
     sample_bilinear,
@@ -104,6 +106,7 @@ class PixelAlignedReader(Reader):
         weights = jnp.broadcast_to(pooled, visible.shape).astype(pixels.dtype)
         size = (cameras.width, cameras.height)
         indices = texel_indices(pixels, size, (maps.shape[2], maps.shape[1]), grid)
+        indices = jnp.where(weights[..., None] > 0, indices, OUTSIDE)
         read = sample_neighborhoods
         if self.output_width is None:
             read = sample_bilinear
@@ -201,24 +204,29 @@ def sum_over_views(
     indices: Float[Array, "v n 2"],
     weights: Float[Array, "v n"],
 ) -> PyTree:
-    """Sums weight * read(map of the view, texel indices) over the views, one after the other:
-    memory for one.
+    """Sums weight * read(map of the view, texel indices) over the views; on a CPU one after the
+    other, with memory for one.
 
     read: (h, w, c), (n, 2) -> a pytree of (n, ...).
     """
 
     @jax.checkpoint  # what was read is read again for gradients: it is larger than the maps
-    def add_view(total, view):
+    def weighed(view):
         texels, positions, weight = view
+        return jax.tree.map(
+            lambda x: weight.reshape(-1, *[1] * (x.ndim - 1)) * x, read(texels, positions)
+        )
 
-        def add(t, x):
-            return t + weight.reshape(-1, *[1] * (x.ndim - 1)) * x
+    def add(total, view):
+        return jax.tree.map(jnp.add, total, weighed(view)), None
 
-        return jax.tree.map(add, total, read(texels, positions)), None
-
-    shapes = jax.eval_shape(read, maps[0], indices[0])
-    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, jnp.result_type(x, weights)), shapes)
-    return jax.lax.scan(add_view, empty, (maps, indices, weights))[0]
+    views = maps, indices, weights
+    if not one_after_the_other():
+        texels = maps.shape[1] * maps.shape[2]
+        return jax.tree.map(lambda x: jnp.sum(x, axis=0), over(weighed, views, texels))
+    shapes = jax.eval_shape(weighed, jax.tree.map(lambda x: x[0], views))
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return jax.lax.scan(add, empty, views)[0]
 
 
 def photo_colors(

@@ -15,6 +15,7 @@ from humangs_jax.avatar.animate import with_pixel_footprint_of
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.arrays import from_host
+from humangs_jax.core.loops import over
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.refinement.config import RefineConfig
@@ -149,7 +150,11 @@ def refine_views(
     """
     avatar, photos = with_pixel_footprint_of(avatar, views), photos_of(views)
     parameters = parameters_of(avatar.gaussians)
-    found = jax.lax.map(lambda photo: compare(parameters, avatar, photo, config, splat), photos)
+    found = over(
+        lambda photo: compare(parameters, avatar, photo, config, splat),
+        photos,
+        views.cameras.width * views.cameras.height,
+    )
     state = replace(init_state(parameters, found.together(), config, splat), total=steps)
 
     def one(state: RefineState, i: Int[Array, ""]) -> tuple[RefineState, Int[Array, ""]]:

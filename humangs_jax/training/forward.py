@@ -18,6 +18,7 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.reconstruct import completed_avatar
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.loops import over
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loading import Example, Source, ViewSampling
 from humangs_jax.data.views import SubjectViews, prepare_inputs
@@ -93,7 +94,7 @@ def draw_targets(
 
     def pose(outputs):
         avatar = completed_avatar(outputs, body, inputs, config.model)
-        return jax.lax.map(
+        return over(
             lambda pose: skin(avatar, BodyPose(*pose)), (targets.rotations, targets.translations)
         )
 
@@ -115,7 +116,8 @@ def draw_posed(
             posed, camera, background = target
             return render(posed, camera, splat, background)
 
-        return Drawn(jax.lax.map(one, (posed, targets.cameras, backgrounds)))
+        pixels = targets.cameras.width * targets.cameras.height
+        return Drawn(over(one, (posed, targets.cameras, backgrounds), pixels))
 
     return tap("images", draw, posed)
 
@@ -217,7 +219,9 @@ def evaluate(
     }
     if networks.lpips is not None:
         compare = functools.partial(lpips, networks.lpips)
-        metrics["lpips"] = jnp.mean(jax.lax.map(lambda pair: compare(*pair), (shown, images)))
+        pixels = images.shape[1] * images.shape[2]
+        each = over(lambda pair: compare(*pair), (shown, images), pixels)
+        metrics["lpips"] = jnp.mean(each)
     return shown, metrics
 
 

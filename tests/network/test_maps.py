@@ -11,7 +11,8 @@ import pytest
 from jax.test_util import check_grads
 from network_cases import random_like
 
-from humangs_jax.network.encoder import sample_triplane
+from humangs_jax.network import encoder
+from humangs_jax.network.encoder import NOWHERE, sample_triplane
 from humangs_jax.network.maps import (
     Convolution,
     convolve,
@@ -131,6 +132,38 @@ def test_background_reads_the_last_texel_and_outside_is_zero():
     assert np.allclose(read[0, 0], texture[:, -1, -1].ravel()) and np.array_equal(
         read[0, 1], np.zeros(6)
     )
+
+
+def test_background_and_empty_slots_add_nothing_to_a_texture_one_by_one(monkeypatch):
+    """An accelerator's additions to one place wait for each other: the background's are one sum."""
+    texture = jnp.asarray(np.random.default_rng(0).normal(size=(3, 4, 4, 2)), jnp.float32)
+    inside = np.random.default_rng(1).uniform(-1, 1, (5, 3))
+    positions = jnp.asarray([[1.0] * 3] * 4 + [[NOWHERE] * 3] * 3 + inside.tolist(), jnp.float32)
+
+    def loss(texture):
+        return jnp.sum(jnp.sin(sample_triplane(texture, positions)))
+
+    here = jax.value_and_grad(loss)(texture)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    there = jax.value_and_grad(loss)(texture)
+    np.testing.assert_allclose(there[0], here[0], rtol=RTOL32)
+    np.testing.assert_allclose(there[1], here[1], rtol=RTOL32, atol=RTOL32)
+    # the first seven are a texel or more beyond the four of a plane
+    places = []
+    monkeypatch.setattr(encoder, "sample_bilinear", spied(places))
+    jax.grad(loss)(texture)
+    outside = [np.all(np.abs(np.asarray(x)[:7]) >= 2.5) for x in places]  # from the middle
+    assert len(outside) == 3 and all(outside)
+
+
+def spied(places):
+    """`sample_bilinear`, which notes the indices that it is given."""
+
+    def read(grid, indices, origin):
+        places.append(indices)
+        return sample_bilinear(grid, indices, origin)
+
+    return read
 
 
 SHAPE, FEATURES = (2, 5, 7, 3), 4
