@@ -271,7 +271,7 @@ def update(
         state.params, state.batch_stats, body, batch, keys, config, networks, mesh
     )
     # the step of the optimizer; one that is skipped leaves parameters and statistics as they are
-    optimizer = make_optimizer(config.optimizer, config.steps)
+    optimizer = make_optimizer(config.optimizer, config.steps, divided=mesh is not None)
     updates, opt_state = optimizer.update(gradients, state.opt_state, state.params, value=loss)
     opt_state = cast(GuardState, opt_state)
     good = opt_state.skipped == state.opt_state.skipped

@@ -117,3 +117,24 @@ def test_every_optimizer_by_name_goes_downhill_and_keeps_the_guard(name):
     assert int(skipped.skipped) == 1 and jax.tree.all(
         jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, PARAMS)
     )
+
+
+@pytest.mark.parametrize("name", ["adamw", "nadamw", "lion", "lamb"])
+def test_elsewhere_than_on_a_cpu_the_steps_are_the_same_and_so_is_the_state(monkeypatch, name):
+    """A run that was begun on one kind of device goes on on the other."""
+    config = dataclasses.replace(CONFIG, name=name)
+    generator = np.random.default_rng(0)
+    gradients = [
+        {key: generator.normal(size=x.shape).astype(np.float32) for key, x in PARAMS.items()}
+        for _ in range(3)
+    ]
+    _, middle = stepped.__wrapped__(gradients[0], config)
+    here = stepped.__wrapped__(gradients[1], config, state=middle)
+    skipped = stepped.__wrapped__(gradients[2], config, np.nan, here[1])
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    there = stepped.__wrapped__(gradients[1], config, state=middle)
+    assert jax.tree.structure(there) == jax.tree.structure(here)
+    # a norm over all entries in another order, then a handful of roundings
+    near = functools.partial(np.testing.assert_allclose, rtol=8 * FLOAT32, atol=FLOAT32)
+    jax.tree.map(near, there, here)
+    jax.tree.map(near, stepped.__wrapped__(gradients[2], config, np.nan, there[1]), skipped)
