@@ -37,6 +37,9 @@ FOR_EVER = 100_000_000
 WARM_UP, EMA, LOGGED, SAVED, RESERVE = 40, 0.998, 20, 90.0, 6.0
 """Steps until the full learning rate; decay of the average; steps between lines of the log; seconds
 between weights on disk; seconds that the last ones may take."""
+PAIRS = 7 << 14
+"""(splat, tile) pairs of a target that fit: twice the 45,000 to 50,000 that targets of the shipped
+network need at 256 pixels. What does not fit is counted in the log."""
 FIRST, SEED = 1000, 0
 """Of the training seeds; of order and views."""
 LPIPS, DISPLACED, START_SHARE = 0.1, 0.5, 0.5
@@ -117,6 +120,8 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
                 log.write(
                     json.dumps({"step": done, "seconds": clock(), "rate": rate} | numbers) + "\n"
                 )
+                if numbers["overflow"]:
+                    print(f"step {done}: {numbers['overflow']:.0f} pairs had no room", flush=True)
             if now - saved > SAVED:
                 saved = now
                 save_weights(
@@ -154,6 +159,7 @@ def configured(how: Clock) -> TrainConfig:
         optimizer=dataclasses.replace(
             config.optimizer, learning_rate=how.learning_rate, warmup_steps=0
         ),
+        splat=dataclasses.replace(config.splat, max_pairs=PAIRS),
         steps=FOR_EVER,
         batch_size=how.batch,
         microbatch_size=how.batch,

@@ -146,7 +146,7 @@ def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[
     size = np.asarray([cameras.width, cameras.height], np.int32)
     sizeless = replace(cameras, width=1, height=1)
     each = [
-        _count(gaussians, camera, size, config)
+        needed_by(gaussians, camera, size, config)
         for camera in (sizeless if sizeless.batch_shape else [sizeless])
     ]
     rows, pairs = np.asarray(each, int).reshape(-1, 2).max(axis=0, initial=0)
@@ -154,11 +154,11 @@ def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[
 
 
 @functools.partial(jax.jit, static_argnums=3)
-def _count(
+def needed_by(
     gaussians: Gaussians, camera: Camera, size: Int[Array, "2"], config: SplatConfig
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Counts rows and pairs of a camera whose image has `size` (width, height) in place of its
-    own.
+    """Counts rows and pairs that an image of `size` (width, height) of a camera needs, in place of
+    its own size. The room that `config` has is not looked at.
     """
     camera = replace(camera, width=size[0], height=size[1])
     projected = project_gaussians(gaussians, camera, config)

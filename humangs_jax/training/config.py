@@ -114,7 +114,9 @@ class TrainConfig:
     optimizer: OptimizerConfig = OptimizerConfig()
     """The optimizer and its learning rate."""
     splat: SplatConfig = SplatConfig()
-    """How targets are drawn."""
+    """How targets are drawn. Without `max_pairs` there is room for twice what the first targets
+    need, where that is worth measuring (`training.room`).
+    """
     target_size: Side = 128
     """Side of the targets, pixels."""
     steps: Steps = 20_000

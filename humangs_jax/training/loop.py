@@ -46,6 +46,7 @@ from humangs_jax.network.weights import save_weights
 from humangs_jax.training.checkpoint import Checkpoints, save_config
 from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.forward import sheet, validate, validation_examples
+from humangs_jax.training.room import with_measured_room, with_twice_the_room
 from humangs_jax.training.sharding import place, replicated, state_shardings, training_mesh, whole
 from humangs_jax.training.sources import SourceFactory, bad_samples, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
@@ -59,6 +60,9 @@ NO_GRADIENT = (
     "had a gradient of 0: no loss depends on a parameter any more; a learning rate that is too high"
     " does that"
 )
+
+NO_ROOM = "(splat, tile) pairs of a step had no room and were not drawn"
+"""What the log says of a step that overflowed."""
 
 
 class RunLog:
@@ -160,7 +164,10 @@ class Watch:
     """
 
     def __init__(self, log: RunLog, state: TrainState):
+        self.overflowed = False
+        """Whether the last step that was looked at had no room for some (splat, tile) pairs."""
         self._log, self._pending = log, None
+        self._told_of_overflow = False
         self._counts = int(state.opt_state.skipped), int(state.opt_state.nonfinite)
         self._in_a_row = self._without_gradient = 0
 
@@ -173,7 +180,7 @@ class Watch:
         # one step may wait behind the one that runs: enough to keep a device busy, and the run
         # reacts to a signal soon
         self.look()
-        names = ("skipped", "nonfinite", "loss", "grad_norm")
+        names = ("skipped", "nonfinite", "loss", "grad_norm", "overflow")
         self._pending = done, {name: metrics[name] for name in names}, bad_samples
 
     def look(self) -> None:
@@ -191,6 +198,11 @@ class Watch:
             self._without_gradient = self._without_gradient + 1
         else:
             self._without_gradient = 0
+        # once: all steps of a fresh network may overflow, and the lines of the log say how much
+        self.overflowed = numbers["overflow"] > 0
+        if self.overflowed and not self._told_of_overflow:
+            self._told_of_overflow = True
+            self._log.event(done, "overflow", f"{numbers['overflow']:.0f} {NO_ROOM}")
         if skipped or replaced:
             samples = bad_samples()
             text = "; ".join(
@@ -383,15 +395,18 @@ def train(
                     examples = validation_examples(unseen, part, validated)
                 batches = loader.batches(first, last, waiting=waiting)
                 for step, batch in batches:
-                    if (
-                        step == first and mesh is None
-                    ):  # costs nothing: once, and the arrays are in memory
+                    if step == first and mesh is None:
+                        # costs nothing: once, and the arrays are in memory
                         for line in bad_samples(loader, step, batch):
                             log.event(step, "sample", line, samples=[line])
+                        part = with_measured_room(part, state.variables, body, batch)
                     with stage("compiling the step") if step == first else contextlib.nullcontext():
                         state, metrics = train_step(state, batch, body, part, networks, mesh)
                     done = step + 1
                     watch(done, metrics, functools.partial(bad_samples, loader, step))
+                    if watch.overflowed and part.splat.max_pairs != config.splat.max_pairs:
+                        part = with_twice_the_room(part, body)
+                        log.event(done, "room", f"{NO_ROOM}: there is twice the room from now on")
                     stop = stopping(done)
                     if done % config.log_every == 0 or done == end or stop:
                         log.steps(

@@ -140,15 +140,16 @@ def test_a_bad_sample_is_named(tmp_path, body, captures, capsys):
 
 def watched(folder, steps, bad_samples=list, before=0):
     """What the log has after `Watch` saw steps: number, skipped and nonfinite so far, loss, norm of
-    the gradient.
+    the gradient, and perhaps the (splat, tile) pairs without room.
     """
-    names = ("skipped", "nonfinite", "loss", "grad_norm")
+    names = ("skipped", "nonfinite", "loss", "grad_norm", "overflow")
     state = TrainState(
         jnp.asarray(0), {}, {}, GuardState(*[jnp.asarray(before)] * 2, jnp.zeros(()), ()), None
     )
     with RunLog(folder, 0, 100, progress=False) as log:
         watch = Watch(log, state)
         for done, *numbers in steps:
+            numbers = (*numbers, 0.0)[: len(names)]
             watch(done, dict(zip(names, map(np.asarray, numbers), strict=True)), bad_samples)
         watch.look()
         watch.look()
@@ -171,3 +172,10 @@ def test_a_gradient_that_stays_0_is_reported_once(tmp_path, capsys):
     events = watched(tmp_path, [(1 + i, 0, 0, 0.0, float(i == 0)) for i in range(2 * MANY_SKIPPED)])
     assert [(line["step"], line["event"]) for line in events] == [(1 + MANY_SKIPPED, "stuck")]
     assert "had a gradient of 0" in capsys.readouterr().out
+
+
+def test_the_first_step_that_had_no_room_for_all_pairs_is_reported(tmp_path, capsys):
+    overflows = (0.0, 7.0, 9.0, 0.0, 3.0)
+    events = watched(tmp_path, [(1 + i, 0, 0, 1.0, 1.0, x) for i, x in enumerate(overflows)])
+    assert [(line["step"], line["event"]) for line in events] == [(2, "overflow")]
+    assert "7 (splat, tile) pairs of a step had no room" in capsys.readouterr().out

@@ -128,7 +128,7 @@ def quick(step=None):
     def made(state, batch, body, config, networks, mesh):
         if step is not None:
             step(int(state.step) + 1)
-        names = ("loss", "psnr", "grad_norm", "skipped", "nonfinite")
+        names = ("loss", "psnr", "grad_norm", "skipped", "nonfinite", "overflow")
         return replace(state, step=state.step + 1), dict.fromkeys(names, jnp.ones(()) * 0)
 
     return made
