@@ -19,6 +19,7 @@ import optax
 
 from experiments.harness import Run, entry
 from humangs_jax.body.library import load_body
+from humangs_jax.core.loops import one_after_the_other
 from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import gaussian_body
@@ -160,6 +161,8 @@ def configured(how: Clock) -> TrainConfig:
             config.optimizer, learning_rate=how.learning_rate, warmup_steps=0
         ),
         splat=dataclasses.replace(config.splat, max_pairs=PAIRS),
+        # one program for all blocks: half of the products that an accelerator tries out
+        model=config.model.with_runtime(scan=not one_after_the_other()),
         steps=FOR_EVER,
         batch_size=how.batch,
         microbatch_size=how.batch,
