@@ -6,7 +6,9 @@ import sys
 
 import pytest
 
-MOST = {"demo": 60, "animate": 12}
+from experiments.first_run import write_photos
+
+MOST = {"demo": 60, "start": 320, "animate": 12}
 """By command: about a quarter more than there were when this was written."""
 
 
@@ -28,3 +30,13 @@ def test_the_demo_and_a_video_of_its_avatar_need_few_programs(tmp_path):
         *("animate", tmp_path / "demo" / "avatar.npz", "--out", tmp_path / "a.mp4", "--size", "64")
     )
     assert len(drawn) <= MOST["animate"], "\n".join(drawn)
+
+
+@pytest.mark.slow
+def test_photos_alone_need_few_programs(tmp_path):
+    photos = tmp_path / "photos"
+    write_photos(photos, 512)
+    started = programs_of(
+        *("start", photos, "--out", tmp_path / "out", "--no-browser", "--refine", "1steps")
+    )
+    assert len(started) <= MOST["start"], "\n".join(started)
