@@ -57,7 +57,8 @@ def scene_fits(
     """
     scene = garden(gaussians, seed)
     cameras = around(photos + HELD_OUT, *size)
-    truth = np.asarray(render_views(scene, cameras, SCENE_SPLAT, "black").rgb)
+    # gloss may exceed 1, which no photo shows
+    truth = np.clip(np.asarray(render_views(scene, cameras, SCENE_SPLAT, "black").rgb), 0, 1)
     shown, hidden = np.arange(photos), np.arange(photos, photos + HELD_OUT)
     rng = np.random.default_rng(seed + 1)
     found = np.asarray(scene.means) + rng.normal(0, FOUND, scene.means.shape)
