@@ -44,6 +44,8 @@ STRONG = {
     "pucker": ("mouthPucker",),
 }
 """Expressions that are varied, and the shapes that move together in each."""
+BOTH = "brows less frown"
+"""How high the brows are."""
 FACE_SIDE, HEAD_PIXELS, HEAD_METRES = 512, 150, 0.24
 """Pixels of a picture and of the head in it; a usual height of a head."""
 FEET = [BODY_NAMES.index(name) for name in ("left_foot", "right_foot")]
@@ -70,7 +72,7 @@ def motion_faces(run: Run, people: int = 8, faces: int = 12) -> None:
     body, networks, parts = load_body(), Networks(), FaceAndHands()
     assert body.expressions is not None
     names = body.expressions.names
-    correlations, found = {name: [] for name in STRONG}, 0
+    correlations, found = {name: [] for name in (*STRONG, BOTH)}, 0
     for seed in list(FITTING)[100 : 100 + people]:
         subject, rng = make_subject(seed, body), np.random.default_rng(seed)
         truth, scores = [], []
@@ -86,9 +88,16 @@ def motion_faces(run: Run, people: int = 8, faces: int = 12) -> None:
                 truth.append(amounts)
                 scores.append(score)
         found += len(scores)
-        for i, (name, shapes) in enumerate(STRONG.items()):
-            own = np.asarray(scores)[:, [SHAPE_NAMES.index(shape) for shape in shapes]].mean(1)
-            correlations[name].append(float(np.corrcoef(own, np.asarray(truth)[:, i])[0, 1]))
+        asked = dict(zip(STRONG, np.asarray(truth).T, strict=True))
+        given = {
+            name: np.asarray(scores)[:, [SHAPE_NAMES.index(shape) for shape in shapes]].mean(1)
+            for name, shapes in STRONG.items()
+        }
+        # brows that are raised and lowered at once are where both have left them
+        for each in (asked, given):
+            each[BOTH] = each["brows"] - each["frown"]
+        for name in correlations:
+            correlations[name].append(float(np.corrcoef(given[name], asked[name])[0, 1]))
     numbers = {
         name: {"mean": float(np.nanmean(each)), "least": float(np.nanmin(each))}
         for name, each in correlations.items()
