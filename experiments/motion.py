@@ -16,16 +16,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from experiments.harness import Run, entry
-from experiments.real_capture import CAMERAS, read_cameras, unpacked
+from experiments.real_capture import CAMERAS, VideoCamera, read_cameras, unpacked
 from experiments.results import markdown_table
 from humangs_jax.apps.video_motion import fit_video, look_at_video, rate_and_count
 from humangs_jax.body.joints import BODY_NAMES, FINGERS, JOINT_NAMES
 from humangs_jax.body.landmarks import landmark_model
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyPose, pose_body, shape_body, without_expression
+from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body, without_expression
 from humangs_jax.capture.detection.face_and_hands import SHAPE_NAMES, FaceAndHands, hand_columns
 from humangs_jax.capture.detection.people import Networks, find_people
-from humangs_jax.capture.fitting.landmark_fit import fit_landmarks
+from humangs_jax.capture.fitting.landmark_fit import LandmarkFit, fit_landmarks
+from humangs_jax.capture.fitting.motion_fit import MotionFit
 from humangs_jax.capture.fitting.residuals.keypoints import make_observations
 from humangs_jax.capture.keypoints.formats import SeenPerson, columns_of
 from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, MEDIAPIPE_69
@@ -229,61 +230,76 @@ def finger_errors(joints, truth):
 
 
 @entry
-def motion_cameras(run: Run, folder: Path, height: float = 1.75, timed_frames: int = 240) -> None:
+def motion_cameras(run: Run, folder: Path, timed_frames: int = 240) -> None:
     """The motion that each of four cameras finds alone in the real capture of `real_capture`, a man
-    on a treadmill, against the body that all four find together.
+    who balances on a beam, against the body that all four find together.
 
     joints: of the body, mean distance from those of the body of all four, measured from the pelvis
-    in the axes of the camera. bends: the same with the joints turned to agree best, so that what
-    remains is how limbs bend. third difference: mean length, over joints and frames. feet: how far
-    the ball of a foot that stands on the belt moves in a frame, across the belt's direction.
+    in the axes of the camera; the motion was given the man's height, or his body. turned: the same
+    after one turn of all frames of a video, which takes out how a single camera is mistaken about
+    its tilt. third difference: mean length, over joints and frames. feet: how far the ball of a
+    foot that is on the beam moves in a frame, across the beam.
 
     Options:
     folder: with the unpacked wheel of pose2sim, see real_capture
-    height: the man's, metres
     timed_frames: of the first video, forwards and backwards, whose motion is found by the command
-    in a process of its own, which has the time of the table; 0: none
+        in a process of its own; 0: none
     """
-    demo = unpacked(folder)
-    lenses, found = read_cameras(demo / "calibration" / "Calib.qca.txt"), {}
+    demo, body = unpacked(folder), without_expression(load_body())
+    lenses, seen_by, found = read_cameras(demo / "calibration" / "Calib.qca.txt"), {}, {}
+    numbers: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as place:
         for name in CAMERAS:
-            lens, video = lenses[name], demo / "videos" / f"{name}.mp4"
-            kept = Path(place) / f"{name}.npz"  # each video is looked at once
+            video = demo / "videos" / f"{name}.mp4"
+            # each video is looked at once; frames are looked at smaller than they are
+            kept = Path(place) / f"{name}.npz"
             seen, size = look_at_video(video, rate_and_count(video)[1], None, kept)
-            # frames are looked at smaller than they are
-            scale = max(size) / max(video_size(video))
-            focal = DIAGONAL_35MM * scale * lens.K[0, 0] / np.hypot(*size)
-            fitted = fit_video(video, height=height, focal_mm=focal, kept=kept)
-            found[name] = (lens, scale, seen, fitted.fit)
-        numbers: dict[str, Any] = {}
+            seen_by[name] = (lenses[name], max(size) / max(video_size(video)), seen)
+        all_four = body_of_all(body, list(seen_by.values()))
+        truth = np.asarray(all_four.joints)[:, : len(BODY_NAMES)]
+        rest = shape_body(body, all_four.betas)
+        height = float(np.ptp(np.asarray(rest.vertices)[:, 1]))
+        for name, (lens, scale, _) in seen_by.items():
+            # from the picture's pixels to millimetres of film
+            looked = scale * np.asarray(video_size(demo / "videos" / f"{name}.mp4"))
+            options: dict[str, Any] = {
+                "focal_mm": DIAGONAL_35MM * scale * lens.K[0, 0] / np.hypot(*looked),
+                "kept": Path(place) / f"{name}.npz",
+            }
+            video = demo / "videos" / f"{name}.mp4"
+            found[name] = [
+                in_the_calibration(fit_video(video, **options, **known).fit, lens)[: len(truth)]
+                for known in ({"height": height}, {"rest_joints": np.asarray(rest.joints)})
+            ]
         if timed_frames:
             numbers["command"] = command_time(
                 demo / "videos" / f"{CAMERAS[0]}.mp4", timed_frames, Path(place)
             )
-    truth = body_of_all([each[:3] for each in found.values()])
-    belt, standing = on_the_belt(truth)
+    beam, standing = along_and_on(truth)
     numbers["all four"] = {
         "third_difference_mm": third_difference(truth),
-        "feet_mm": feet_slide(truth, belt, standing),
+        "feet_mm": feet_slide(truth, beam, standing),
     }
-    for name, (lens, _, _, fit) in found.items():
-        # from the world of the motion to that of the calibration
-        turn = lens.cam_from_world[:3, :3].T @ fit.cam_from_world[:3, :3]
-        own = fit.joints[: len(truth), : len(BODY_NAMES)] @ turn.T
+    from_pelvis = truth - truth[:, :1]
+    for name, (by_height, by_body) in found.items():
+        own = by_height - by_height[:, :1]
+        turn, _ = Rotation.align_vectors(from_pelvis.reshape(-1, 3), own.reshape(-1, 3))
         numbers[name] = {
-            "joints_mm": 1000 * distance(own - own[:, :1], truth - truth[:, :1]),
-            "bends_mm": 1000 * distance(turned_onto(own, truth), truth - truth[:, :1]),
-            "third_difference_mm": third_difference(own),
-            "feet_mm": feet_slide(own, belt, standing),
+            "joints_mm": distance(own, from_pelvis),
+            "own_body_mm": distance(by_body - by_body[:, :1], from_pelvis),
+            "turned_mm": distance(own @ turn.as_matrix().T, from_pelvis),
+            "third_difference_mm": third_difference(by_height),
+            "feet_mm": feet_slide(by_height, beam, standing),
         }
-    keys = ("joints_mm", "bends_mm", "third_difference_mm", "feet_mm")
+    keys = ("joints_mm", "own_body_mm", "turned_mm", "third_difference_mm", "feet_mm")
+    numbers["mean"] = {
+        key: float(np.mean([numbers[name][key] for name in CAMERAS])) for key in keys
+    }
     rows = [
-        [name, *(f"{each[key]:.1f}" if key in each else "" for key in keys)]
-        for name, each in numbers.items()
-        if name != "command"
+        [name, *(f"{numbers[name][key]:.1f}" if key in numbers[name] else "" for key in keys)]
+        for name in (*CAMERAS, "mean", "all four")
     ]
-    header = ["camera", "joints, mm", "bends, mm", "third difference, mm a frame^3"]
+    header = ["camera", "joints, mm", "with his body", "turned", "third difference, mm a frame^3"]
     text = markdown_table([*header, "feet, mm a frame"], rows)
     if timed_frames:
         taken = numbers["command"]
@@ -292,6 +308,12 @@ def motion_cameras(run: Run, folder: Path, height: float = 1.75, timed_frames: i
             f" {taken['cpu']:.0f} s of CPU time."
         )
     run.show(text, numbers)
+
+
+def in_the_calibration(fit: MotionFit, lens: VideoCamera) -> np.ndarray:
+    """The joints of the body in the axes of the calibration's world, metres from anywhere."""
+    turn = lens.cam_from_world[:3, :3].T @ fit.cam_from_world[:3, :3]
+    return fit.joints[:, : len(BODY_NAMES)] @ turn.T
 
 
 def video_size(video: Path) -> tuple[int, int]:
@@ -329,9 +351,11 @@ def command_time(video: Path, frames: int, folder: Path) -> dict[str, float]:
     return {"frames": frames, "wall": time.perf_counter() - began, "cpu": cpu}
 
 
-def body_of_all(cameras: list[tuple[Any, float, dict[str, np.ndarray]]]) -> np.ndarray:
-    """Joints of the body (m, j, 3) that the landmarks of all cameras give together, frame by frame
-    smoothed as `humangs fit` does: metres in the world of the calibration.
+def body_of_all(
+    body: BodyModel, cameras: list[tuple[VideoCamera, float, dict[str, np.ndarray]]]
+) -> LandmarkFit:
+    """The body and its motion that the landmarks of all cameras give together, as `humangs fit
+    --smoothness` does: metres in the world of the calibration.
 
     Arguments: cameras: of each its lens, pixels of a looked-at frame for one of the video, and what
     was seen.
@@ -351,21 +375,13 @@ def body_of_all(cameras: list[tuple[Any, float, dict[str, np.ndarray]]]) -> np.n
         np.stack(places),
     )
     kind = MEDIAPIPE_69
-    model = landmark_model(without_expression(load_body()), kind.names, kind.places, kind.certainty)
-    fit = fit_landmarks(model, observations, smoothness=SMOOTHNESS)
-    return np.asarray(fit.joints)[:, : len(BODY_NAMES)]
+    model = landmark_model(body, kind.names, kind.places, kind.certainty)
+    return fit_landmarks(model, observations, smoothness=SMOOTHNESS)
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean distance of corresponding points."""
-    return float(np.linalg.norm(a - b, axis=-1).mean())
-
-
-def turned_onto(joints: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Joints of each frame from the pelvis, turned to agree best with the true ones."""
-    ours, theirs = joints - joints[:, :1], truth - truth[:, :1]
-    pairs = zip(ours, theirs, strict=True)
-    return np.stack([Rotation.align_vectors(b, a)[0].apply(a) for a, b in pairs])
+    """Mean distance of corresponding points in metres, in mm."""
+    return 1000 * float(np.linalg.norm(a - b, axis=-1).mean())
 
 
 def third_difference(joints: np.ndarray) -> float:
@@ -373,21 +389,20 @@ def third_difference(joints: np.ndarray) -> float:
     return 1000 * float(np.linalg.norm(np.diff(joints, n=3, axis=0), axis=-1).mean())
 
 
-def on_the_belt(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The direction in which the belt moves, and from which frames to the next each foot is on it:
-    those in which the ball of the foot is low. y is up.
+def along_and_on(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The direction of the beam, along which feet that are on it step, and from which frames to the
+    next each foot is on it: those in which the ball of the foot is low. y is up.
     """
     feet = joints[:, FEET]
     heights = feet[..., 1]
     low = heights < np.quantile(heights, LOW_SHARE, axis=0) + LOW
     standing = low[1:] & low[:-1]
     moved = np.diff(feet, axis=0)[standing] * [1.0, 0.0, 1.0]
-    belt = np.linalg.svd(moved)[2][0]
-    return belt, standing
+    return np.linalg.svd(moved)[2][0], standing
 
 
-def feet_slide(joints: np.ndarray, belt: np.ndarray, standing: np.ndarray) -> float:
-    """Mean length of the moves of the feet that stand, without the belt's direction, mm a frame."""
+def feet_slide(joints: np.ndarray, beam: np.ndarray, standing: np.ndarray) -> float:
+    """Mean length of the moves of the feet that stand, but for those along the beam, mm a frame."""
     moved = np.diff(joints[:, FEET], axis=0)[standing]
-    across = moved - (moved @ belt)[:, None] * belt
+    across = moved - (moved @ beam)[:, None] * beam
     return 1000 * float(np.linalg.norm(across, axis=-1).mean())

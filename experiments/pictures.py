@@ -3,7 +3,8 @@ README's pictures.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from PIL import Image
 from skimage.transform import resize
 
 from experiments.harness import Run, entry
+from humangs_jax.apps.video_motion import motion_from_video
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.attach_face import with_face
 from humangs_jax.avatar.avatar import Avatar
@@ -20,11 +22,14 @@ from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import (
     a_pose_of,
     images,
+    motion_frames,
     motion_views,
     rest_pose_of,
     turntable_views,
 )
 from humangs_jax.avatar.video import tile, write_video
+from humangs_jax.body.joints import FINGERS, JOINT_NAMES
+from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture, load_capture
@@ -32,6 +37,8 @@ from humangs_jax.geometry.camera import look_at, project
 from humangs_jax.io.images import to_uint8
 from humangs_jax.motion import load_motion
 from humangs_jax.rendering.splatting import render
+from humangs_jax.synthetic.subject import FITTING, expressed_subject, make_subject, render_view
+from humangs_jax.synthetic.writer import stand
 
 CROP = 0.75
 """Share of the image's width that is shown: cameras keep the whole height of a person in a square
@@ -226,3 +233,76 @@ def _framed(image: np.ndarray, size: int) -> np.ndarray:
     used = np.flatnonzero((image < 0.98).any(axis=(0, 2)))
     left, right = max(0, used[0] - size // 32), min(image.shape[1], used[-1] + size // 32)
     return image[:, left:right]
+
+
+VIDEO_SIDE = (704, 960)
+"""Pixels of a frame of the rendered video, width and height: the head has 120."""
+GESTURES = 54
+"""Frames of the video."""
+GESTURE_RATE = 18.0
+"""Frames a second."""
+
+
+@entry
+def motion_picture(run: Run, avatar: Path, out: Path = Path("docs/images/motion.gif")) -> None:
+    """Somebody who waves, closes a hand and makes faces in a video, and an avatar of somebody else
+    that moves as `humangs motion` found it there, side by side.
+
+    The video is rendered from a synthetic person, and looked at like any other.
+
+    Options:
+    avatar: avatar.npz of `humangs demo`
+    out: the picture
+    """
+    person = Avatar.load(avatar)
+    with tempfile.TemporaryDirectory() as folder:
+        video = Path(folder) / "video.mp4"
+        frames = list(gestures())
+        write_video(video, frames, GESTURE_RATE)
+        motion = motion_from_video(video, avatar=person)
+    shot = Shot(width=VIDEO_SIDE[0] // 2, height=VIDEO_SIDE[1] // 2, background="white")
+    drawn = list(motion_frames(with_face(person), motion, shot))
+    pairs = [
+        np.concatenate([resize(frame, image.shape, anti_aliasing=True), image], axis=1)
+        for frame, image in zip(frames, drawn, strict=True)
+    ]
+    write_video(out, pairs, GESTURE_RATE)
+    run.show(f"{out}: {len(pairs)} frames")
+
+
+def gestures() -> Iterator[np.ndarray]:
+    """Frames of a synthetic person who raises an arm, closes the hand, turns, smiles and speaks."""
+    body = load_body()
+    assert body.expressions is not None
+    names = body.expressions.names
+    subject = make_subject(list(FITTING)[300], body)
+    width, height = VIDEO_SIDE
+    K = jnp.asarray([[1.35 * height, 0, width / 2], [0, 1.35 * height, height / 2], [0, 0, 1]])
+    eye, target, up = (jnp.asarray(x) for x in ([0.0, 1.1, 2.9], [0.0, 0.92, 0.0], [0.0, 1, 0]))
+    camera = look_at(eye, target, up, K, width, height)
+    for i in range(GESTURES):
+        phase = 2 * np.pi * i / GESTURES
+        # 0 at the beginning and the end, 1 in the middle
+        raised = 0.5 - 0.5 * np.cos(phase)
+        rotations = np.zeros((len(JOINT_NAMES), 3))
+        rotations[JOINT_NAMES.index("pelvis"), 1] = 0.35 * np.sin(phase)
+        rotations[JOINT_NAMES.index("left_shoulder"), 2] = -1.2 + 1.5 * raised
+        rotations[JOINT_NAMES.index("right_shoulder"), 2] = 1.2 - 0.3 * raised
+        rotations[JOINT_NAMES.index("left_elbow"), 2] = 1.3 * raised + 0.3 * np.sin(3 * phase)
+        rotations[JOINT_NAMES.index("right_elbow"), 1] = 1.2 * raised
+        closed = 0.5 - 0.5 * np.cos(2 * phase)
+        for side, sign in (("left", -1), ("right", 1)):
+            for finger in FINGERS[:4]:
+                for knuckle in (1, 2, 3):
+                    rotations[JOINT_NAMES.index(f"{side}_{finger}{knuckle}"), 2] = sign * closed
+        amounts = {
+            "jawOpen": 0.8 * max(0.0, np.sin(2 * phase)),
+            "mouthSmileLeft": raised,
+            "mouthSmileRight": raised,
+            "browInnerUp": max(0.0, np.sin(phase)),
+            "eyeBlinkLeft": float(i % 18 in (8, 9)),
+            "eyeBlinkRight": float(i % 18 in (8, 9)),
+        }
+        coefficients = np.asarray([amounts.get(name, 0.0) for name in names], np.float32)
+        posed = stand(expressed_subject(subject, body, coefficients), rotations)
+        yield np.asarray(render_view(posed, camera)[0], np.float32)
