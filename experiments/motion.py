@@ -127,7 +127,7 @@ def face_picture(subject, rng):
     return render_view(posed, look_at(*place, K, FACE_SIDE, FACE_SIDE))[0].astype(np.float32)
 
 
-FULL_SIDE, FULL_METRES = 768, 2.1
+FULL_SIDE, FULL_METRES = 1536, 2.1
 """Pixels of a picture of a whole person, and metres that it shows."""
 HAND_VIEWS = (0.0, 50.0, -60.0, 120.0)
 """Degrees around a person from which cameras see it."""
