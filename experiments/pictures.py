@@ -37,7 +37,7 @@ from humangs_jax.geometry.camera import look_at, project
 from humangs_jax.io.images import to_uint8
 from humangs_jax.motion import load_motion
 from humangs_jax.rendering.splatting import render
-from humangs_jax.synthetic.subject import FITTING, expressed_subject, make_subject, render_view
+from humangs_jax.synthetic.subject import SPLITS, expressed_subject, make_subject, render_view
 from humangs_jax.synthetic.writer import stand
 
 CROP = 0.75
@@ -275,7 +275,7 @@ def gestures() -> Iterator[np.ndarray]:
     body = load_body()
     assert body.expressions is not None
     names = body.expressions.names
-    subject = make_subject(list(FITTING)[300], body)
+    subject = make_subject(list(SPLITS["fitting"])[300], body)
     width, height = VIDEO_SIDE
     K = jnp.asarray([[1.35 * height, 0, width / 2], [0, 1.35 * height, height / 2], [0, 0, 1]])
     eye, target, up = (jnp.asarray(x) for x in ([0.0, 1.1, 2.9], [0.0, 0.92, 0.0], [0.0, 1, 0]))
