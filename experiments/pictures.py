@@ -260,7 +260,7 @@ def motion_picture(run: Run, avatar: Path, out: Path = Path("docs/images/motion.
         frames = list(gestures())
         write_video(video, frames, GESTURE_RATE)
         motion = motion_from_video(video, avatar=person)
-    shot = FrameSettings(width=VIDEO_SIDE[0] // 2, height=VIDEO_SIDE[1] // 2, background="white")
+    shot = FrameSettings(width=VIDEO_SIDE[0] // 3, height=VIDEO_SIDE[1] // 3, background="white")
     drawn = list(motion_frames(with_face(person), motion, shot))
     pairs = [
         np.concatenate([resize(frame, image.shape, anti_aliasing=True), image], axis=1)
