@@ -18,12 +18,12 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.body_and_masks import (
     MASK_THRESHOLD,
     shaped,
-    silhouette,
     skinned,
     views_without_person,
 )
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
+from humangs_jax.data.vertex_offsets import silhouette
 from humangs_jax.io.images import resized
 
 LONGEST = 512

@@ -16,14 +16,11 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import short_repr
-from humangs_jax.data.body_and_masks import (
-    fit_vertex_offsets,
-    report_left_out,
-    views_without_person,
-)
+from humangs_jax.data.body_and_masks import report_left_out, views_without_person
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import equalize_exposure
 from humangs_jax.data.skirt import add_skirt
+from humangs_jax.data.vertex_offsets import fit_vertex_offsets
 from humangs_jax.data.view_choice import best_views
 from humangs_jax.data.views import (
     gaussian_body,

@@ -5,7 +5,7 @@ a long skirt becomes a pair of ragged trousers. The vertices of the skirt are li
 those of the legs, in shape, pose directions and skinning
 weights: where it spans the gap, of one point on each leg. So it bends smoothly between them. Its
 rows lie on the convex section of both legs; from there it is displaced along its normals to the
-edges of the masks, as the body is (`data.body_and_masks`).
+edges of the masks, as the body is (`data.vertex_offsets`).
 
 The photos show a skirt where points between the legs, and beside both, lie inside the masks. It
 ends above the first row where they do not. Legs that no photo shows apart have no skirt. All on the
@@ -22,16 +22,18 @@ from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import (
     MASK_THRESHOLD,
+    empty_views,
+    shaped,
+    skinned,
+)
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.vertex_offsets import (
     OffsetFitConfig,
     Points,
     at,
-    empty_views,
     masked_views,
-    shaped,
-    skinned,
     to_edges,
 )
-from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.mesh import vertex_areas
 
 LEGS = (("left_hip", "left_knee", "left_ankle"), ("right_hip", "right_knee", "right_ankle"))

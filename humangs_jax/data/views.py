@@ -65,7 +65,7 @@ class SubjectViews:
     """
     displacement: Float[Array, "n 3"] | None = None
     """How far the vertices of the shaped body move in the T-pose, (n, 3), metres
-    (`data.body_and_masks`). None: nowhere.
+    (`data.vertex_offsets`). None: nowhere.
     """
     unknown: Bool[Array, "v h w"] | None = None
     """Where the person may be hidden and masks are 0, (v, h, w). None: nowhere."""

@@ -122,7 +122,7 @@ class Runtime:
         gain="boundaries and hems of bodies that are a centimetre off, and skirts",
         measured="benchmarks/quality.md",
     )
-    """The body is moved to the edges of the masks first (`data.body_and_masks`), for weights that
+    """The body is moved to the edges of the masks first (`data.vertex_offsets`), for weights that
     look at the pixels of the "person". None: where a part of it sticks out of the masks; True:
     always, which costs PSNR where the body is right. False: never; a capture's own displacement,
     which else comes first, and a skirt (`data.skirt`) are left out, too."""

@@ -31,8 +31,8 @@ from humangs_jax.core.processes import in_processes
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.core.records import array_fields
-from humangs_jax.data.body_and_masks import fit_vertex_offsets, silhouette
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.vertex_offsets import fit_vertex_offsets, silhouette
 from humangs_jax.geometry.camera import project
 from humangs_jax.io.arrays import check_array, check_indices, check_joints, read_npz, write_npz
 from humangs_jax.io.atomic import replace_folder
@@ -231,7 +231,7 @@ class PeopleBank:
     """Number of the pose that is most like each one, (p, q)."""
     displacements: Float[Array, "p b 3"]
     """Offsets of a body's vertices to the silhouettes of the dressed person
-    (`data.body_and_masks`), (p, b, 3), metres; b is 0 in a bank without.
+    (`data.vertex_offsets`), (p, b, 3), metres; b is 0 in a bank without.
     """
     parents: tuple[int, ...] = static_field(default=())
     """Parent of each joint. Static."""

@@ -22,10 +22,10 @@ from humangs_jax.body.model import BodyPose, person_vertices, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import skirt
-from humangs_jax.data.body_and_masks import fit_vertex_offsets
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.loading.examples import shrink
 from humangs_jax.data.prepared import prepare_capture
+from humangs_jax.data.vertex_offsets import fit_vertex_offsets
 from humangs_jax.data.views import (
     SubjectViews,
     cropped,

@@ -15,8 +15,13 @@ from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import views
-from humangs_jax.data.body_and_masks import HELD_JOINTS, WRAP, OffsetFitConfig, fit_vertex_offsets
 from humangs_jax.data.capture import capture_from_arrays
+from humangs_jax.data.vertex_offsets import (
+    HELD_JOINTS,
+    WRAP,
+    OffsetFitConfig,
+    fit_vertex_offsets,
+)
 from humangs_jax.data.views import gaussian_body, on_gaussian_body, subject_rest
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.presets import tiny

@@ -9,10 +9,11 @@ from changes import edit_json
 from humangs_jax.capture.fitting.refine import overlap
 from humangs_jax.capture.fitting.residuals.silhouettes import mask_boundary
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.body_and_masks import fit_vertex_offsets, views_without_person
+from humangs_jax.data.body_and_masks import views_without_person
 from humangs_jax.data.capture import CaptureError, load_capture, save_capture
 from humangs_jax.data.hidden import hidden_line, hidden_parts, with_hidden_parts
 from humangs_jax.data.prepared import prepare_capture
+from humangs_jax.data.vertex_offsets import fit_vertex_offsets
 from humangs_jax.data.views import cropped
 from humangs_jax.evaluation.scores import score
 from humangs_jax.io.images import read_grey, write_png

@@ -1,0 +1,411 @@
+"""How far the skin of the body moves to fill the masks.
+
+The body is displaced: its vertices are moved along their normals until its silhouettes meet those
+of all photos. Where a vertex lies on the body's own silhouette in a photo, the mask's edge along
+its normal says how far it should move. A sparse least-squares fit carries this over the rest of the
+mesh, smoothly:
+
+    sum over photos of (t - target)^2 + WEAKNESS t^2 + SMOOTHNESS^4 (Laplacian t)^2,    per area,
+
+so that a section between two photos becomes round. What is then still outside a mask is moved
+inwards. Clothes become part of the body (as in "SMPL+D", https://arxiv.org/abs/1803.04758). All on
+the host, by numpy and scipy: nothing is compiled.
+"""
+
+import dataclasses
+import functools
+
+import numpy as np
+from PIL import Image, ImageDraw
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import Bool, Float, Int
+from humangs_jax.data.body_and_masks import MASK_THRESHOLD, empty_views, shaped, skinned
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.masks import box_of, signed_distance
+from humangs_jax.geometry.mesh import unit, vertex_area_vectors, vertex_areas
+from humangs_jax.io.images import resized
+
+STEP = 0.0025
+"""Metres along a normal, of the search for a mask's edge."""
+WEAKNESS = 0.002
+"""Weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette."""
+HELD = 20.0
+"""The same, for hands and head."""
+HELD_JOINTS = ("head", "jaw", "eye", "wrist", "index", "middle", "pinky", "ring", "thumb")
+NEAR = 2.5
+"""Pixels. A vertex may be on the body's silhouette if it is no farther from the edge."""
+PROBE = 0.012
+"""Metres by which such a vertex is moved along its normal, to see whether it leaves the
+silhouette.
+"""
+LEAVES = 0.6
+"""It is on the silhouette if that move leaves it by this share of PROBE."""
+DRAWN = 0.5
+"""Pixels by which polygons are drawn larger than they are."""
+WRAP = 0.07
+"""At last, vertices outside a mask move inwards by up to so many metres, until all masks contain
+them by the inset.
+"""
+WRAP_ROUNDS = 6
+"""How often these moves are averaged over the neighbours."""
+OUTSIDE = 0.01
+"""Metres outside of a mask from which on a vertex counts as outside."""
+MISFIT = 0.025
+"""A body does not fit its masks if more than this share of its vertices (no head, no hands) lies
+more than OUTSIDE outside of a mask. Clothes never cause that: of true bodies the share is 0. It was
+at least 0.03 for bodies that are a centimetre off, 0.02 to 0.06 for a real man fitted to keypoints
+alone, and at most 0.02 for his fits refined by the masks.
+"""
+LONGEST = 480
+"""Pixels of the window around the person in which silhouettes are compared."""
+MARGIN = 0.12
+"""The room around the person, as a share of its height."""
+
+
+Points = Float[np.ndarray, "n 3"]
+Faces = Int[np.ndarray, "f 3"]
+PerVertex = Float[np.ndarray, " n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class OffsetFitConfig:
+    """How a surface moves to the edges of the masks. The defaults are those of bodies: the network
+    adds clothes on top, and knows naked ones.
+    """
+
+    outwards: float = 0.05
+    """How far outwards along a normal a mask's edge is looked for, and the largest move, metres."""
+    inwards: float = 0.06
+    """The same inwards, metres."""
+    smoothness: float = 0.03
+    """The length over which a move spreads to the vertices around it, metres."""
+    inset: tuple[float, float] = (0.005, 0.025)
+    """The least and the most that the surface may lie inside the masks, metres."""
+    iterations: int = 2
+    """How often edges are looked for and the surface is moved."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskedView:
+    """One photo: the window around the person, and the body as it is posed there."""
+
+    coverage: Float[np.ndarray, "h w"]
+    """The share of each pixel that the person covers, (h, w), in [0, 1]."""
+    project: Float[np.ndarray, "3 4"]
+    """From the world in metres to homogeneous pixels of the window, (3, 4)."""
+    linear: Float[np.ndarray, "n 3 3"]
+    """The linear part of the move from the rest pose to the posed body, for each vertex, (n, 3, 3).
+    """
+    offset: Float[np.ndarray, "n 3"]
+    """The offset of that move, (n, 3), metres."""
+    low: Float[np.ndarray, "2"]
+    """The least x and y in the window that count as in the photo, (2,), pixels: `NEAR` inside its
+    corner.
+    """
+    high: Float[np.ndarray, "2"]
+    """The largest x and y that do, (2,), pixels."""
+    hidden: Float[np.ndarray, "h w"] | None = None
+    """Where somebody may be in front, (h, w), in [0, 1]: the ends of masks say nothing there. None:
+    nowhere.
+    """
+
+    @functools.cached_property
+    def mask(self) -> Float[np.ndarray, "h w"]:
+        """Signed distance to the edge of the mask, pixels."""
+        return signed_distance(self.coverage).astype(np.float32)
+
+    def seen(
+        self, points: Float[np.ndarray, "*n 3"], index: np.ndarray | slice = slice(None)
+    ) -> tuple:
+        """Pixels (*n, 2) of points in the rest pose, pixels for a metre there, and which the photo
+        shows.
+        """
+        posed = np.einsum("nab,n...b->n...a", self.linear[index], points)
+        posed += self.offset[index].reshape(len(posed), *[1] * (points.ndim - 2), 3)
+        clip = posed @ self.project[:, :3].T + self.project[:, 3]
+        depth = np.maximum(clip[..., 2], 1e-3)
+        pixels = clip[..., :2] / depth[..., None]
+        within = (clip[..., 2] > 1e-3) & ((pixels > self.low) & (pixels < self.high)).all(-1)
+        if self.hidden is not None:
+            within &= at(self.hidden, pixels) < MASK_THRESHOLD
+        return pixels, np.linalg.norm(self.project[0, :3]) / depth, within
+
+
+def fit_vertex_offsets(
+    body: BodyModel,
+    capture: Capture,
+    inset: tuple[float, float] = OffsetFitConfig.inset,
+    *,
+    always: bool = True,
+) -> Float[np.ndarray, "n 3"]:
+    """How far the vertices of the shaped body of a person move in the T-pose, metres, so that it
+    fills the masks; bounded.
+
+    Arguments: body: the capture's, or one of `data.views.gaussian_body`. capture: with masks;
+    frames and worlds may be any.
+    always: else 0 where the body fits the masks already, see `MISFIT`: it then gains less than the
+    network's own clothes lose. Where masks say nothing, or nothing of the body is near them, it is
+    0.
+    """
+    assert capture.masks is not None
+    rest = shaped(body, capture.betas)
+    views = masked_views(body, rest, capture)
+    total = np.zeros_like(rest)
+    if not views:
+        return total.astype(np.float32)
+    faces = np.asarray(body.faces)
+    held = (
+        HELD
+        * np.asarray(body.skinning_weights)
+        @ [any(x in name for x in HELD_JOINTS) for name in body.joint_names]
+    )
+    if not always and _share_outside(views, rest, held < HELD / 2) < MISFIT:
+        return total.astype(np.float32)
+    total += to_edges(views, rest, faces, held, OffsetFitConfig(inset=inset))
+    moved, normals = rest + total, unit(vertex_area_vectors(rest + total, faces))
+    total -= _outside(views, moved, normals, faces, inset, held < HELD / 2)[:, None] * normals
+    return total.astype(np.float32)
+
+
+def to_edges(
+    views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: OffsetFitConfig
+) -> Points:
+    """How far the vertices of a surface in the T-pose move along its normals to the masks' edges,
+    smoothly.
+
+    held: weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette.
+    """
+    total = np.zeros_like(rest)
+    for _ in range(reach.iterations):
+        moved, normals = rest + total, unit(vertex_area_vectors(rest + total, faces))
+        count, summed = _targets(views, moved, normals, faces, reach)
+        total += _spread(moved, faces, count, summed, held, reach)[:, None] * normals
+    return total
+
+
+def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[MaskedView]:
+    """The views of a capture whose masks are not empty, cut to the person."""
+    assert capture.masks is not None
+    joints = np.asarray(body.joint_regressor, float) @ rest
+    weights, views, posed = np.asarray(body.skinning_weights, float), [], {}
+    empty = empty_views(capture.masks)
+    for i, frame in enumerate(np.asarray(capture.frames).tolist()):
+        if i in empty:
+            continue
+        if frame not in posed:
+            posed[frame] = skinned(body, joints, capture.poses, frame, weights, corrected=True)
+        # a body that is not finite is named by whoever poses it
+        if not all(np.isfinite(x).all() for x in (rest, *posed[frame])):
+            continue
+        K = np.asarray(capture.cameras.K, float)[i]
+        matrix = np.asarray(capture.cameras.cam_from_world, float)[i]
+        hidden = None if capture.unknown is None else capture.unknown[i]
+        mask = np.asarray(capture.masks[i])
+        views.append(_window(mask, hidden, K @ matrix[:3], *posed[frame]))
+    return views
+
+
+def _window(
+    mask: Float[np.ndarray, "h w"],
+    hidden: Bool[np.ndarray, "h w"] | None,
+    project: Float[np.ndarray, "3 4"],
+    linear: Float[np.ndarray, "n 3 3"],
+    offset: Points,
+) -> MaskedView:
+    """Cuts a view to the person and brings it to one size.
+
+    Outside of the photo the mask repeats the values at the photo's border.
+    """
+    (top, bottom), (left, right) = box_of(mask > MASK_THRESHOLD).tolist()
+    margin = int(np.ceil(MARGIN * max(bottom - top, right - left)))
+    top, left, bottom, right = top - margin, left - margin, bottom + margin, right + margin
+    height, width = mask.shape
+    pad = ((max(-top, 0), max(bottom - height, 0)), (max(-left, 0), max(right - width, 0)))
+    cut = slice(max(top, 0), bottom), slice(max(left, 0), right)
+    window = np.pad(mask[cut], pad, mode="edge")
+    scale = LONGEST / max(window.shape)
+    rows, columns = (max(1, round(side * scale)) for side in window.shape)
+    x, y = columns / window.shape[1], rows / window.shape[0]
+    to_window = np.asarray([[x, 0, -left * x], [0, y, -top * y], [0, 0, 1]])
+    low = np.asarray([-left * x, -top * y])
+    high = np.asarray([(width - left) * x, (height - top) * y])
+    covers = None
+    if hidden is not None and hidden[cut].any():
+        share = resized(np.pad(hidden[cut], pad, mode="edge").astype(np.float32), columns, rows)
+        # the mask's edge beside it is that of who stands in front
+        covers = ndimage.maximum_filter(share, size=2 * int(np.ceil(NEAR)) + 1)
+    return MaskedView(
+        resized(window, columns, rows),
+        to_window @ project,
+        linear,
+        offset,
+        low + NEAR,
+        high - NEAR,
+        covers,
+    )
+
+
+def _share_outside(
+    views: list[MaskedView], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]
+) -> float:
+    """The share of the free vertices that are `OUTSIDE` outside of a mask, or, if few are outside
+    at all, the share of these.
+    """
+    if not free.any():
+        return 0.0
+    outside, far = np.zeros((2, len(rest)), bool)
+    seen = [view.seen(rest) for view in views]
+
+    # outside at all, which needs no distances
+    for view, (pixels, _, within) in zip(views, seen, strict=True):
+        outside |= within & (at(view.coverage, pixels) < MASK_THRESHOLD)
+    few = float(outside[free].mean())
+    if few < MISFIT:
+        return few
+
+    for view, (pixels, per_metre, within) in zip(views, seen, strict=True):
+        far |= within & (at(view.mask, pixels) < -OUTSIDE * per_metre)
+    return float(far[free].mean())
+
+
+def _targets(
+    views: list[MaskedView], rest: Points, normals: Points, faces: Faces, how: OffsetFitConfig
+) -> tuple[PerVertex, PerVertex]:
+    """For each vertex the number of photos that show it on the silhouette, and the sum of the
+    distances to the masks' edges.
+    """
+    count, summed = np.zeros(len(rest)), np.zeros(len(rest))
+    reach = np.arange(-how.inwards, how.outwards + STEP / 2, STEP)
+    for view in views:
+        pixels, per_metre, within = view.seen(rest)
+        own = _silhouette_distance(pixels, faces, view.mask.shape)
+        probed, _, _ = view.seen(rest + PROBE * normals)
+        leaves = at(own, probed) < at(own, pixels) - LEAVES * PROBE * per_metre
+        edge = np.flatnonzero(within & (np.abs(at(own, pixels)) < NEAR) & leaves)
+        along = rest[edge, None] + reach[:, None] * normals[edge, None]
+        pixels, _, within = view.seen(along, edge)
+        there, found = _crossing(np.where(within, at(view.mask, pixels), np.nan), reach)
+        here, known = _crossing(at(own, pixels), reach)
+        found &= known
+        count[edge[found]] += 1
+        gap = (there - here)[found]
+        summed[edge[found]] += gap - np.clip(gap, *how.inset)
+    return count, summed
+
+
+def _crossing(
+    depths: Float[np.ndarray, "e r"], reach: Float[np.ndarray, " r"]
+) -> tuple[Float[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
+    """Where the mask ends along each normal, nearest to its start: outwards from the inside,
+    inwards from the outside.
+    """
+    zero = int(np.argmin(np.abs(reach)))
+    distance, found = np.zeros(len(depths)), np.zeros(len(depths), bool)
+    starts_inside = depths[:, zero] > 0
+    for inside, order in ((True, slice(zero, None)), (False, slice(zero, None, -1))):
+        rows = np.flatnonzero(starts_inside == inside)
+        values, places = depths[rows][:, order], reach[order]
+        if inside:
+            crossed = values[:, 1:] <= 0
+        else:
+            crossed = values[:, 1:] > 0
+        unknown = np.isnan(values).cumsum(1)[:, 1:] > 0
+        first = np.argmax(crossed & ~unknown, axis=1)
+        hit = (crossed & ~unknown)[np.arange(len(rows)), first]
+        a, b = values[np.arange(len(rows)), first], values[np.arange(len(rows)), first + 1]
+        share = np.where(hit, a / np.where(a == b, 1, a - b), 0)
+        distance[rows] = places[first] + np.clip(share, 0, 1) * (places[first + 1] - places[first])
+        found[rows] = hit
+    return distance, found
+
+
+def _silhouette_distance(
+    pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]
+) -> Float[np.ndarray, "h w"]:
+    """Signed distance to the edge of the silhouette of a surface, pixels; positive inside."""
+    # the side that faces the camera covers all
+    a, b, c = np.moveaxis(pixels[faces], 1, 0)
+    turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    return signed_distance(silhouette(pixels, faces[turn < 0], shape)) - DRAWN
+
+
+def silhouette(
+    pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]
+) -> Float[np.ndarray, "h w"]:
+    """1 where triangles lie, larger by `DRAWN` than they are."""
+    image = Image.new("L", (shape[1], shape[0]))
+    pen = ImageDraw.Draw(image)
+    for corners in (pixels[faces] - 0.5).reshape(-1, 6).tolist():
+        pen.polygon(corners, fill=1)
+    return np.asarray(image, np.float32)
+
+
+def _spread(
+    vertices: Points,
+    faces: Faces,
+    count: PerVertex,
+    summed: PerVertex,
+    held: PerVertex,
+    reach: OffsetFitConfig,
+) -> PerVertex:
+    """The smooth displacement that is nearest to the targets."""
+    areas = np.maximum(vertex_areas(vertices, faces), 1e-9)
+    laplacian = _laplacian(vertices, faces)
+    bending = reach.smoothness**4 * laplacian.T @ sparse.diags(1 / areas) @ laplacian
+    matrix = sparse.diags(areas * (WEAKNESS + count + held)) + bending
+    return np.clip(splu(matrix.tocsc()).solve(areas * summed), -reach.inwards, reach.outwards)
+
+
+def _laplacian(vertices: Points, faces: Faces) -> sparse.csr_array | sparse.csr_matrix:
+    """By the cotangents of the angles, none of them negative."""
+    rows, columns, values = [], [], []
+    for i in range(3):
+        a, b, c = (faces[:, (i + k) % 3] for k in range(3))
+        u, v = vertices[a] - vertices[c], vertices[b] - vertices[c]
+        cotangent = (u * v).sum(-1) / np.maximum(np.linalg.norm(np.cross(u, v), axis=-1), 1e-10)
+        rows = [*rows, a, b]
+        columns = [*columns, b, a]
+        values = [*values, *[np.clip(cotangent, 0.05, 5) / 2] * 2]
+    size = len(vertices)
+    weights = sparse.coo_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)
+    ).tocsr()
+    return (sparse.diags(np.asarray(weights.sum(axis=1))) - weights).tocsr()
+
+
+def _outside(
+    views: list[MaskedView],
+    rest: Points,
+    normals: Points,
+    faces: Faces,
+    inset: tuple[float, float],
+    free: Bool[np.ndarray, " n"],
+) -> PerVertex:
+    """How far each vertex moves inwards until all masks contain it, smoothly."""
+    reach = np.arange(0, WRAP + STEP / 2, STEP)
+    inside = np.full((len(rest), len(reach)), np.inf)
+    for view in views:
+        pixels, per_metre, within = view.seen(rest[:, None] - reach[:, None] * normals[:, None])
+        inside = np.minimum(inside, np.where(within, at(view.mask, pixels) / per_metre, np.inf))
+    good = inside >= inset[0]
+    move = np.where((inside[:, 0] < 0) & good.any(1) & free, reach[np.argmax(good, axis=1)], 0)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    size = len(rest)
+    ones = np.ones(len(edges))
+    near = sparse.coo_array((ones, (edges[:, 0], edges[:, 1])), (size, size)).tocsr()
+    near = near + near.T + sparse.eye(size)
+    near = sparse.diags(1 / np.asarray(near.sum(axis=1))) @ near
+    for _ in range(WRAP_ROUNDS):
+        move = near @ move
+    return move
+
+
+def at(
+    image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "*b 2"]
+) -> Float[np.ndarray, "*b"]:
+    """Bilinear; pixel centres at + 0.5."""
+    x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
+    return ndimage.map_coordinates(image, [y, x], order=1, mode="nearest", prefilter=False)
