@@ -4,8 +4,7 @@ person.
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +12,6 @@ import numpy as np
 
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export import ExportFormat
-from humangs_jax.avatar.export.gaussians import world_matrix
 from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.body.model import BodyPose, RestBody, blend_transforms, joint_transforms
 from humangs_jax.body.motion import Motion, grounded
@@ -27,15 +24,12 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import upright_world
 from humangs_jax.geometry import transform
-from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
-from humangs_jax.io.atomic import add_files, check_ours
-from humangs_jax.io.images import DRAWN, is_own_output, write_png
+from humangs_jax.geometry.camera import Camera, intrinsics_from_fov
 from humangs_jax.io.reading import check_limit
 from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import (
     ALPHA_MIN,
-    DEFAULT_CONFIG,
     SPLAT_PRESETS,
     SplatConfig,
     drawn_as,
@@ -456,141 +450,3 @@ def without_unseen(
     ):
         most = np.maximum(most, rendering.visibility)
     return avatar.select(np.flatnonzero(most >= ALPHA_MIN))
-
-
-# Views of any Gaussians, those of other programs too: from a circle of cameras, or from the cameras
-# of a calibration ---
-
-
-SHOWN = 0.9
-"""Share of the opaque Gaussians that a circle of cameras is made to show: outliers are far away."""
-NEARLY_ALL = 0.999
-"""Share of the opaque Gaussians whose distance is taken for that of all."""
-COMPACT = 3.0
-"""Where nearly all are within so many times the distance of `SHOWN`, as of a person, there are no
-outliers: all are shown.
-"""
-ROOM = 1.1
-PAIRS = 4_000_000
-"""(splat, tile) pairs that are drawn at once: some hundred megabytes."""
-
-
-def circle_cameras(
-    gaussians: Gaussians, form: ExportFormat, views: int, shot: FrameSettings
-) -> dict[str, Camera]:
-    """Cameras around the middle of the Gaussians, by name.
-
-    form: of the file that the Gaussians are from. Without an azimuth the first camera sees the
-    front of a person that `export` wrote. Without a distance all of them fit.
-    """
-    means = np.asarray(gaussians.means)[
-        np.asarray(gaussians.opacities) >= 0.5 * np.max(gaussians.opacities, initial=0)
-    ]
-    # most of what is opaque; all of it where nothing lies far away, as of a person
-    middle = np.median(means, axis=0) if len(means) else np.zeros(3)
-    radius = 1.0
-    if len(means):
-        radius = np.quantile(np.linalg.norm(means - middle, axis=1), SHOWN)
-        low, high = np.quantile(means, [1 - NEARLY_ALL, NEARLY_ALL], axis=0)
-        whole = np.quantile(np.linalg.norm(means - (low + high) / 2, axis=1), NEARLY_ALL)
-        if whole < COMPACT * radius:
-            middle, radius = (low + high) / 2, max(radius, whole)
-    distance = ROOM * max(float(radius), 1e-3) / np.sin(np.arctan(min(shot.tangents)))
-    # cameras stand around it in the world of the file, whose up axis may be another
-    turn = world_matrix(form)
-    cameras = orbit(
-        from_host(middle @ turn, jnp.float32),
-        distance if shot.distance is None else shot.distance,
-        jnp.radians(shot.azimuth + 360 / views * np.arange(views)).astype(jnp.float32),
-        float(np.radians(shot.elevation)),
-        intrinsics_from_fov(float(np.radians(shot.fov)), *shot.resolution),
-        *shot.resolution,
-    )
-    turned = np.asarray(cameras.cam_from_world).copy()
-    turned[:, :3, :3] = turned[:, :3, :3] @ turn.T
-    each = replace(cameras, cam_from_world=from_host(turned))
-    return {f"view_{i:03d}": camera for i, camera in enumerate(each)}
-
-
-def splat_images(
-    gaussians: Gaussians, cameras: Mapping[str, Camera], shot: FrameSettings
-) -> Iterator[Float[np.ndarray, "h w c"]]:
-    """One image for each camera, in bounded memory; with alpha where the shot's background is
-    transparent.
-    """
-    config = SPLAT_PRESETS["exact" if shot.splat == "as_trained" else shot.splat]
-    drawn = (
-        render_in_bands(gaussians, camera, config, jnp.zeros(3)) for camera in cameras.values()
-    )
-    for rendering in bar(drawn, total=len(cameras), desc="render", unit="view", first=COMPILING):
-        yield composite_over(rendering, shot.color())
-
-
-def write_splat_views(
-    out: Path, gaussians: Gaussians, cameras: Mapping[str, Camera], shot: FrameSettings
-) -> int:
-    """Images NAME.png in a folder, which appear together; other files stay. Returns how many.
-
-    Raises: OSError.
-    """
-
-    def write(folder: Path) -> None:
-        for name, image in zip(cameras, splat_images(gaussians, cameras, shot), strict=True):
-            write_png(folder / f"{name}.png", image, mark=DRAWN)
-
-    check_ours((out / f"{name}.png" for name in cameras), is_own_output)
-    add_files(out, write, ours=is_own_output)
-    return len(cameras)
-
-
-# Large scenes in bounded memory: the image in bands of rows, one after the other, each with buffers
-# of the same size -------
-
-
-def render_in_bands(
-    gaussians: Gaussians,
-    camera: Camera,
-    config: SplatConfig = DEFAULT_CONFIG,
-    background: Background = None,
-    most_pairs: int = PAIRS,
-) -> Rendering:
-    """The image of `render`, as arrays of numpy, drawn in as many bands as keep each below
-    `most_pairs`; for calls outside of transformations.
-
-    Bands of one row of tiles may still need more: they get it. Configurations whose image depends
-    on its height (a `jacobian_margin`, or what is asked for of each Gaussian) are drawn whole.
-    Raises: as `render`.
-    """
-    whole = (
-        config.jacobian_margin is not None or config.visibility or config.means2d or config.radii
-    )
-    planned = plan_buffers(gaussians, camera, config, margin=1.0)
-    rows, bands = -(-camera.height // config.tile_size), 1
-    cameras = camera
-    while not whole and (planned.max_pairs or 0) > most_pairs and bands < rows:
-        bands = min(rows, max(bands + 1, -(-bands * (planned.max_pairs or 0) // most_pairs)))
-        cameras = banded(camera, -(-rows // bands) * config.tile_size)
-        planned = plan_buffers(gaussians, cameras, config, margin=1.0)
-    if bands == 1:
-        return jax.tree.map(np.asarray, render(gaussians, camera, planned, background))
-    drawn = [
-        jax.tree.map(np.asarray, render(gaussians, each, planned, background)) for each in cameras
-    ]
-    joined = {
-        name: np.concatenate([getattr(each, name) for each in drawn])[: camera.height]
-        for name in ("rgb", "alpha", "depth", "depth_sum", "depth_median", "distortion")
-        if getattr(drawn[0], name) is not None
-    }
-    return replace(drawn[0], **joined)
-
-
-def banded(camera: Camera, height: int) -> Camera:
-    """A camera for each band of `height` rows, from the top; the last band may reach beyond the
-    image.
-    """
-    tops = np.arange(0, camera.height, height)
-    shift = (
-        jnp.zeros((len(tops), 3, 3), camera.K.dtype).at[:, 1, 2].set(tops.astype(camera.K.dtype))
-    )
-    each = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(tops), *leaf.shape)), camera)
-    return replace(each, K=camera.K - shift, height=height)

@@ -317,7 +317,11 @@ class Render:
         with stage("starting"):
             from humangs_jax import load_gaussians
             from humangs_jax.avatar.camera_paths import file_cameras
-            from humangs_jax.avatar.frames import circle_cameras, splat_images, write_splat_views
+            from humangs_jax.avatar.splat_views import (
+                circle_cameras,
+                splat_images,
+                write_splat_views,
+            )
             from humangs_jax.avatar.video import check_video, write_video
 
             check_video(

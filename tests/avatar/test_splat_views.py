@@ -14,7 +14,7 @@ from humangs_jax.avatar.camera_paths import file_cameras
 from humangs_jax.avatar.export import EXPORTS
 from humangs_jax.avatar.export.gaussians import export, world_matrix
 from humangs_jax.avatar.frame_settings import FrameSettings
-from humangs_jax.avatar.frames import circle_cameras
+from humangs_jax.avatar.splat_views import circle_cameras
 from humangs_jax.geometry.camera import project
 from humangs_jax.io.images import read_image
 

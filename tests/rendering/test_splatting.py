@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from rounding import bound
 from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians, with_harmonics
 
-from humangs_jax.avatar.frames import render_in_bands
+from humangs_jax.avatar.splat_views import render_in_bands
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.rendering.buffers import default_pairs, plan_buffers, round_up
