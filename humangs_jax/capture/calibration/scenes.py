@@ -319,56 +319,22 @@ def read_transforms(source: Source, format: CameraFormat) -> Calibration:
 def _frame_camera(
     values: Mapping[str, Any], file: Path, prefix: str, photo_size: Callable[[str], tuple[int, int]]
 ) -> CalibratedCamera:
+    """The camera of one image, by its values and those of the whole file.
+
+    Raises: CaptureError.
+    """
     (name,) = members(values, file, prefix.rstrip("."), file_path=str)
+    lens = _frame_lens(values, file, prefix)
 
-    def number(key: str) -> float:
-        return float(floats(values[key], file, f"{prefix}{key}", ()))
-
-    model, refusal = values.get("camera_model", "OPENCV"), None
-    if model not in CAMERA_MODELS:
-        expected = f"expected {', '.join(CAMERA_MODELS)}; else {UNDISTORT_BEFORE}"
-        refusal = CaptureError(file, f"{prefix}camera_model", f"{shown(model)}: {expected}")
-        if model != FISHEYE_MODEL:
-            raise refusal
-    for key in ("is_fisheye", "k4"):  # five coefficients do not describe these lenses
-        if values.get(key) and refusal is None:
-            refusal = CaptureError(
-                file, f"{prefix}{key}", f"fisheye lenses are not supported: {UNDISTORT_BEFORE}"
-            )
+    # the size of the image, where the file says it or the intrinsics depend on it
     size = None
     if "w" in values or "h" in values:
         sides = [required(values, key, file, prefix) for key in ("w", "h")]
         size = image_size(sides, file, f"{prefix}w, h")
     elif not ({"fl_x", "cx", "cy"} <= values.keys() or values.keys() & set(MATRICES)):
         size = photo_size(name)
+    K = _frame_intrinsics(values, size, file, prefix)
     width, height = size or (None, None)
-    # intrinsics: a whole matrix, or focal lengths and the principal point
-    whole = next((key for key in MATRICES if key in values and "fl_x" not in values), None)
-    # square pixels and a centred axis where the file does not say otherwise
-    focal = {axis: number(f"fl_{axis}") for axis in "xy" if f"fl_{axis}" in values}
-    for axis, side in zip("xy", size or (), strict=False):
-        if axis not in focal and f"camera_angle_{axis}" in values:
-            focal[axis] = 0.5 * side / np.tan(0.5 * number(f"camera_angle_{axis}"))
-    if whole is not None:
-        K = floats(values[whole], file, f"{prefix}{whole}", (3, 3))
-    elif focal:
-        cx = number("cx") if "cx" in values else 0.5 * (width or 0)
-        cy = number("cy") if "cy" in values else 0.5 * (height or 0)
-        either = next(iter(focal.values()))
-        K = intrinsics(focal.get("x", either), focal.get("y", either), cx, cy)
-    else:
-        raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x, or K")
-    # the lens; one that cannot be undistorted carries the error, for those who ask for photos
-    # without lens distortion
-    of_fisheye = model == FISHEYE_MODEL or bool(values.get("is_fisheye"))
-    keys = ("k1", "k2", "k3", "k4") if of_fisheye else ("k1", "k2", "p1", "p2", "k3", "k4")
-    coefficients = [number(key) if key in values else 0.0 for key in keys]
-    if refusal is not None and of_fisheye:
-        lens = fisheye_lens(coefficients, file, f"{prefix}k1", refusal)
-    else:
-        lens = pinhole_lens([*coefficients, 0.0, 0.0], file, f"{prefix}k1")
-        if refusal is not None:
-            lens["refusal"] = refusal
     matrix = required(values, "transform_matrix", file, prefix)
     pose = floats(matrix, file, f"{prefix}transform_matrix", (4, 4))
     try:
@@ -378,6 +344,67 @@ def _frame_camera(
             file, f"{prefix}transform_matrix", "expected a rigid transform, got a singular one"
         ) from None
     return CalibratedCamera(name, K, cam_from_world, width, height, **lens)
+
+
+def _frame_intrinsics(
+    values: Mapping[str, Any], size: tuple[int, int] | None, file: Path, prefix: str
+) -> Float[np.ndarray, "3 3"]:
+    """A whole matrix, or focal lengths and the principal point: square pixels and a centred axis
+    where the file does not say otherwise.
+
+    Raises: CaptureError for none of them.
+    """
+    for key in MATRICES:
+        if key in values and "fl_x" not in values:
+            return floats(values[key], file, f"{prefix}{key}", (3, 3))
+    focal = {
+        axis: _number(values, f"fl_{axis}", file, prefix) for axis in "xy" if f"fl_{axis}" in values
+    }
+    for axis, side in zip("xy", size or (), strict=False):
+        if axis not in focal and f"camera_angle_{axis}" in values:
+            angle = _number(values, f"camera_angle_{axis}", file, prefix)
+            focal[axis] = 0.5 * side / np.tan(0.5 * angle)
+    if not focal:
+        raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x, or K")
+    either = next(iter(focal.values()))
+    center = [
+        _number(values, key, file, prefix) if key in values else 0.5 * side
+        for key, side in zip(("cx", "cy"), size or (0, 0), strict=True)
+    ]
+    return intrinsics(focal.get("x", either), focal.get("y", either), *center)
+
+
+def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str, Any]:
+    """Fields of a `CalibratedCamera` for the lens. One that cannot be undistorted carries the
+    error, for those who ask for photos without lens distortion.
+
+    Raises: CaptureError for a model of cameras that is not read.
+    """
+    model, refusal = values.get("camera_model", "OPENCV"), None
+    if model not in CAMERA_MODELS:
+        expected = f"expected {', '.join(CAMERA_MODELS)}; else {UNDISTORT_BEFORE}"
+        refusal = CaptureError(file, f"{prefix}camera_model", f"{shown(model)}: {expected}")
+        if model != FISHEYE_MODEL:
+            raise refusal
+    # five coefficients do not describe these lenses
+    for key in ("is_fisheye", "k4"):
+        if values.get(key) and refusal is None:
+            problem = f"fisheye lenses are not supported: {UNDISTORT_BEFORE}"
+            refusal = CaptureError(file, f"{prefix}{key}", problem)
+
+    is_fisheye = model == FISHEYE_MODEL or bool(values.get("is_fisheye"))
+    keys = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2", "k3", "k4")
+    coefficients = [_number(values, key, file, prefix) if key in values else 0.0 for key in keys]
+    if refusal is not None and is_fisheye:
+        return fisheye_lens(coefficients, file, f"{prefix}k1", refusal)
+    lens = pinhole_lens([*coefficients, 0.0, 0.0], file, f"{prefix}k1")
+    if refusal is not None:
+        lens["refusal"] = refusal
+    return lens
+
+
+def _number(values: Mapping[str, Any], key: str, file: Path, prefix: str) -> float:
+    return float(floats(values[key], file, f"{prefix}{key}", ()))
 
 
 # Moments
