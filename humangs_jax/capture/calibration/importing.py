@@ -15,6 +15,7 @@ from typing import get_args
 
 import numpy as np
 
+from humangs_jax.capture.calibration.checks import Checks, check_calibration, likely_unit
 from humangs_jax.capture.calibration.others import (
     find_others,
     is_cut_off,
@@ -45,11 +46,8 @@ from humangs_jax.data.cameras import (
     ROTATION_TO_Y_UP,
     CalibratedCamera,
     Calibration,
-    Checks,
     PixelCenters,
-    check_calibration,
     in_capture_convention,
-    likely_unit,
     read_calibration,
     undistort,
 )

@@ -1,0 +1,245 @@
+"""Whether a calibration makes sense.
+
+A wrong convention gives plausible numbers, but not cameras around a person that all look at the
+person. Some cameras do stand otherwise: these checks only warn.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.data.cameras import (
+    CONVENTIONS,
+    OPENGL_FROM_OPENCV,
+    ROTATION_TO_Y_UP,
+    WORLD_FROM_CAM_OPENGL,
+    CalibratedCamera,
+    Calibration,
+    distort,
+    nearest_rotation,
+)
+
+REPROJECTION_LIMIT = 2.0
+"""Pixels; calibrations are usually good to less than one."""
+DISTANCES = (0.3, 30.0)
+"""Metres between which cameras stand from a person."""
+UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres"}
+"""Units in which people calibrate."""
+USUAL_DISTANCE = 2.5
+"""Metres from a camera to a person: of several units, the one that comes nearest is likely."""
+NEARLY_PARALLEL = np.sin(np.radians(2.0)) ** 2
+"""Axes within about 2 degrees of each other do not define a point where they meet."""
+MISS = 0.5
+"""Axes of cameras around a person pass within this share of the distance: some look at the feet,
+others at the face.
+"""
+TILT_LIMIT = 45.0
+"""Degrees between the mean upward direction of the photos and +y."""
+OFF_CENTER = 0.25
+"""Share of the image from its middle beyond which a principal point belongs to an image of another
+size.
+"""
+COINCIDENT = 1e-3
+"""Cameras that meet within this share of their distance to the world's origin stand all in one
+place.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Checks:
+    """What was measured, and warnings."""
+
+    reprojection: float | None
+    """The mean reprojection error over all observations, pixels; None without any."""
+    observations: int
+    """The number of observations."""
+    distance: float | None
+    """Median from the cameras to where their axes meet, metres; None where they are parallel (one
+    camera).
+    """
+    warnings: tuple[str, ...]
+    """One line for each thing that looks wrong."""
+
+
+def check_calibration(source: Calibration, converted: Calibration, up: str) -> Checks:
+    """Check cameras as their source has them, and as they came into the capture's convention with
+    that axis up.
+    """
+
+    def matrices(calibration):
+        return np.stack([camera.cam_from_world for camera in calibration.cameras])
+
+    # what the points and the axes of the cameras say
+    reprojection = _mean_reprojection_error(converted)
+    depths, _ = _axes_meeting(matrices(converted))
+    distance = None
+    if depths is not None:
+        distance = float(np.median(np.abs(depths)))
+    warnings = []
+    if reprojection is not None and reprojection > REPROJECTION_LIMIT:
+        limit = f"(expected below {REPROJECTION_LIMIT:g})"
+        warnings.append(
+            f"the mean reprojection error is {reprojection:.3g} px {limit}: are these its points?"
+        )
+    # matrices are checked before the conversion, where a wrong convention shows
+    warnings += _convention_warnings(matrices(source), source.convention)
+    # a wrong unit shows in how far the cameras stand from the person
+    low, high = DISTANCES
+    if distance is not None and not low <= distance <= high:
+        stand = (
+            f"the cameras stand {distance:.3g} m from where they look (expected {low:g} to"
+            f" {high:g})"
+        )
+        warnings.append(
+            f"{stand}: is scale, the metres in a unit of the source, right? Measure one distance"
+        )
+    warnings += _up_warnings(matrices(converted), up)
+    # one warning about principal points is enough: all cameras mostly share the cause
+    warnings += [warning for camera in converted.cameras for warning in _center_warnings(camera)][
+        :1
+    ]
+    count = 0
+    if converted.observations is not None:
+        count = len(converted.observations.points)
+    return Checks(reprojection, count, distance, tuple(warnings))
+
+
+def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
+    """Gives the metres in a unit of a calibration, and a line about it unless it is 1 or unknown.
+
+    The format's unit is taken where it has one, else metres. If the cameras then stand too near to
+    a person or too far, it is the unit that puts them there, if one does.
+    """
+    known = calibration.unit or 1.0
+    matrices = np.stack([camera.cam_from_world for camera in calibration.cameras])
+    matrices[:, :3, :3] = [nearest_rotation(matrix[:3, :3]) for matrix in matrices]
+    depths, _ = _axes_meeting(matrices)
+    distance = None
+    if depths is not None:
+        distance = float(np.median(np.abs(depths)))
+    low, high = DISTANCES
+    if distance is None or low <= known * distance <= high:
+        line = (
+            f"{calibration.format} is in {UNITS.get(known, 'an unusual unit')}: taken (--scale"
+            " says otherwise)"
+        )
+        return known, line if known != 1 else None
+    fitting = [unit for unit in UNITS if low <= unit * distance <= high]
+    if not fitting:
+        return known, None
+    best = min(fitting, key=lambda unit: abs(np.log(unit * distance / USUAL_DISTANCE)))
+    before, after = f"{known * distance:.3g} m", f"{best * distance:.3g} m"
+    why = (
+        f"in {UNITS.get(known, 'its unit')} the cameras stand {before} from where they look, so"
+        f" {after}"
+    )
+    return best, f"the unit is taken for {UNITS[best]}: {why} (--scale says otherwise)"
+
+
+def _mean_reprojection_error(calibration: Calibration) -> float | None:
+    """Pixels between where the calibration's points were seen and where its cameras see them; None
+    without points.
+
+    Infinite where a point lies behind a camera that saw it.
+    """
+    seen = calibration.observations
+    if seen is None:
+        return None
+    errors = []
+    for i, camera in enumerate(calibration.cameras):
+        mine = seen.cameras == i
+        p = seen.points[mine] @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+        if (p[:, 2] <= 0).any():
+            return float("inf")
+        plane = p[:, :2] / p[:, 2:]
+        if camera.distortion is not None:
+            plane = distort(plane, camera.distortion)
+        pixels = plane * np.diag(camera.K)[:2] + camera.K[:2, 2]
+        errors.append(np.linalg.norm(pixels - seen.pixels[mine], axis=-1))
+    return float(np.concatenate(errors).mean())
+
+
+def _axes_meeting(
+    poses: Float[np.ndarray, "v 4 4"],
+) -> tuple[Float[np.ndarray, " v"] | None, Float[np.ndarray, " v"] | None]:
+    """Depth of the point nearest to all optical axes before each camera, and its distance from each
+    axis.
+
+    (None, None) if the axes are nearly parallel: they meet nowhere. `poses` are cam_from_world, in
+    any unit.
+    """
+    rotations, axes = poses[:, :3, :3], poses[:, 2, :3]
+    centers = -np.einsum("vji,vj->vi", rotations, poses[:, :3, 3])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    normal = across.mean(axis=0)
+    if np.linalg.eigvalsh(normal)[0] < NEARLY_PARALLEL:
+        return None, None
+    point = np.linalg.solve(normal, np.einsum("vij,vj->i", across, centers) / len(poses))
+    return ((point - centers) * axes).sum(axis=-1), np.linalg.norm(
+        np.einsum("vij,vj->vi", across, point - centers), axis=-1
+    )
+
+
+def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:
+    """How far axes pass the point where they meet before all cameras, as a share of its distance;
+    infinite if none is.
+    """
+    depths, misses = _axes_meeting(poses)
+    farthest = np.linalg.norm(poses[:, :3, 3], axis=-1).max()
+    if (
+        depths is None
+        or misses is None
+        or depths.min() <= 0
+        or np.median(depths) < COINCIDENT * farthest
+    ):
+        return np.inf
+    share = float(np.sqrt(np.mean(misses**2)) / np.median(depths))
+    return share if share < MISS else np.inf
+
+
+def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> list[str]:
+    """Whether another meaning of the matrices in the file would let the cameras look at one
+    place.
+    """
+    if _axes_meeting(poses)[0] is None or np.isfinite(_miss(poses)):
+        return []
+    matrices = poses
+    if convention == WORLD_FROM_CAM_OPENGL:
+        matrices = np.linalg.inv(OPENGL_FROM_OPENCV @ poses)
+    misses = {name: _miss(meaning(matrices)) for name, meaning in CONVENTIONS.items()}
+    best = min(misses, key=lambda name: misses[name])
+    problem = "the cameras do not look at one place before them"
+    if np.isfinite(misses[best]):
+        return [
+            f"{problem}; they would if the matrices in the file were {best} (the format says"
+            f" {convention})"
+        ]
+    return [f"{problem}: is this calibration of photos around a person?"]
+
+
+def _up_warnings(poses: Float[np.ndarray, "v 4 4"], up: str) -> list[str]:
+    """The photos are upright, most of them: the mean of their upward directions tells which axis is
+    up.
+    """
+    direction = -poses[:, 1, :3].mean(axis=0)
+    length = np.linalg.norm(direction)
+    if length < 0.5 or direction[1] / length >= np.cos(np.radians(TILT_LIMIT)):
+        return []
+    in_source = np.asarray(ROTATION_TO_Y_UP[up]).T @ direction
+    best = max(
+        ROTATION_TO_Y_UP, key=lambda axis: float(f"{axis[0]}1") * in_source["xyz".index(axis[1])]
+    )
+    return [
+        f"the photos do not stand upright with {up} up: --up={best} fits best (or were they taken"
+        " sideways?)"
+    ]
+
+
+def _center_warnings(camera: CalibratedCamera) -> list[str]:
+    if np.abs(camera.K[:2, 2] / (camera.width, camera.height) - 0.5).max() < OFF_CENTER:
+        return []
+    center = f"({camera.K[0, 2]:.1f}, {camera.K[1, 2]:.1f})"
+    size = f"{camera.width} x {camera.height}"
+    problem = f"the principal point {center} is far from the middle of {size}"
+    return [f"{camera.name}: {problem}: is K that of photos of another size?"]
