@@ -21,7 +21,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import apply_gain, exposure_gains
 from humangs_jax.evaluation.cases import predict_views
-from humangs_jax.evaluation.scores import mean_scores
+from humangs_jax.evaluation.means import mean_scores
 from humangs_jax.losses.loss_networks import installed_lpips, load_lpips
 from humangs_jax.losses.perceptual import Lpips
 

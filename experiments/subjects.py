@@ -29,7 +29,8 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
-from humangs_jax.evaluation.scores import PROTOCOLS, mean_scores, score_views
+from humangs_jax.evaluation.means import mean_scores
+from humangs_jax.evaluation.scores import PROTOCOLS, score_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.io.images import to_uint8

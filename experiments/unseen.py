@@ -16,7 +16,8 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.prepared import prepare_capture
 from humangs_jax.data.views import to_network_views
 from humangs_jax.evaluation.cases import predict_views
-from humangs_jax.evaluation.scores import PROTOCOLS, mean_scores, score_views
+from humangs_jax.evaluation.means import mean_scores
+from humangs_jax.evaluation.scores import PROTOCOLS, score_views
 from humangs_jax.losses.loss_networks import load_lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs

@@ -43,8 +43,9 @@ from humangs_jax.evaluation.cases import (
     painted_body,
     predict_views,
 )
+from humangs_jax.evaluation.means import person_means
 from humangs_jax.evaluation.run import evaluate
-from humangs_jax.evaluation.scores import EvaluationProtocol, person_means
+from humangs_jax.evaluation.scores import EvaluationProtocol
 from humangs_jax.losses.loss_networks import LossNetworks, load_loss_networks
 from humangs_jax.losses.losses import LossConfig
 from humangs_jax.network.config import HumanGSConfig, paper_parts

@@ -21,8 +21,8 @@ from humangs_jax.data.capture import load_capture
 from humangs_jax.data.datasets.subject import FileBody, open_people
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.evaluation.cases import Case, Choice, choose_views, find_people
+from humangs_jax.evaluation.means import mean_scores, person_means
 from humangs_jax.evaluation.run import evaluate
-from humangs_jax.evaluation.scores import mean_scores, person_means
 from humangs_jax.io.reading import read_json
 from humangs_jax.network.weights import load_weights
 

@@ -39,17 +39,12 @@ from humangs_jax.evaluation.cases import (
     find_people,
 )
 from humangs_jax.evaluation.kept import KeptScores, body_key, indices_key, method_key, networks_key
+from humangs_jax.evaluation.means import CONFIDENCE, Mean, Row, Scored, overall_means, person_means
 from humangs_jax.evaluation.scores import (
-    CONFIDENCE,
     PROTOCOLS,
     EvaluationProtocol,
-    Mean,
-    Row,
-    Scored,
     missing_reasons,
     on_background,
-    overall_means,
-    person_means,
     score_names,
     score_views,
 )

@@ -6,8 +6,7 @@ import io
 import numpy as np
 import pytest
 
-from humangs_jax.evaluation.run import csv_text, latex_table, markdown_table, shown_mean
-from humangs_jax.evaluation.scores import (
+from humangs_jax.evaluation.means import (
     Mean,
     Scored,
     bootstrap,
@@ -15,6 +14,7 @@ from humangs_jax.evaluation.scores import (
     overall_means,
     person_means,
 )
+from humangs_jax.evaluation.run import csv_text, latex_table, markdown_table, shown_mean
 
 ROWS = [
     Scored("a", 0, "x", {"psnr": 10.0, "patch_psnr": None}),

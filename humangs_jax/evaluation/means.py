@@ -1,0 +1,120 @@
+"""Means of scores: first over the images of a frame, then over the frames of a person, then over
+people: a person counts once, however often photographed. An interval is of the mean over people;
+with one person, over the frames; with one frame, over the images.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Row = dict[str, float | None]
+"""Scores by name; None for what is missing."""
+CONFIDENCE = 0.95
+"""The probability with which an interval holds the mean of all people."""
+RESAMPLES = 2000
+"""Resamples of the bootstrap."""
+BLOCKS = 20
+"""In how many parts they are computed, for memory."""
+
+
+class Scored(NamedTuple):
+    """An image's place and scores."""
+
+    person: str
+    """The name of the person."""
+    frame: int
+    """The frame that the image shows."""
+    view: str
+    """The name of the view."""
+    scores: Row
+    """The scores of the image."""
+
+
+class Mean(NamedTuple):
+    """A mean and its interval of `CONFIDENCE`."""
+
+    mean: float
+    """The mean."""
+    low: float | None
+    """The lower end of the interval; None for a mean of one."""
+    high: float | None
+    """The upper end; None for a mean of one."""
+    count: int
+    """How many the mean is of."""
+    over: str
+    """What they are: people, frames or images."""
+
+
+def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
+    """Means of the scores of some images or people; None for what one of them lacks."""
+    listed = list(rows)
+    lacking = {name for name in listed[0] for row in listed if row.get(name) is None}
+    means = _known_means(listed)
+    return {name: None if name in lacking else mean for name, mean in means.items()}
+
+
+def _known_means(rows: Sequence[Mapping[str, float | None]]) -> Row:
+    """Means of the scores over those that have them, such as images with patches; None for what
+    none has.
+    """
+    means: Row = {}
+    for name in rows[0]:
+        values = [row.get(name) for row in rows]
+        known = [value for value in values if value is not None]
+        means[name] = sum(known) / len(known) if known else None
+    return means
+
+
+def _means_by(rows: Iterable[tuple[Any, Row]]) -> dict[Any, Row]:
+    """`_known_means` of the rows that share a key, in the order of first appearance."""
+    groups: dict[Any, list[Row]] = {}
+    for key, row in rows:
+        groups.setdefault(key, []).append(row)
+    return {key: _known_means(found) for key, found in groups.items()}
+
+
+def _frame_means(rows: Sequence[Scored]) -> dict[tuple[str, int], Row]:
+    return _means_by(((row.person, row.frame), row.scores) for row in rows)
+
+
+def person_means(rows: Sequence[Scored]) -> dict[str, Row]:
+    """Scores by person: means over the images of a frame, then over frames."""
+    return _means_by((person, row) for (person, _), row in _frame_means(rows).items())
+
+
+def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
+    """The mean of each score with its interval, see the head of this module; None for scores that
+    no image has.
+    """
+    levels = {
+        "people": list(person_means(rows).values()),
+        "frames": list(_frame_means(rows).values()),
+        "images": [row.scores for row in rows],
+    }
+    over = next((over for over, units in levels.items() if len(units) > 1), "images")
+    found: dict[str, Mean | None] = {}
+    for name in rows[0].scores:
+        of_units = [unit[name] for unit in levels[over]]
+        values = [value for value in of_units if value is not None]
+        if values:
+            found[name] = Mean(float(np.mean(values)), *bootstrap(values), len(values), over)
+        else:
+            found[name] = None
+    return found
+
+
+def bootstrap(values: Sequence[float], seed: int = 0) -> tuple[float | None, float | None]:
+    """The percentile interval of the mean of some values under resampling (Efron, 1979); (None,
+    None) for one value.
+    """
+    if len(values) < 2:
+        return None, None
+    generator, numbers = np.random.default_rng(seed), np.asarray(values, np.float64)
+
+    def drawn():
+        return generator.integers(len(numbers), size=(RESAMPLES // BLOCKS, len(numbers)))
+
+    means = np.concatenate([numbers[drawn()].mean(axis=1) for _ in range(BLOCKS)])
+    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
