@@ -299,24 +299,19 @@ def cropped(capture: Capture, size: int) -> Capture:
     if boxes is None or capture.masks is None:
         return capture
     images, masks, cameras = _squares(capture.images, capture.masks, capture.cameras, boxes, size)
-    unknown = capture.unknown
-    if unknown is None and _reaches_border(capture.masks):
+
+    # nobody knows what is beyond the edge of a photo, whose border may cut the person off
+    person, unknown = capture.masks > MASK_THRESHOLD, capture.unknown
+    ends = (person[:, 0], person[:, -1], person[:, :, 0], person[:, :, -1])
+    if unknown is None and any(end.any() for end in ends):
         unknown = np.zeros(capture.masks.shape, bool)
     if unknown is not None:
         shares = unknown.astype(np.float32)
-        # nobody knows what is beyond the edge of a photo
         hidden = [_window(x, *box, 1.0) for x, box in zip(shares, boxes, strict=True)]
         unknown = np.stack([resized(x, size, size) for x in hidden]) > 0
     return dataclasses.replace(
         capture, images=images, masks=masks, cameras=cameras, unknown=unknown
     )
-
-
-def _reaches_border(masks: Float[np.ndarray, "v h w"]) -> bool:
-    """Whether a photo's border may cut the person off."""
-    person = masks > MASK_THRESHOLD
-    ends = (person[:, 0], person[:, -1], person[:, :, 0], person[:, :, -1])
-    return any(end.any() for end in ends)
 
 
 def _squares(

@@ -260,7 +260,8 @@ def save_gaussians(
     require_concrete("save_gaussians", "writes a file", gaussians)
     form = chosen_format(os.path.splitext(path)[1])
     if form is None or form.mesh:
-        raise ValueError(f"{path}: expected a name ending in {_suffixes()}")
+        suffixes = alternatives(_written().suffixes)
+        raise ValueError(f"{path}: expected a name ending in {suffixes}")
     _check_version(path, form, version)
     form(path, _between_worlds(gaussians, form) if y_up else gaussians, **_versioned(version))
 
@@ -294,10 +295,6 @@ def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
 
 def _written() -> Formats[ExportFormat]:
     return EXPORTS.where(lambda each: not each.mesh)
-
-
-def _suffixes() -> str:
-    return alternatives(_written().suffixes)
 
 
 def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], said: list[str]) -> Gaussians:
