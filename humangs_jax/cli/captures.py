@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import Positional, arg
 
 from humangs_jax.cli.options import (
     OutputPath,
@@ -176,16 +176,6 @@ class ImportCameras:
 
 
 @dataclasses.dataclass(frozen=True)
-class Extras:
-    """What is written besides the photos."""
-
-    held_out: Annotated[int, at_least(0)] = 0
-    """Views of the first pose from other cameras, in the sub-folder held_out/."""
-    scans: bool = False
-    """Also write scan/: the first pose as a textured mesh, OBJ and GLB."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Synth:
     """Make synthetic clothed people and write them as capture folders.
 
@@ -196,7 +186,6 @@ class Synth:
         "humangs synth --subjects 100 --for-training --out people",
         "humangs synth --subjects 8 --split test --held-out 6 --out test_people",
     )
-    extras: OmitArgPrefixes[Extras]
     out: Annotated[Path, OutputPath()] = Path("synthetic_people")
     """Folder for one capture folder per subject and manifest.json."""
     subjects: Annotated[int, at_least(1)] = 8
@@ -222,11 +211,14 @@ class Synth:
     """Length of that motion, 30 frames per second."""
     for_training: bool = False
     """Short for 2 poses x 12 views at 256 pixels and no others, enough for `humangs train`."""
+    held_out: Annotated[int, at_least(0)] = 0
+    """Views of the first pose from other cameras, in the sub-folder held_out/."""
+    scans: bool = False
+    """Also write scan/: the first pose as a textured mesh, OBJ and GLB."""
     workers: Workers = None
     """Processes. Default: as many as cores."""
 
     def run(self) -> None:
-        extras = self.extras
         if self.size not in SIZES:
             raise UsageError(
                 f"--size {self.size}: expected {', '.join(map(str, SIZES[:-1]))} or {SIZES[-1]}"
@@ -259,9 +251,9 @@ class Synth:
             small.get("poses", self.poses),
             small.get("views", self.views or 60),
             small.get("close_views", close_views),
-            extras.held_out,
+            self.held_out,
             frames=self.motion_frames if self.sequences else 0,
-            scan_texture=2048 if extras.scans else 0,
+            scan_texture=2048 if self.scans else 0,
         )
         with stage("making people"):
             folders = write_set(
