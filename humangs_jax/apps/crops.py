@@ -3,10 +3,10 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import Capture
@@ -48,7 +48,7 @@ def around_person(
     corners = np.clip(np.rint(middles - size / 2), 0, photo - size).astype(int)
     shift = np.zeros((count, 3, 3), np.float32)
     shift[:, :2, 2] = corners
-    K = jnp.asarray(np.asarray(capture.cameras.K) - shift)
+    K = from_host(np.asarray(capture.cameras.K) - shift)
     cameras = replace(capture.cameras, K=K, width=int(size[0]), height=int(size[1]))
     masks = None
     if capture.masks is not None:

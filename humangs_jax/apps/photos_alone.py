@@ -296,7 +296,8 @@ def _calibration(seen: PersonViews, found: PersonCameras, images: Path) -> Calib
 
 
 def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tuple[str, ...]:
-    centers = np.asarray([camera.center for camera in found.cameras], float)
+    matrices = [np.asarray(camera.cam_from_world, float) for camera in found.cameras]
+    centers = np.linalg.inv(matrices)[:, :3, 3]
     distance = float(np.median(np.hypot(centers[:, 0], centers[:, 2])))
     count = len(found.views)
     # how many poses the photos show tells how much they determine
@@ -311,7 +312,7 @@ def _lines(seen: PersonViews, found: PersonCameras, report: ImportReport) -> tup
     # focal lengths over the diagonal, since photos may differ in size
     focal = np.median(
         [
-            float(c.K[0, 0]) / np.hypot(*seen.sizes[view])
+            np.asarray(c.K)[0, 0] / np.hypot(*seen.sizes[view])
             for view, c in zip(found.views, found.cameras, strict=True)
         ]
     )

@@ -130,8 +130,8 @@ def _hidden_part(
     nowhere = np.zeros((height, width), bool)
 
     # the silhouette of the body, if all of it is before the camera
-    K = np.asarray(capture.cameras.K[view], float) * [[columns / width], [rows / height], [1]]
-    matrix = np.asarray(capture.cameras.cam_from_world[view], float)
+    K = np.asarray(capture.cameras.K, float)[view] * [[columns / width], [rows / height], [1]]
+    matrix = np.asarray(capture.cameras.cam_from_world, float)[view]
     seen = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     if seen[:, 2].min() <= 0:
         return nowhere

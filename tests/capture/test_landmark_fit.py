@@ -58,7 +58,7 @@ def test_frames_are_a_batch(monkeypatch):
     def reached(model, observations):
         raise Reached(observations)
 
-    monkeypatch.setattr(landmark_fit, "_fit_frames", reached)
+    monkeypatch.setattr(landmark_fit, "fit_frames", reached)
     with pytest.raises(Reached) as caught:
         fit_landmarks(model_of(), seen)
     assert caught.value.args[0].batch_shape == (2,)

@@ -117,14 +117,14 @@ def fit_landmarks(
     independent. The result is finite for all finite observations; frames without keypoints rest in
     the prior's usual pose, or with smooth motion are interpolated.
     """
-    fit = _fit_frames(model, observations)
+    fit = fit_frames(model, observations)
     if smoothness and len(fit.noise) > 2:
         return smooth_motion(model, observations, fit, smoothness)
     return fit
 
 
 @jax.jit
-def _fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit:
+def fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit:
     """All stages but the motion."""
     problem = keypoint_problem(model)
     states = jax.vmap(lambda seen: _fit_frame(problem, seen))(observations)

@@ -16,7 +16,7 @@ these poses are the detector's errors, and the body fills the masks less than be
 import dataclasses
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from humangs_jax.capture.fitting.files import FitRecord
@@ -31,6 +31,7 @@ from humangs_jax.capture.fitting.refine import (
 from humangs_jax.capture.fitting.state import StateStd
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 
@@ -118,8 +119,8 @@ def with_own_poses(capture: Capture) -> Capture:
     frames = np.asarray(capture.frames)
     poses = replace(
         capture.poses,
-        rotations=capture.poses.rotations[frames],
-        translation=capture.poses.translation[frames],
+        rotations=from_host(np.asarray(capture.poses.rotations)[frames]),
+        translation=from_host(np.asarray(capture.poses.translation)[frames]),
     )
     return dataclasses.replace(
         capture, frames=np.arange(capture.view_count, dtype=np.int32), poses=poses
@@ -141,15 +142,16 @@ def movement_line(capture: Capture) -> str:
     The number is the mean distance of the skin, across the line of sight, from where the mean of
     all poses has it, in the photo where it is largest: a photo does not show depths.
     """
-    poses, frames = capture.poses, np.asarray(capture.frames)
+    frames = np.asarray(capture.frames)
+    poses = jax.tree.map(np.asarray, capture.poses)
     mean = replace(
         poses,
         rotations=poses.rotations.mean(axis=0, keepdims=True),
         translation=poses.translation.mean(axis=0, keepdims=True),
     )
-    betas = jnp.asarray(capture.betas)
-    own, shared = (posed_vertices(capture.body, betas, each) for each in (poses, mean))
-    moved = np.asarray(own - shared)[frames]
+    betas = from_host(capture.betas)
+    own, shared = (np.asarray(posed_vertices(capture.body, betas, each)) for each in (poses, mean))
+    moved = (own - shared)[frames]
     across = np.einsum("vab,vnb->vna", np.asarray(capture.cameras.cam_from_world)[:, :2, :3], moved)
     centimetres = 100 * float(np.linalg.norm(across, axis=-1).mean(axis=-1).max())
     return (

@@ -296,21 +296,20 @@ def how_far(start: Capture, refined: Capture) -> dict[str, float]:
     """How far two captures of one person differ, means: focal_factor; camera_degrees, camera_cm;
     joint_degrees of the joints' rotations, transl_cm of the root.
     """
-    a, b = start.cameras, refined.cameras
-    camera_turns = [
-        Rotation.from_matrix(np.asarray(cameras.cam_from_world[:, :3, :3], float))
-        for cameras in (a, b)
-    ]
-    joint_turns = [
-        Rotation.from_rotvec(np.asarray(capture.poses.rotations, float).reshape(-1, 3))
-        for capture in (start, refined)
-    ]
+    both = (start, refined)
+    focal = [np.asarray(each.cameras.K, float)[:, 0, 0] for each in both]
+    matrices = [np.asarray(each.cameras.cam_from_world, float) for each in both]
+    centers = [np.linalg.inv(each)[:, :3, 3] for each in matrices]
+    camera_turns = [Rotation.from_matrix(each[:, :3, :3]) for each in matrices]
+    rotations = [np.asarray(each.poses.rotations, float) for each in both]
+    joint_turns = [Rotation.from_rotvec(each.reshape(-1, 3)) for each in rotations]
+    places = [np.asarray(each.poses.translation, float) for each in both]
     return {
-        "focal_factor": float(np.mean(np.asarray(b.K[:, 0, 0] / a.K[:, 0, 0]))),
+        "focal_factor": float(np.mean(focal[1] / focal[0])),
         "camera_degrees": _mean_degrees(*camera_turns),
-        "camera_cm": 100 * _mean_length(b.center - a.center),
+        "camera_cm": 100 * _mean_length(centers[1] - centers[0]),
         "joint_degrees": _mean_degrees(*joint_turns),
-        "transl_cm": 100 * _mean_length(refined.poses.translation - start.poses.translation),
+        "transl_cm": 100 * _mean_length(places[1] - places[0]),
     }
 
 
@@ -319,6 +318,6 @@ def _mean_degrees(first: Rotation, second: Rotation) -> float:
     return float(np.degrees((first.inv() * second).magnitude().mean()))
 
 
-def _mean_length(vectors: Any) -> float:
-    """The mean length of vectors (..., 3)."""
-    return float(np.linalg.norm(np.asarray(vectors), axis=-1).mean())
+def _mean_length(vectors: Float[np.ndarray, "*n 3"]) -> float:
+    """The mean length of vectors."""
+    return float(np.linalg.norm(vectors, axis=-1).mean())

@@ -39,6 +39,7 @@ from jax.flatten_util import ravel_pytree
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import EXACT, BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import Camera
@@ -344,9 +345,9 @@ class Origin:
 
 def usual_origin(prior: PosePrior, joints: tuple[int, ...], coefficients: int) -> Origin:
     """The mean shape in its usual pose at the world's origin."""
-    pose = BodyPose(jnp.asarray(prior.mean), jnp.zeros(3))
-    std = jnp.asarray(prior.std[np.asarray(joints, int)])
-    return Origin(betas=jnp.zeros(coefficients), pose=pose, body_pose_std=std, joints=joints)
+    pose = BodyPose(from_host(prior.mean), _zeros(3))
+    std = from_host(prior.std[np.asarray(joints, int)])
+    return Origin(betas=_zeros(coefficients), pose=pose, body_pose_std=std, joints=joints)
 
 
 def zero_state(origin: Origin) -> FitState:
@@ -355,20 +356,23 @@ def zero_state(origin: Origin) -> FitState:
     cameras = None
     views = origin.cameras
     if views is not None:
-        count, focals = int(views.camera.max()) + 1, int(views.focal.max()) + 1
+        count, focals = (int(np.max(np.asarray(x))) + 1 for x in (views.camera, views.focal))
         cameras = CameraState(
-            rotations=jnp.zeros((count, 3)),
-            centers=jnp.zeros((count, 3)),
-            log_focals=jnp.zeros(focals),
+            rotations=_zeros(count, 3), centers=_zeros(count, 3), log_focals=_zeros(focals)
         )
     return FitState(
-        betas=jnp.zeros(len(origin.betas)),
-        global_orient=jnp.zeros((*frames, 3)),
-        transl=jnp.zeros((*frames, 3)),
-        body_pose=jnp.zeros((*frames, a, 3)),
+        betas=_zeros(len(origin.betas)),
+        global_orient=_zeros(*frames, 3),
+        transl=_zeros(*frames, 3),
+        body_pose=_zeros(*frames, a, 3),
         cameras=cameras,
-        clothing=None if origin.segment is None else jnp.zeros(a + 1),
+        clothing=None if origin.segment is None else _zeros(a + 1),
     )
+
+
+def _zeros(*shape: int) -> Float[Array, "..."]:
+    """Zeros that no program is compiled for."""
+    return from_host(np.zeros(shape, np.float32))
 
 
 def frame_axes(state: FitState) -> FitState:
@@ -478,9 +482,7 @@ def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"]) -> CameraOrigi
     K, matrices = np.asarray(cameras.K, float), np.asarray(cameras.cam_from_world, float)
     camera = camera_numbers(K, matrices, SAME)
     focal = _numbered(np.log(K[:, [0, 1], [0, 1]]), SAME)
-    return CameraOrigin(
-        cameras.K, cameras.cam_from_world, *map(jnp.asarray, (camera, focal, frames))
-    )
+    return CameraOrigin(cameras.K, cameras.cam_from_world, *map(from_host, (camera, focal, frames)))
 
 
 def camera_numbers(

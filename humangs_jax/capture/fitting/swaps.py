@@ -29,6 +29,7 @@ from humangs_jax.capture.fitting.state import camera_numbers
 from humangs_jax.capture.fitting.triangulation import agreement, triangulate_robustly
 from humangs_jax.capture.keypoints.keypoints import Keypoints, KeypointSet
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import replace
 
 LEAST_GAIN = 0.1
@@ -172,7 +173,7 @@ def arranged(
 
     def pick(values):
         """Values of the keypoints in the order."""
-        return jnp.asarray(np.asarray(values)[rows[..., None], order.source[..., None], columns])
+        return from_host(np.asarray(values)[rows[..., None], order.source[..., None], columns])
 
     # where left and right are exchanged the detector may have seen the body turned round: its
     # depths say nothing then
@@ -203,7 +204,7 @@ class Agreement(NamedTuple):
 
 
 @jax.jit
-def _agreements(
+def agreements(
     observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]
 ) -> Agreement:
     """How well the views of each frame agree, a batch of m. mirror: index of each keypoint's mirror
@@ -265,7 +266,7 @@ class _Search:
         self.observations, self.mirror = observations, mirror
         self.cameras, self.order = cameras, order
         seen = arranged(observations, mirror, order)
-        found = jax.tree.map(np.asarray, _agreements(seen, mirror))
+        found = jax.tree.map(np.asarray, agreements(seen, mirror))
         self.confidences = np.asarray(seen.confidences)
         self.total, self.views = found.own.sum(-1), (self.confidences > 0).any(-1)
         # with many views, only what looks better at once is worth a trial
@@ -285,7 +286,7 @@ class _Search:
     ) -> Float[np.ndarray, " e"]:
         """(e,) agreement that an exchange adds in each of its frames."""
         order = self.order.exchanged(frames, a, b)
-        own = _agreements(arranged(self.observations, self.mirror, order), self.mirror).own
+        own = agreements(arranged(self.observations, self.mirror, order), self.mirror).own
         return (np.asarray(own).sum(-1) - self.total)[frames]
 
     def is_clear(self, trial: _Trial, of: Bool[np.ndarray, " k"]) -> bool:

@@ -5,6 +5,7 @@ and their residuals.
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from humangs_jax.capture.fitting.state import (
 )
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.photos import Photos
@@ -87,7 +89,7 @@ def make_observations(
     given = [points, confidences, K, cam_from_world, noise]
     if world is not None:
         given.append(world)
-    return jax.vmap(Observations)(*(jnp.asarray(x, jnp.float32) for x in given))
+    return jax.vmap(Observations)(*(from_host(x, np.float32) for x in given))
 
 
 def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -> Observations:
@@ -98,11 +100,12 @@ def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -
         [cameras.width / photos.width, cameras.height / photos.height], keypoints.points.dtype
     )
     points = np.where(keypoints.confidences[..., None] > 0, keypoints.points, 0.0) * scale
-    arrays = (points, keypoints.confidences, cameras.K, cameras.cam_from_world)
+    places = (cameras.K, cameras.cam_from_world)
+    arrays = (points, keypoints.confidences, *map(np.asarray, places))
     noise = expected_noise(points[None], keypoints.confidences[None])
     return replace(
         make_observations(*(x[:, None] for x in arrays)),
-        noise=jnp.asarray(np.repeat(noise, len(points))),
+        noise=from_host(np.repeat(noise, len(points))),
     )
 
 
@@ -120,7 +123,8 @@ def group_by_frame(
         row[: len(own)] = own
     confidences = np.where(views[..., None] < 0, 0.0, keypoints.confidences[views])
     points = np.where(confidences[..., None] > 0, keypoints.points[views], 0.0)
-    cameras = photos.cameras
+    K = np.asarray(photos.cameras.K)[views]
+    places = np.asarray(photos.cameras.cam_from_world)[views]
     world = None
     # several views say more than what the detector sees in any of them
     if keypoints.world is not None and views.shape[1] == 1:
@@ -128,11 +132,8 @@ def group_by_frame(
         hips = np.asarray([kind_of(name) == "hip" for name in keypoints.set.names])
         of_hips = confidences * hips
         weights = np.where(of_hips.any(-1, keepdims=True), of_hips, confidences)
-        K = np.asarray(cameras.K)[views]
         world = in_camera_axes(keypoints.world[views], points, weights, K)
-    observations = make_observations(
-        points, confidences, cameras.K[views], cameras.cam_from_world[views], world
-    )
+    observations = make_observations(points, confidences, K, places, world)
     return observations, views
 
 
@@ -175,13 +176,18 @@ def expected_noise(
     )
 
 
-def found_noise(lengths: Array, expected: Array) -> Array:
+def found_noise(lengths: Array | np.ndarray, expected: Array | np.ndarray | np.floating) -> Any:
     """The noise, pixels, from the median of errors, which outliers hardly change; NaN is none, and
-    without any it is as expected.
+    without any it is as expected. Arrays of numpy give one of numpy.
     """
-    median = jnp.nanmedian(lengths)
-    found = jnp.where(jnp.isnan(median), expected, median / RAYLEIGH_MEDIAN)
-    return jnp.clip(found, NOISE_RANGE[0] * expected, NOISE_RANGE[1] * expected)
+    xp: Any = jnp
+    if isinstance(lengths, np.ndarray):
+        xp, lengths = np, lengths[~np.isnan(lengths)]
+        if not len(lengths):
+            return np.asarray(expected)
+    median = xp.nanmedian(lengths)
+    found = xp.where(xp.isnan(median), expected, median / RAYLEIGH_MEDIAN)
+    return xp.clip(found, NOISE_RANGE[0] * expected, NOISE_RANGE[1] * expected)
 
 
 def in_cameras(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k 3"]:

@@ -24,6 +24,7 @@ import numpy as np
 from humangs_jax.body.model import BodyModel, SurfacePoints, surface_points
 from humangs_jax.capture.fitting.state import robust
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
@@ -94,11 +95,11 @@ def body_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
 
 def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> BodyView:
     """Project and rasterize a posed body."""
-    return BodyView(*map(np.asarray, _look(vertices, faces, camera)))
+    return BodyView(*map(np.asarray, look(vertices, faces, camera)))
 
 
 @jax.jit
-def _look(
+def look(
     vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera
 ) -> tuple[Array, Array, Array, Array]:
     rotation, focal = camera.cam_from_world[:3, :3], jnp.stack([camera.K[0, 0], camera.K[1, 1]])
@@ -227,13 +228,13 @@ class Matches:
     x = offsets[i].
     """
 
-    points: Int[Array, " e"]
+    points: Int[Array | np.ndarray, " e"]
     """Indices of the points, (e,)."""
-    normals: Float[Array, "e 2"]
+    normals: Float[Array | np.ndarray, "e 2"]
     """Unit normals, (e, 2), outwards."""
-    offsets: Float[Array, " e"]
+    offsets: Float[Array | np.ndarray, " e"]
     """Offsets of the lines, (e,), pixels."""
-    weights: Float[Array, " e"]
+    weights: Float[Array | np.ndarray, " e"]
     """Weights, (e,); 0: no equation."""
 
 
@@ -250,19 +251,24 @@ def match(
     hidden: where the mask says nothing, since somebody may be in front.
     """
     of_body, of_mask = _ends_of_mask(body, mask, reach, hidden), _nearest(body, boundary, reach)
-    rows = [np.concatenate(pair) for pair in zip(of_body, of_mask, strict=True)]
-    points, normals, offsets = (padded(x, 2 * count) for x in rows)
-    weights = np.arange(2 * count) < len(rows[0])
-    return Matches(
-        points=jnp.asarray(points, jnp.int32),
-        normals=jnp.asarray(normals, jnp.float32),
-        offsets=jnp.asarray(offsets, jnp.float32),
-        weights=jnp.asarray(weights, jnp.float32),
-    )
+    points, normals, offsets = map(np.concatenate, zip(of_body, of_mask, strict=True))
+    return matches_of((points, normals, offsets), count)
 
 
 Pairs = tuple[Int[np.ndarray, " e"], Float[np.ndarray, "e 2"], Float[np.ndarray, " e"]]
 """Points of the body's silhouette, and the normals and offsets of their lines."""
+
+
+def matches_of(pairs: Pairs, count: int) -> Matches:
+    """Equations of at most 2 `count` pairs, padded with weight 0."""
+    points, normals, offsets = (padded(x, 2 * count) for x in pairs)
+    weights = np.arange(2 * count) < len(pairs[0])
+    return Matches(
+        points=np.asarray(points, np.int32),
+        normals=np.asarray(normals, np.float32),
+        offsets=np.asarray(offsets, np.float32),
+        weights=np.asarray(weights, np.float32),
+    )
 
 
 def _ends_of_mask(
@@ -274,7 +280,7 @@ def _ends_of_mask(
     """For points of the body, along their normals: where the mask goes from inside to outside."""
     steps = np.linspace(-reach, reach, LOOKS)
     places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
-    covered = np.asarray(_coverage(jnp.asarray(mask), jnp.asarray(places, jnp.float32)))
+    covered = np.asarray(coverage(from_host(mask), from_host(places, np.float32)))
     seen = inside_image(places, mask.shape)
     if hidden is not None:
         seen &= ~_covered(hidden, places.reshape(-1, 2)).reshape(seen.shape)
@@ -291,7 +297,7 @@ def _ends_of_mask(
 
 
 @jax.jit
-def _coverage(mask: Float[Array, "h w"], places: Float[Array, "p l 2"]) -> Float[Array, "p l"]:
+def coverage(mask: Float[Array, "h w"], places: Float[Array, "p l 2"]) -> Float[Array, "p l"]:
     return sample_bilinear(mask[..., None], places - 0.5)[..., 0]
 
 
@@ -310,7 +316,9 @@ def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
     )
 
 
-def distances(matches: Matches, pixels: Float[Array, "p 2"]) -> Float[Array, " e"]:
+def distances(
+    matches: Matches, pixels: Float[Array | np.ndarray, "p 2"]
+) -> Float[Array | np.ndarray, " e"]:
     """How far points of the body are outside of their lines, pixels; negative inside."""
     along = matches.normals * pixels[matches.points]
     return along[:, 0] + along[:, 1] - matches.offsets  # not `jnp.sum`: see `scan.scan_residuals`
