@@ -26,7 +26,7 @@ from humangs_jax.data.views import upright_world
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov
 from humangs_jax.io.reading import check_limit
-from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers
+from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers, plan_near
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import (
     ALPHA_MIN,
@@ -97,7 +97,7 @@ def draw_gaussians(
     """
     config = None
     for frame, camera in zip(gaussians, cameras, strict=True):
-        config = config or plan_buffers(frame, camera, how)
+        config = config or plan_near(frame, camera, how)
         try:
             rendering = render(frame, camera, config, background)
         except BufferOverflowError:

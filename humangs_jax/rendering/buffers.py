@@ -102,6 +102,26 @@ def plan_buffers(
     return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
 
 
+ROOMY = 2.0
+"""Buffers may be this many times as large as they have to be where that saves a program."""
+_PLANNED: dict[tuple[SplatConfig, int, int], list[tuple[int, int]]] = {}
+"""Rows and pairs that images of a size were planned with in this process, as its programs are."""
+
+
+def plan_near(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
+    """`plan_buffers` for one camera, or buffers that were planned before, in which all fits too and
+    that are not much larger: an image costs less than another program.
+    """
+    rows, pairs = _needed(gaussians, camera, config)
+    known = _PLANNED.setdefault((config, camera.width, camera.height), [])
+    for most_rows, most_pairs in known:
+        if rows <= most_rows <= ROOMY * rows and pairs <= most_pairs <= ROOMY * pairs:
+            return dataclasses.replace(config, max_rows=most_rows, max_pairs=most_pairs)
+    planned = plan_buffers(gaussians, camera, config)
+    known.append((planned.max_rows or 0, planned.max_pairs or 0))
+    return planned
+
+
 def raise_on_overflow(
     overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig
 ) -> None:

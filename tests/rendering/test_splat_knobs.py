@@ -10,7 +10,8 @@ from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.rendering.buffers import plan_buffers
+from humangs_jax.rendering import buffers
+from humangs_jax.rendering.buffers import plan_buffers, plan_near
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
@@ -128,3 +129,16 @@ def test_cameras_of_a_batch_are_planned_together():
     assert both == max(
         (plan_buffers(gaussians, c, SMALL) for c in (near, far)), key=lambda c: c.max_pairs
     )
+
+
+def test_buffers_that_were_planned_before_are_used_again_where_they_are_near(monkeypatch):
+    gaussians, view, need = random_gaussians(2, np.float32), camera(np.float32), [900, 4000]
+    monkeypatch.setattr(buffers, "_PLANNED", {})
+    monkeypatch.setattr(buffers, "_needed", lambda *scene: need)
+    first = plan_near(gaussians, view, SMALL)
+    assert first == plan_buffers(gaussians, view, SMALL)
+    need[:] = 800, 3700
+    assert plan_near(gaussians, view, SMALL) == first != plan_buffers(gaussians, view, SMALL)
+    for other in ([300, 1000], [1200, 9000]):  # far too large, and too small
+        need[:] = other
+        assert plan_near(gaussians, view, SMALL) == plan_buffers(gaussians, view, SMALL)
