@@ -180,6 +180,12 @@ def _plain_compiler():
         CPU_COMPILER_OPTIONS.clear()
 
 
+@pytest.fixture(autouse=True)
+def _nothing_ahead(monkeypatch):
+    """Tests call few of the programs that a command compiles ahead."""
+    monkeypatch.setattr("humangs_jax.core.processes.Ahead.add", lambda self, calls: None)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _forget_programs():
     yield

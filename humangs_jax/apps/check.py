@@ -12,6 +12,7 @@ cross coincide.
 """
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -29,6 +30,7 @@ from humangs_jax.capture.fitting.camera_errors import find_camera_errors
 from humangs_jax.capture.fitting.fit_capture import Examination
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.processes import Call
 from humangs_jax.core.progress import text_table
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
@@ -36,9 +38,11 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.prepared import PreparedCapture, prepare_capture
 from humangs_jax.data.skirt import SKIRT_VERTICES
+from humangs_jax.data.views import gaussian_body
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import to_uint8
+from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.rendering.mesh.rasterizer import (
     interpolate_attributes,
     rasterize_mesh,
@@ -230,6 +234,14 @@ def check_capture(
         farthest = float(np.linalg.norm(own, axis=1).max())
     registered = capture.displacement is not None
     return CheckReport(tuple(views), found.whole, farthest, registered, skirt)
+
+
+def calls_of_check(capture: Capture, config: HumanGSConfig) -> Iterator[Call]:
+    """The programs that draw the body over photos, and that of the network over it."""
+    small = capture.select([0]).resized(min(LONGEST_SIDE, max(capture.images.shape[1:3])))
+    for body in (capture.body, gaussian_body(capture.body, config)):
+        vertices = np.zeros(body.template.shape, np.float32)
+        yield body_image, (vertices, body.faces, vertices, small.cameras[0])
 
 
 def _prepared(capture: Capture) -> PreparedCapture | None:

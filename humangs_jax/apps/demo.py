@@ -7,7 +7,7 @@ import dataclasses
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,21 +22,28 @@ from humangs_jax.avatar.export.gaussians import export
 from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import capture_renderings, motion_frames, splatting_of
 from humangs_jax.avatar.layers import write_renderings_exr
-from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.avatar.reconstruct import calls_of_reconstruct, reconstruct
 from humangs_jax.avatar.video import contact_sheet, side_by_side, write_video
 from humangs_jax.core.arrays import from_host
+from humangs_jax.core.processes import Ahead, Call
 from humangs_jax.core.progress import COMPILING, stage
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.data.view_choice import best_views
-from humangs_jax.evaluation.cases import draw_painted_body, painted_body
+from humangs_jax.evaluation.cases import (
+    calls_of_painted_body,
+    draw_painted_body,
+    painted_body,
+)
 from humangs_jax.evaluation.scores import score
 from humangs_jax.io.atomic import add_files, check_ours
 from humangs_jax.io.reading import read_json, write_json
 from humangs_jax.motion import load_motion
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.refine import refine_with_report
+from humangs_jax.refinement.refine import calls_of_refine, refine_with_report
 from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.viewer.page import write_page
 
@@ -77,7 +84,9 @@ def run_demo(
     _check_place(Path(out))
 
     def write(folder):
-        return report.update(_write_demo(folder, weights, frame_size, refine, settings))
+        with Ahead() as ahead:
+            made = _write_demo(folder, weights, frame_size, refine, settings, ahead)
+        return report.update(made)
 
     add_files(Path(out), write, first=FILES[0])
     return report
@@ -109,12 +118,21 @@ def summary(report: dict[str, Any]) -> str:
     return f"{quality}; refined for {refined['seconds']:.0f} s: {gain}"
 
 
+def _calls_until_refined(
+    variables: Variables, config: HumanGSConfig, inputs: Capture, truth: Capture
+) -> Iterator[Call]:
+    """What the demonstration calls before it refines, the first ones first."""
+    yield from calls_of_reconstruct(variables, config, inputs)
+    yield from calls_of_painted_body(inputs, truth)
+
+
 def _write_demo(
     folder: Path,
     weights: str | os.PathLike[str] | None,
     frame_size: int,
     refine: RefineConfig | None,
     settings: Settings,
+    ahead: Ahead,
 ) -> dict[str, Any]:
     began, timings = time.perf_counter(), dict[str, Any]()
     with stage("loading"):
@@ -125,6 +143,8 @@ def _write_demo(
         variables, config = _timed(timings, "load_weights", lambda: load_weights(weights))
         config = settings.network(config)
 
+    ahead.add(_calls_until_refined(variables, config, inputs, truth))
+
     def held_out(avatar: Avatar, background: float = 1.0) -> tuple[Any, list[Rendering]]:
         how = splatting_of(settings.shot(FrameSettings()), avatar)
         return capture_renderings(avatar, truth, from_host(np.full(3, background)), how)
@@ -134,6 +154,8 @@ def _write_demo(
             timings, "reconstruct", lambda: reconstruct(variables, config, inputs), twice=True
         )
         _timed(timings, "animate", lambda: animate(avatar, motion.pose(0)), twice=True)
+    if refine is not None:
+        ahead.add(calls_of_refine(avatar, inputs, refine))
     with stage("rendering"):
         ours = _images(_timed(timings, "render_held_out", lambda: held_out(avatar), twice=True))
         baseline = score(draw_painted_body(painted_body(inputs), truth), truth)

@@ -9,6 +9,7 @@ from typing import Any
 
 from humangs_jax.apps import detect, photos_alone
 from humangs_jax.apps import start as material_of
+from humangs_jax.apps.ahead import calls_after_fit, calls_of_found_people, shipped_weights
 from humangs_jax.apps.check import check_capture
 from humangs_jax.apps.start import HeldOut, PhotoFolder, held_out_psnr, missing, photos_to_read
 from humangs_jax.apps.video_photos import photos_of_video, seconds_of_photos, video_of
@@ -37,6 +38,7 @@ from humangs_jax.capture.fitting.refine import (
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.capture.keypoints.reading import read_keypoints
 from humangs_jax.core.configuration import ArgumentError
+from humangs_jax.core.processes import Ahead
 from humangs_jax.core.progress import stage
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.capture_checks import CaptureError
@@ -53,7 +55,6 @@ from humangs_jax.io.atomic import (
 )
 from humangs_jax.io.decoded import decoded_once, forget_decoded
 from humangs_jax.io.reading import read_json
-from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.config import ITERATIONS_ALONE, RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
 from humangs_jax.viewer.page import write_page
@@ -216,8 +217,8 @@ class FromPhotos:
             material = dataclasses.replace(material, masks=None)
         self._check_lengths(material)
         yield Step(str(material))
-        with only_writer(self.out, replaced=True), decoded_once():
-            yield from self._go_on(material)
+        with only_writer(self.out, replaced=True), decoded_once(), Ahead() as ahead:
+            yield from self._go_on(material, ahead)
 
     def _check_lengths(self, material: PhotoFolder) -> None:
         """Raises: ArgumentError for a scale or a direction that something else sets."""
@@ -272,7 +273,7 @@ class FromPhotos:
                 problem = f": the body in {self.out} was made {how}: {BEGIN_ANEW}"
                 raise ArgumentError(name, problem)
 
-    def _go_on(self, material: PhotoFolder) -> Iterator[Step]:
+    def _go_on(self, material: PhotoFolder, ahead: Ahead) -> Iterator[Step]:
         """From where an earlier run came to an end, if there was one."""
         # a body that is there is used again
         if self.resumes():
@@ -289,10 +290,11 @@ class FromPhotos:
                 yield Step(f"{replaced}; this is deleted: {deleted}")
         # without cameras the person gives them
         if material.cameras is None and detection.available():
+            ahead.add(calls_of_found_people(material.photos))
             material = yield from self._photos_alone(material)
         else:
             material = yield from self._with_cameras(material)
-        capture, estimate = yield from self._fit(material)
+        capture, estimate = yield from self._fit(material, ahead)
         yield from self._finish(capture, estimate)
 
     def _with_cameras(self, material: PhotoFolder) -> Generator[Step, None, PhotoFolder]:
@@ -443,7 +445,9 @@ class FromPhotos:
             yield Step(f"photos were turned upright: {should}", warning=True)
         return report
 
-    def _fit(self, material: PhotoFolder) -> Generator[Step, None, tuple[Capture, HeldOut | None]]:
+    def _fit(
+        self, material: PhotoFolder, ahead: Ahead
+    ) -> Generator[Step, None, tuple[Capture, HeldOut | None]]:
         """Fit the body to keypoints and masks, and write it into the capture."""
         with stage("fitting the body"):
             assert material.keypoints is not None
@@ -462,6 +466,8 @@ class FromPhotos:
                     "cameras",
                     f"{material.cameras}: {against}: correct it, or go on without it by {IGNORE!r}",
                 )
+            if photos.masks is not None:
+                ahead.add(calls_after_fit(photos, keypoints))
             fitted = fit_photos(photos, keypoints, load_body())
         with stage("examining the fit"):
             report = fitted.report
@@ -475,7 +481,7 @@ class FromPhotos:
             with stage("comparing bodies by a held-out photo"):
                 loose, tight = bodies
                 capture, estimate = material_of.better_body(
-                    *load_weights(), loose.capture, tight.capture, ITERATIONS_ALONE
+                    *shipped_weights(), loose.capture, tight.capture, ITERATIONS_ALONE, ahead
                 )
             report = (tight if capture is tight.capture else loose).report
             yield Step(f"\n{report}")
@@ -507,7 +513,7 @@ class FromPhotos:
         """Check the capture, then make, refine and write the avatar."""
         forget_decoded()  # the capture has the photos
         with stage("preparing the photos"):
-            weights = load_weights()
+            weights = shipped_weights()
             nobody, photos = None, None
             try:
                 photos = prepare_capture(capture)

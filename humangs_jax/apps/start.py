@@ -6,12 +6,14 @@ an avatar is where no photo was. The best frames of a video: `apps.video_photos`
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.capture.calibration.photos import (
     MASK_FOLDERS,
@@ -20,6 +22,7 @@ from humangs_jax.capture.calibration.photos import (
     is_transparent,
 )
 from humangs_jax.core.array_types import Float, PyTree
+from humangs_jax.core.processes import Ahead
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.folders import (
@@ -35,14 +38,13 @@ from humangs_jax.data.prepared import PreparedCapture, prepare_capture
 from humangs_jax.data.view_choice import best_views
 from humangs_jax.data.views import cropped
 from humangs_jax.evaluation.cases import predict_views
-from humangs_jax.evaluation.scores import score
-from humangs_jax.geometry import quaternion
 from humangs_jax.io.images import PHOTO_SUFFIXES, image_size
 from humangs_jax.io.reading import visible
 from humangs_jax.losses.alignment import ASKED, aligned_psnr, photos_agree
+from humangs_jax.losses.losses import LARGEST_PSNR
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.refine import refine
+from humangs_jax.refinement.refine import calls_of_refine, refine
 
 PHOTO_FOLDERS = ("images", "photos", "imgs", "rgb")
 CAMERA_PLACES = (".", "cameras", "calibration", "calib", "colmap", "colmap/sparse/0")
@@ -335,12 +337,15 @@ def held_out_psnr(
     capture: Capture | PreparedCapture,
     refinement: RefineConfig | None,
     number: int = 0,
+    watch: Callable[[Avatar, PreparedCapture], None] | None = None,
 ) -> HeldOut | None:
     """How well a photo is reproduced by an avatar of the others, over the person, in a crop of
     `SIZE` pixels: the one that has the nearest other one, or of higher `number` the next in this
     order. None for fewer than four photos or without masks.
     Body and cameras are those of all photos. In its place is a second copy of the nearest photo:
     the programs for that number of photos are compiled already.
+
+    Arguments: watch: gets the avatar of the others, before it is refined, and its photos.
     """
     photos = _photos_to_hold_out(capture)
     capture = photos.capture
@@ -351,6 +356,8 @@ def held_out_psnr(
     view = int(np.argsort(apart.min(axis=1), kind="stable")[number])
     others = photos.select(np.where(views == view, int(apart[view].argmin()), views))
     avatar = reconstruct(variables, config, others)
+    if watch is not None:
+        watch(avatar, others)
     if refinement is not None:
         avatar = refine(
             avatar, others, dataclasses.replace(refinement, head_steps=0)
@@ -359,13 +366,24 @@ def held_out_psnr(
     assert photo.masks is not None and photo.unknown is not None
     drawn = predict_views(avatar, photo)
     assert drawn.alpha is not None
-    psnr = float(score(drawn.images, photo).psnr_fg)
+    psnr = _psnr_of_person(drawn.images[0], photo.images[0], photo.masks[0])
     aligned = aligned_psnr(
         np.concatenate([drawn.images[0], drawn.alpha[0][..., None]], axis=-1),
         np.concatenate([photo.images[0], photo.masks[0][..., None]], axis=-1),
         ~photo.unknown[0],
     )
     return HeldOut(capture.names[view], psnr, aligned)
+
+
+def _psnr_of_person(
+    image: Float[np.ndarray, "h w 3"],
+    photo: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w"],
+) -> float:
+    """`psnr_fg` of `evaluation.scores`, dB, without the programs of the other scores."""
+    errors = np.mean(np.square(image - photo), axis=-1)
+    mean = float(np.sum(errors * mask) / max(np.sum(mask), 1e-6))
+    return min(LARGEST_PSNR, -10 * float(np.log10(max(mean, 1e-30))))
 
 
 def _photos_to_hold_out(capture: Capture | PreparedCapture) -> PreparedCapture:
@@ -397,6 +415,7 @@ def better_body(
     first: Capture,
     second: Capture,
     refinement: RefineConfig | None,
+    ahead: Ahead | None = None,
 ) -> tuple[Capture, HeldOut | None]:
     """The capture whose body makes the better avatar, judged by photos that are held out of it, and
     what the first of them says of the avatar after refinement.
@@ -404,9 +423,20 @@ def better_body(
     More of the masks is covered by a body that fills clothes; the avatar is not better for it.
     Several photos are asked, see `photos_agree`, about avatars that are not refined: which body is
     better shows before, and refinement takes most of the time. Without enough photos the first.
+
+    Arguments: ahead: compiles meanwhile what the refinement will need.
     """
     photos = _photos_to_hold_out(first)
-    begun = held_out_psnr(variables, config, photos, None)
+
+    def compile_refinement(avatar: Avatar, read: PreparedCapture) -> None:
+        """Begins with what the refinement of any of the avatars will need, then with that by all
+        photos.
+        """
+        if ahead is not None and refinement is not None:
+            ahead.add(calls_of_refine(avatar, read, refinement))
+            ahead.add(calls_of_refine(avatar, photos, refinement))
+
+    begun = held_out_psnr(variables, config, photos, None, watch=compile_refinement)
     if begun is None:
         return first, None
     others = _photos_to_hold_out(second)
@@ -434,12 +464,11 @@ def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:
     also serve for somebody who turns before one camera. A photo is not its own neighbour.
     """
     frames = np.asarray(capture.frames)
-    pelvis = capture.poses.rotations[:, 0]
-    world_from_pelvis = np.asarray(quaternion.matrix_from_axis_angle(pelvis), np.float64)[frames]
-    towards = (
-        np.asarray(capture.cameras.center, np.float64)
-        - np.asarray(capture.poses.translation, np.float64)[frames]
-    )
+    pelvis = np.asarray(capture.poses.rotations, np.float64)[frames, 0]
+    world_from_pelvis = Rotation.from_rotvec(pelvis).as_matrix()
+    cam_from_world = np.asarray(capture.cameras.cam_from_world, np.float64)
+    centers = np.linalg.inv(cam_from_world)[:, :3, 3]
+    towards = centers - np.asarray(capture.poses.translation, np.float64)[frames]
     towards = np.einsum("vba,vb->va", world_from_pelvis, towards)
     towards = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
     return np.linalg.norm(towards[:, None] - towards, axis=-1) + 9 * np.eye(len(towards))

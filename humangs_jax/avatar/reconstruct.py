@@ -31,11 +31,11 @@ from humangs_jax.body.model import (
     blend_transforms,
     joint_transforms,
 )
-from humangs_jax.core.array_types import Array, Bool, Int
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.loops import over
-from humangs_jax.core.processes import compile_ahead
+from humangs_jax.core.processes import Call, compile_ahead
 from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
@@ -112,21 +112,12 @@ def reconstruct(
     """
     _check(capture, "capture")
     prepared = prepare_capture(capture, config)
-    body, photos = prepared.body, prepared.capture
+    body = prepared.body
     assert body is not None  # prepared for a network
-
-    # few numbers of views are compiled: the others are padded
-    size, crop = config.image_size, config.runtime.crop
-    views = to_network_views(photos, size, crop, prepared.displacement)
-    bucket = round_up(photos.view_count, smallest=1)
-    if bucket > photos.view_count:
-        views = pad_views(views, bucket)
+    views, sized = _for_network(prepared.capture, prepared.displacement, config)
     with compiling(("reconstruct", config, views.images.shape)):
-        # masks alone say how many tokens there are, where every photo has one and the network reads
-        # the person's pixels alone: then two programs are compiled side by side
-        person, sized = np.asarray(views.masks) > MASK_THRESHOLD, None
-        if config.conventions.pixels == "person" and person.any(axis=(1, 2)).all():
-            sized = fit_buffers(from_host(person), views.view_count, config)
+        # where masks alone say how many tokens there are, two programs are compiled side by side
+        if sized is not None:
             shapes = jax.eval_shape(_prepare, body, views, config)
             compile_ahead(_reconstruct, variables, sized, body, views, shapes)
 
@@ -139,6 +130,41 @@ def reconstruct(
     if prepared.turned:
         return replace(avatar, light=None)
     return avatar
+
+
+def calls_of_reconstruct(
+    variables: Variables, config: HumanGSConfig, capture: Capture
+) -> Iterator[Call]:
+    """The programs of `reconstruct` for a capture with masks, whatever its body; none where the
+    body decides on their sizes. A skirt makes others.
+    """
+    body, moved = gaussian_body(capture.body, config), None
+    if allows_vertex_offsets(config):
+        moved = np.zeros(body.template.shape, np.float32)
+    views, sized = _for_network(capture, moved, config)
+    if sized is not None:
+        inputs = jax.eval_shape(_prepare, body, views, config)
+        yield _reconstruct, (variables, sized, body, views, inputs)
+        yield _prepare, (body, views, config)
+
+
+def _for_network(
+    photos: Capture, displacement: Float[np.ndarray, "n 3"] | None, config: HumanGSConfig
+) -> tuple[SubjectViews, HumanGSConfig | None]:
+    """The photos as the network wants them, and the configuration with room for their tokens; None
+    where masks alone do not say how many these are.
+    """
+    # few numbers of views are compiled: the others are padded
+    size, crop = config.image_size, config.runtime.crop
+    views = to_network_views(photos, size, crop, displacement)
+    bucket = round_up(photos.view_count, smallest=1)
+    if bucket > photos.view_count:
+        views = pad_views(views, bucket)
+    # masks say it where every photo has one and the network reads the person's pixels alone
+    person = np.asarray(views.masks) > MASK_THRESHOLD
+    if config.conventions.pixels != "person" or not person.any(axis=(1, 2)).all():
+        return views, None
+    return views, fit_buffers(from_host(person), views.view_count, config)
 
 
 class Reconstructed(NamedTuple):

@@ -17,7 +17,7 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from importlib.metadata import version
 from multiprocessing import connection
 from pathlib import Path
@@ -348,3 +348,50 @@ def compile_ahead(program: Any, *arguments: Any) -> threading.Thread:
     thread = threading.Thread(target=compile_it)
     thread.start()
     return thread
+
+
+Call = tuple[Any, tuple[Any, ...]]
+"""What `jax.jit` returned, and the arguments of a call; arrays may be `jax.ShapeDtypeStruct`."""
+AT_ONCE = 2
+"""Programs that are compiled at once: each takes up to a gigabyte, and the work beside them has a
+core, too."""
+
+
+class Ahead:
+    """Compiles in threads, beside other work, what that work will call: see `compile_ahead`.
+
+        with Ahead() as ahead:
+            ahead.add(calls_of_fit(body, kind, views))
+            ...
+
+    A call that nobody makes costs time alone. At the end of the block no further ones are begun.
+    """
+
+    def __init__(self) -> None:
+        self._free = threading.BoundedSemaphore(AT_ONCE)
+        self._over = threading.Event()
+
+    def __enter__(self) -> "Ahead":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._over.set()
+
+    def add(self, calls: Iterable[Call]) -> None:
+        """Begins with these, one after the other in their order; what is wrong with one of them
+        ends it, and says nothing.
+        """
+        # threads that do not keep the process alive: whoever ends it waits for no program
+        threading.Thread(target=self._begin, args=(calls,), daemon=True).start()
+
+    def _begin(self, calls: Iterable[Call]) -> None:
+        with contextlib.suppress(Exception):
+            for call in calls:
+                self._free.acquire()
+                threading.Thread(target=self._compile, args=call, daemon=True).start()
+
+    def _compile(self, program: Any, arguments: tuple[Any, ...]) -> None:
+        with contextlib.suppress(Exception):
+            if not self._over.is_set():
+                program.lower(*arguments).compile()
+        self._free.release()

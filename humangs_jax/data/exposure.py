@@ -19,7 +19,8 @@ again from photos that are nearly equal, they would not be ones.
 
 import dataclasses
 import itertools
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,7 @@ from scipy.sparse.csgraph import connected_components
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import taken
+from humangs_jax.core.processes import Call
 from humangs_jax.data.body_and_masks import views_without_person
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import to_network_views
@@ -109,17 +111,25 @@ def points_of(
 
     capture: photos on white, with masks, all of which show the person.
     """
+    each = [_seen_colors(*arguments) for arguments in _looks(capture)]
+    colors, seen = (np.stack(x) for x in zip(*each, strict=True))
+    return colors, seen
+
+
+def _looks(capture: Capture) -> Iterator[tuple[Any, ...]]:
+    """The arguments of `seen_colors` for one photo after the other."""
     views = to_network_views(capture, EXPOSURE_SIZE, crop=True)
     rest = shape_body(capture.body, views.betas)
     per_view = views.images, views.masks, views.cameras
     poses = jax.vmap(BodyPose)(views.rotations, views.translations)
+    for i in range(capture.view_count):
+        photo = jax.tree.map(lambda x, i=i: taken(x, i), (poses, *per_view))
+        yield capture.body, rest, *photo
 
-    def photo(i):
-        return jax.tree.map(lambda x: taken(x, i), (poses, *per_view))
 
-    each = [_seen_colors(capture.body, rest, *photo(i)) for i in range(capture.view_count)]
-    colors, seen = (np.stack(x) for x in zip(*each, strict=True))
-    return colors, seen
+def calls_of_exposure(capture: Capture) -> Iterator[Call]:
+    """The program that looks for the colors of the body in photos, wherever it is."""
+    yield _seen_colors, next(_looks(capture))
 
 
 def gains_of(

@@ -4,7 +4,7 @@ views, the simplest last.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host, joined
+from humangs_jax.core.processes import Call
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.datasets.subject import FileBody, open_people
 from humangs_jax.data.loading.captures import find_captures
@@ -309,7 +310,7 @@ def capture_of(views: SubjectViews, body: BodyModel) -> Capture:
 
 def predict_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Predicted:
     """An avatar in the poses and from the cameras of a capture."""
-    drawn = capture_renderings(avatar, views, jnp.full(3, background))[1]
+    drawn = capture_renderings(avatar, views, from_host(np.full(3, background), np.float32))[1]
     images = np.stack([np.clip(np.asarray(rendering.rgb), 0, 1) for rendering in drawn])
     alpha = np.stack([np.asarray(rendering.alpha) for rendering in drawn])
     return Predicted(images, alpha, tuple(range(len(images))))
@@ -500,6 +501,16 @@ def _seen(
     depth_map = rasterize_mesh(vertices, body.faces, camera).depth
     size = (camera.width, camera.height)
     return pixels, visible_vertices(pixels, depths, depth_map, size, "half_pixel")
+
+
+def calls_of_painted_body(inputs: Capture, views: Capture) -> Iterator[Call]:
+    """The programs of `painted_body` and `draw_painted_body`."""
+    body = inputs.body
+    rest = shape_body(body, from_host(inputs.betas))
+    first, drawn = inputs.pose(int(inputs.frames[0])), views.pose(int(views.frames[0]))
+    yield _seen, (body, rest, first, inputs.cameras[0])
+    colors = np.zeros(body.template.shape, np.float32)
+    yield _painted, (body, rest, drawn, views.cameras[0], colors)
 
 
 def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.ndarray, "v h w 3"]:

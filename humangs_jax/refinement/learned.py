@@ -15,7 +15,7 @@ no photo shows move with their neighbours. Gradient descent on the photos cannot
 
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib import resources
 from typing import Any, cast
 
@@ -28,6 +28,7 @@ from scipy.spatial import KDTree
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.arrays import from_host
+from humangs_jax.core.processes import Call
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.tensors import read_safetensors
@@ -114,6 +115,19 @@ def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
     return Graph(
         neighbors_of(means), neighbors_of(centers), *indices, from_host(weights, jnp.float32)
     )
+
+
+def graph_like(g: int) -> Graph:
+    """A graph of the shape that `graph_of` g Gaussians has, with nothing in it."""
+
+    def neighbors(count: int) -> Neighbors:
+        index = np.zeros((count, NEIGHBORS))
+        return Neighbors(from_host(index, jnp.int32), from_host(index, jnp.float32))
+
+    clusters = 2**CLUSTER_LEVELS
+    members, nearest = np.zeros((clusters, -(-g // clusters))), np.zeros((g, NEAREST_CLUSTERS))
+    indices = from_host(members, jnp.int32), from_host(nearest, jnp.int32)
+    return Graph(neighbors(g), neighbors(clusters), *indices, from_host(nearest, jnp.float32))
 
 
 def clusters_of(means: Float[np.ndarray, "g 3"]) -> Int[np.ndarray, "c m"]:
@@ -328,6 +342,28 @@ def learned_update(
             load_refiner(), parameters, values, start, hidden, overflow, each, graph, avatar
         )
     return parameters, overflow
+
+
+def calls_of_update(
+    parameters: UnconstrainedGaussians,
+    avatar: Avatar,
+    photos: Sequence[Photo],
+    graph: Graph,
+    splat: SplatConfig,
+) -> Iterator[Call]:
+    """The long programs of `learned_update`, in the order of their use."""
+    photo, used = photos[0], min(len(photos), MOST_PHOTOS)
+    drawing = parameters, avatar, photo, splat
+    yield drawn_photo, drawing
+    image, pull_back, rendering = drawn_photo.eval_shape(*drawing)
+    yield pulled, (pull_back, image)
+    gradient, pixels = pulled.eval_shape(pull_back, image)
+    signals = _signals_from.eval_shape(gradient, gradient, pixels, rendering, photo)
+    values = side_by_side.eval_shape(parameters)
+    hidden, overflow = np.zeros((len(values), Refiner.width), values.dtype), np.zeros((), np.int32)
+    each = [(signals, rendering.overflow)] * used
+    of_all = load_refiner(), parameters, values, values, hidden, overflow, each, graph, avatar
+    yield _iteration_by, of_all
 
 
 @compiled

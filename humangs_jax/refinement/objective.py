@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar, cast, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -46,13 +46,35 @@ Level 0: eight times.
 """
 P = ParamSpec("P")
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 jax.tree_util.register_static(
     RefineConfig
 )  # here: its own module is imported by the command line, without JAX
 
 
-def compiled(function: Callable[P, T]) -> Callable[P, T]:
+@runtime_checkable
+class Compiled(Protocol[P, T_co]):
+    """What `compiled` returns: a function that can also be compiled before it is called."""
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T_co:
+        """The result."""
+        ...
+
+    def __hash__(self) -> int:
+        """Of the function."""
+        ...
+
+    def lower(self, *args: Any) -> Any:
+        """The program for such arguments, as the function of `jax.jit` lowers it."""
+        ...
+
+    def eval_shape(self, *args: Any) -> Any:
+        """The shapes of the result."""
+        ...
+
+
+def compiled(function: Callable[P, T]) -> Compiled[P, T]:
     """Decorator: compiles the function where it is called with arrays; inside of a transformation
     it becomes a part of that program.
 
@@ -78,7 +100,10 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
             return function(*args, **kwargs)
         return program()(*args, **kwargs)
 
-    return call
+    made: Any = call
+    made.lower = lambda *args: cast(Any, program()).lower(*args)
+    made.eval_shape = lambda *args: cast(Any, program()).eval_shape(*args)
+    return made
 
 
 # Parameters

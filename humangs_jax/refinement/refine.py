@@ -6,7 +6,7 @@ photos, and keeps the best of what `search` finds until its time is over.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -15,6 +15,7 @@ import numpy as np
 from humangs_jax.avatar.animate import with_pixel_footprint_of
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.processes import Call
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.prepared import PreparedCapture, prepare_capture
 from humangs_jax.refinement.config import RefineConfig
@@ -25,6 +26,7 @@ from humangs_jax.refinement.search import (
     Clock,
     align,
     avatar_comparison,
+    calls_of_photos,
     comparison,
     compile_parts,
     prepare,
@@ -218,6 +220,15 @@ def refine_with_report(
         head_steps=head_steps,
         moved=task.moved,
     )
+
+
+def calls_of_refine(
+    avatar: Avatar, capture: Capture | PreparedCapture, config: RefineConfig
+) -> Iterator[Call]:
+    """The long programs of a refinement, before it begins; none without iterations or masks."""
+    photos = prepare_capture(capture)
+    if config.iterations and photos.capture.masks is not None:
+        yield from calls_of_photos(avatar, crop_to_person(photos, config.image_size))
 
 
 def _crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) -> Crops | None:

@@ -30,6 +30,7 @@ from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.arrays import from_host
+from humangs_jax.core.processes import Ahead, Call
 from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.progress import compiling
 from humangs_jax.core.pytree import replace
@@ -44,7 +45,13 @@ from humangs_jax.losses.alignment import (
 )
 from humangs_jax.losses.losses import LARGEST_PSNR
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
-from humangs_jax.refinement.learned import Graph, graph_of, learned_update
+from humangs_jax.refinement.learned import (
+    Graph,
+    calls_of_update,
+    graph_like,
+    graph_of,
+    learned_update,
+)
 from humangs_jax.refinement.objective import (
     Comparison,
     Image,
@@ -251,9 +258,19 @@ def prepare(
     settings = dataclasses.replace(config, **HOST_SETTINGS)
     task = Task(start, fresh, photos, seen, graph, config, settings, clock)
     parameters, splat = unconstrained(start.gaussians), planned(start, views)
+    if graph is not None:
+        Ahead().add(calls_of_update(parameters, start, seen, graph, splat))
     each = comparison(task, parameters, photos, splat)
     state = init_state(parameters, each.together(), settings, splat)
     return task, Candidate(state, 0, np.arange(len(photos))), each
+
+
+def calls_of_photos(avatar: Avatar, views: SubjectViews) -> Iterator[Call]:
+    """The long programs of iterations on these photos, which `prepare` begins with, too."""
+    start = with_pixel_footprint_of(avatar, views)
+    parameters, graph = unconstrained(start.gaussians), graph_like(len(start.gaussians.means))
+    photos = list(photos_of(views))
+    yield from calls_of_update(parameters, start, photos, graph, planned(start, views))
 
 
 @jax.jit

@@ -32,6 +32,7 @@ from humangs_jax.data.photos import load_photos
 from humangs_jax.geometry.camera import orbit
 from humangs_jax.io.images import read_image, to_uint8, write_png
 from humangs_jax.io.reading import write_json
+from humangs_jax.losses.losses import masked_psnr
 from humangs_jax.network.presets import tiny
 from tests.refinement.refinement_cases import toy_avatar, toy_capture
 
@@ -202,7 +203,7 @@ def detected(mine, monkeypatch):
             )
         )
 
-    def stop(self, material):
+    def stop(self, material, ahead):
         told.append(material)
         raise ValueError("the fit")
         yield
@@ -532,6 +533,14 @@ def test_one_of_four_photos_is_kept_from_the_network_and_compared_with(body, toy
         assert held_out_psnr({}, tiny(), few, None) is None
 
 
+def test_the_psnr_of_the_person_is_that_of_evaluations():
+    image, photo = np.random.default_rng(0).random((2, 20, 30, 3), np.float32)
+    mask = np.linspace(0, 1, 600, dtype=np.float32).reshape(20, 30)
+    expected = float(masked_psnr(*map(jnp.asarray, (image, photo, mask))))
+    assert start._psnr_of_person(image, photo, mask) == pytest.approx(expected, abs=1e-4)
+    assert start._psnr_of_person(photo, photo, mask) == 100
+
+
 def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):
     other, wrong = dataclasses.replace(toy, body_file="other"), {}
     reconstructed(monkeypatch, body, lambda photos: wrong[photos.body_file])
@@ -555,7 +564,7 @@ def test_the_body_with_the_better_avatar_is_taken(body, toy, monkeypatch):
 def test_no_photo_alone_rejects_a_body(gains, asked, better, toy, monkeypatch):
     other, numbers = dataclasses.replace(toy, body_file="other"), []
 
-    def scored(variables, config, photos, refinement, number=0):
+    def scored(variables, config, photos, refinement, number=0, watch=None):
         numbers.append(number)
         of_other = photos.given is other
         return start.HeldOut(photos.given.names[number], 20.0, 30.0 + of_other * gains[number])

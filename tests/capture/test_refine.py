@@ -22,6 +22,7 @@ from humangs_jax.capture.fitting.refine import (
     start_state,
     usual_config,
 )
+from humangs_jax.capture.fitting.residuals import silhouettes
 from humangs_jax.capture.fitting.residuals.silhouettes import (
     BodyView,
     body_boundary,
@@ -449,3 +450,35 @@ def test_clothes_explain_a_gap_and_a_body_outside_costs_more_than_one_inside(sph
 def test_clothes_inside_the_body_count_more_than_those_outside():
     inside, outside = module._counted(jnp.asarray([-0.5, 0.5]))
     assert -inside > 3 * outside == 1.5
+
+
+def shapes_of(arguments):
+    """What a compiled program depends on of the arguments of a call."""
+    leaves, tree = jax.tree.flatten(arguments)
+    return tree, [x if callable(x) else str(jax.eval_shape(lambda y: y, x)) for x in leaves]
+
+
+def test_what_is_compiled_ahead_is_what_a_refinement_calls(monkeypatch):
+    unmasked = dataclasses.replace(augmented(), masks=None)
+    ahead = list(Scene(unmasked, keypoints(), CONFIG).calls())
+    expected = {program.__name__: shapes_of(arguments) for program, arguments in ahead}
+    called = {}
+
+    def note(holder, name, program):
+        def noted(*arguments):
+            called[name] = shapes_of(arguments)
+            return program(*arguments)
+
+        monkeypatch.setattr(holder, name, noted)
+
+    for holder in (module, silhouettes):
+        for program, _ in ahead:
+            if hasattr(holder, program.__name__):
+                note(holder, program.__name__, getattr(holder, program.__name__))
+    note(module, "solve_round", lambda model, origin, evidence, state, *settings: state)
+    scene = Scene(augmented(), keypoints(), dataclasses.replace(CONFIG, iterations=1))
+    state, _ = scene.run()
+    scene.score(module.moved_capture(augmented(), scene.origin, state))
+    assert set(expected) == set(called) and len(expected) == 6
+    for name, shapes in expected.items():
+        assert called[name] == shapes, name

@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,7 @@ from humangs_jax.core.processes import (
     QUICKEST,
     QUICKEST_OF_JAX,
     VARIABLE,
+    Ahead,
     compile_ahead,
     enable_compile_cache,
 )
@@ -28,6 +31,15 @@ import jax, jax.numpy as jnp
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((8, 8))).block_until_ready()
 """
+
+
+ADD = Ahead.add
+"""As it is; the tests' own does nothing."""
+
+
+@pytest.fixture(autouse=True)
+def compiles_ahead(monkeypatch):
+    monkeypatch.setattr(Ahead, "add", ADD)
 
 
 @pytest.fixture(autouse=True)
@@ -144,3 +156,34 @@ def test_a_function_that_cannot_be_compiled_fails_where_it_is_called(capfd):
     assert capfd.readouterr().err == ""
     with pytest.raises(TypeError, match="dot"):
         program(np.zeros(4, np.float32))
+
+
+def test_calls_given_ahead_are_compiled_once_and_faults_among_them_are_silent(capfd):
+    wrong = jax.jit(lambda x: x @ jnp.ones(3))
+    program = jax.jit(lambda x: jnp.sort(jnp.cos(x) @ x))
+    shape = jax.ShapeDtypeStruct((7, 7), np.float32)
+    with compiled_programs() as programs, Ahead() as ahead:
+        ahead.add([(wrong, (shape,)), (program, (shape,))])
+        deadline = time.monotonic() + 60
+        while not programs and time.monotonic() < deadline:
+            time.sleep(0.01)
+        found = program(np.eye(7, dtype=np.float32))
+    assert len(programs) == 1
+    assert np.allclose(found, np.sort(np.cos(np.eye(7))))
+    assert capfd.readouterr().err == ""
+
+
+def test_after_the_block_nothing_further_is_compiled_ahead():
+    program, asked = jax.jit(lambda x: jnp.tan(x)), threading.Event()
+
+    def calls():
+        yield program, (jax.ShapeDtypeStruct((5,), np.float32),)
+        asked.set()
+
+    with compiled_programs() as programs:
+        with Ahead() as ahead:
+            pass
+        ahead.add(calls())
+        assert asked.wait(60)
+        time.sleep(0.05)
+    assert programs == []

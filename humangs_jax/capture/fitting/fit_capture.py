@@ -21,6 +21,7 @@ from humangs_jax.capture.fitting.landmark_fit import (
     ROBUST_SCALES,
     LandmarkFit,
     accelerations,
+    fit_frames,
     fit_landmarks,
     keypoint_problem,
 )
@@ -40,10 +41,13 @@ from humangs_jax.capture.fitting.residuals.keypoints import (
     found_noise,
     frame_residuals,
     group_by_frame,
+    make_observations,
 )
-from humangs_jax.capture.fitting.swaps import find_exchanged_hands, find_swaps
-from humangs_jax.capture.keypoints.keypoints import Keypoints
+from humangs_jax.capture.fitting.swaps import agreements, find_exchanged_hands, find_swaps
+from humangs_jax.capture.keypoints.keypoints import Keypoints, KeypointSet
 from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.arrays import from_host
+from humangs_jax.core.processes import Call
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import DEFAULT_BODY, Capture
 from humangs_jax.data.capture_checks import few
@@ -197,19 +201,19 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
     observations, views = group_by_frame(capture, keypoints)
     # errors of the body's landmarks, frame by frame
     expected = np.asarray(observations.noise)
-    poses = jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
+    poses = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(views)], capture.poses)
     kind = keypoints.set
     model = landmark_model(capture.body, kind.names, kind.places, kind.certainty)
     errors = np.asarray(
-        body_errors(model, jnp.asarray(capture.betas), poses, observations, np.arange(len(views)))
+        body_errors(model, from_host(capture.betas), poses, observations, np.arange(len(views)))
     )
-    compared = np.asarray(observations.confidences > 0) & np.asarray(model.known)
+    compared = (np.asarray(observations.confidences) > 0) & np.asarray(model.known)
     lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
     frames = np.asarray([_quantile(own, 0.5) for own in lengths])
     # noise of the detections: from the fit, or else from the errors themselves
     undetermined = ()
     if record is None:
-        noise = np.asarray(jax.vmap(found_noise)(jnp.asarray(lengths), observations.noise))
+        noise = np.asarray(list(map(found_noise, lengths, expected)))
     else:
         noise, shown = record.noise[: len(views)], np.flatnonzero(compared.any((1, 2)))
         undetermined = undetermined_joints(names, record.joint_std[shown], record.determined[shown])
@@ -282,6 +286,22 @@ FAR = 4.0
 """A frame is far from its neighbours if its distance from their midpoint exceeds this multiple of
 half their distance.
 """
+
+
+def calls_of_fit(body: BodyModel, kind: KeypointSet, views: int) -> Iterator[Call]:
+    """The programs of `fit_photos` and its report on photos of one moment, by their number alone,
+    the first one first.
+    """
+    model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)
+    k, one = len(kind.names), (1, views)
+    matrices = (np.broadcast_to(np.eye(n), (*one, n, n)) for n in (3, 4))
+    observations = make_observations(np.zeros((*one, k, 2)), np.zeros((*one, k)), *matrices)
+    yield fit_frames, (model, observations)
+    fit = jax.eval_shape(fit_frames, model, observations)
+    of_fit = replace(model, certainty=fit.certainty), replace(observations, noise=fit.noise), fit
+    yield _derivatives, of_fit
+    yield agreements, (observations, np.asarray(kind.mirror))
+    yield body_errors, (model, fit.betas, fit.poses, observations, np.arange(1))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

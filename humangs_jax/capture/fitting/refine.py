@@ -9,7 +9,7 @@ it cameras and people could move together.
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -62,6 +62,8 @@ from humangs_jax.capture.fitting.state import (
 from humangs_jax.capture.fitting.triangulation import reprojection_errors
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.arrays import from_host, taken
+from humangs_jax.core.processes import Call
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
@@ -171,11 +173,11 @@ def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfi
     known = without_expression(body).shape_directions.shape[-1]
     wanted = max(len(capture.betas), min(config.coefficients, known))
     return Origin(
-        betas=jnp.pad(jnp.asarray(capture.betas, jnp.float32), (0, wanted - len(capture.betas))),
+        betas=from_host(np.pad(capture.betas, (0, wanted - len(capture.betas))), np.float32),
         pose=capture.poses,
         body_pose_std=_body_pose_std([body.joint_names[j] for j in joints], config),
         cameras=camera_origin(cameras, capture.frames),
-        segment=jnp.asarray(segments(body.parents, joints)),
+        segment=from_host(segments(body.parents, joints)),
         joints=joints,
         std=config.std,
     )
@@ -187,7 +189,7 @@ def _body_pose_std(names: Sequence[str], config: CaptureRefineConfig) -> Float[A
         next((factor for word, factor in config.by_joint if word in name), 1.0) for name in names
     ]
     std = np.radians(config.std.body_pose) * np.asarray(factors)
-    return jnp.asarray(np.repeat(std[:, None], 3, axis=1), jnp.float32)
+    return from_host(np.repeat(std[:, None], 3, axis=1), np.float32)
 
 
 def start_state(origin: Origin, config: CaptureRefineConfig) -> FitState:
@@ -347,7 +349,7 @@ class Scene:
         memory: Float[np.ndarray, " n"] | None = None,
     ) -> None:
         self.capture, self.config = capture, config
-        self.memory = None if memory is None else jnp.asarray(memory, jnp.float32)
+        self.memory = None if memory is None else from_host(memory, np.float32)
         # photos at the size that is looked at
         small = max(capture.images.shape[1:3]) <= LONGEST_SIDE
         looked_at = capture if small else capture.resized(LONGEST_SIDE)
@@ -389,11 +391,46 @@ class Scene:
             state = solve_round(
                 self.model, self.origin, evidence, state, config.independent, self.memory
             )
-            moves = jax.tree.map(
-                lambda a, b: float(jnp.max(jnp.abs(a - b), initial=0.0)), state, before
-            )
-            move = max(jax.tree.leaves(moves))
+            moves = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - np.asarray(b)), state, before)
+            move = max(float(np.max(leaf, initial=0.0)) for leaf in jax.tree.leaves(moves))
         return state, move
+
+    def calls(self) -> Iterator[Call]:
+        """The programs of `run` and `score`, the longest first. Only shapes decide on them."""
+        state, capture = start_state(self.origin, self.config), self.capture
+        betas, cameras = self.origin.betas, self.cameras
+        evidence, count = self._no_evidence(), self.config.points
+        solving = self.model, self.origin, evidence, state, self.config.independent, self.memory
+        yield solve_round, solving
+        vertices = np.zeros(capture.body.template.shape, np.float32)
+        yield silhouettes.look, (vertices, capture.body.faces, cameras[0])
+        yield _moved, (self.origin, state)
+        yield posed_vertices, (capture.body, betas, capture.poses)
+        if self.keypoints is not None:
+            frames = capture.frames
+            seen = self.model, betas, capture.poses, self.keypoints, frames, reprojection_errors
+            yield body_errors, seen
+        places = np.zeros((count, silhouettes.LOOKS, 2), np.float32)
+        yield silhouettes.coverage, (np.zeros(self.masks.shape[1:], np.float32), places)
+
+    def _no_evidence(self) -> Evidence:
+        """Evidence of the shape that all evidence has."""
+        views, count = len(self.masks), self.config.points
+        pixels, ends = np.zeros((2, 0, 2), np.float32), np.zeros((0, 2), int)
+        nothing = silhouettes.Boundary(*pixels, ends, np.zeros(0, np.float32))
+        matches = silhouettes.matches_of((ends[:, 0], pixels[0], pixels[0, :, 0]), count)
+        return Evidence(
+            points=jax.eval_shape(
+                lambda body: silhouettes.boundary_points(
+                    body, [nothing] * views, count, len(self.origin.betas)
+                ),
+                self.capture.body,
+            ),
+            matches=jax.tree.map(lambda leaf: np.stack([leaf] * views), matches),
+            noise=from_host(0, np.float32),
+            scales=from_host(np.zeros(2, np.float32)),
+            keypoints=self.observations,
+        )
 
     def look(self, state: FitState, reach: float) -> Evidence:
         """What the views show, matched within `reach` pixels of the body in this state."""
@@ -412,9 +449,9 @@ class Scene:
             points=silhouettes.boundary_points(
                 self.capture.body, boundaries, count, len(self.origin.betas)
             ),
-            matches=jax.tree.map(lambda *leaves: jnp.stack(leaves), *matches),
-            noise=jnp.asarray(_noise(boundaries, matches), jnp.float32),
-            scales=reach * jnp.asarray(self.config.robust_scales, jnp.float32),
+            matches=jax.tree.map(lambda *leaves: from_host(np.stack(leaves)), *matches),
+            noise=from_host(_noise(boundaries, matches), np.float32),
+            scales=from_host(reach * np.asarray(self.config.robust_scales), np.float32),
             keypoints=self._keypoints(moved),
         )
 
@@ -424,30 +461,31 @@ class Scene:
         """
         if self.keypoints is None or self.observations is None:
             return None
-        errors = jnp.asarray(self._errors(capture, self.keypoints) * self.scale, jnp.float32)
-        return replace(self.observations, noise=found_noise(errors, self.observations.noise))
+        errors = self._errors(capture, self.keypoints) * np.float32(self.scale)
+        noise = found_noise(errors, np.asarray(self.observations.noise))
+        return replace(self.observations, noise=from_host(noise, np.float32))
 
     def _errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
         """Errors of the keypoints in pixels of the photos; NaN where there is none."""
         seen = replace(
             seen,
-            K=capture.cameras.K[:, None],
-            cam_from_world=capture.cameras.cam_from_world[:, None],
+            K=np.asarray(capture.cameras.K)[:, None],
+            cam_from_world=np.asarray(capture.cameras.cam_from_world)[:, None],
         )
-        betas = jnp.asarray(capture.betas)
+        betas = from_host(capture.betas)
         errors = body_errors(
             self.model, betas, capture.poses, seen, capture.frames, reprojection_errors
         )
-        known = np.asarray(seen.confidences * np.asarray(self.model.known) > 0)
+        known = np.asarray(seen.confidences) * np.asarray(self.model.known) > 0
         return np.where(known, errors, np.nan)[:, 0]
 
     def body_views(self, capture: Capture) -> list[silhouettes.BodyView]:
         """The body of a capture of these photos in every view."""
         cameras = capture.cameras.resized(self.cameras.width, self.cameras.height)
-        vertices = posed_vertices(capture.body, jnp.asarray(capture.betas), capture.poses)
+        vertices = posed_vertices(capture.body, from_host(capture.betas), capture.poses)
         faces = capture.body.faces
         return [
-            silhouettes.view_body(vertices[int(frame)], faces, cameras[i])
+            silhouettes.view_body(taken(vertices, frame), faces, cameras[i])
             for i, frame in enumerate(capture.frames)
         ]
 
@@ -501,8 +539,8 @@ def overlap(
 
 @jax.jit
 def posed_vertices(
-    body: BodyModel, betas: Float[jax.Array, " s"], poses: BodyPose
-) -> Float[jax.Array, "m n 3"]:
+    body: BodyModel, betas: Float[Array, " s"], poses: BodyPose
+) -> Float[Array, "m n 3"]:
     """Vertices of a person in a batch of m poses, metres."""
     rest = shape_body(body, betas)
     return jax.lax.map(lambda pose: pose_body(body, rest, pose).vertices, poses)
@@ -517,7 +555,7 @@ def _noise(
     found = [np.zeros(0)]
     for boundary, own in zip(boundaries, matches, strict=True):
         if len(boundary.positions):
-            off = silhouettes.distances(own, jnp.asarray(boundary.positions, jnp.float32))
+            off = silhouettes.distances(own, boundary.positions.astype(np.float32))
             found.append(np.asarray(off)[np.asarray(own.weights) > 0])
     distances = np.abs(np.concatenate(found))
     if not len(distances):
