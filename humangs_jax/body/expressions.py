@@ -31,6 +31,7 @@ FORMAT = "humangs-face-1"
 STEP = 1e-5
 """Metres, of offsets in files: int16 then spans +-0.33 m."""
 EYES = ("left_eye", "right_eye")
+"""Joints that the eyes turn with."""
 PARTS = ("upper_teeth", "lower_teeth", "tongue", "left_lid", "right_lid", "mouth")
 """What `FaceParts.parts` counts; "mouth" is the skin inside of it."""
 KEYS = (
@@ -53,7 +54,7 @@ class Expressions:
     joint_turns: Float[Array, "j 3 e"] | None = None
     """Axis-angle in radians per unit, added to the rotations of the pose; None: no joint turns."""
     names: tuple[str, ...] = static_field(default=())
-    """Of the directions."""
+    """Names of the e directions."""
 
 
 @pytree_dataclass
@@ -78,11 +79,12 @@ class FaceParts:
 
 @functools.cache
 def _shipped() -> dict[str, np.ndarray]:
+    """Reads the face of the package."""
     with resources.as_file(resources.files("humangs_jax") / "assets" / "face.npz") as file:
-        return read_face(file)
+        return _read_face(file)
 
 
-def read_face(path: str | Path) -> dict[str, np.ndarray]:
+def _read_face(path: str | Path) -> dict[str, np.ndarray]:
     """Reads the arrays of a face file; adds `rows`: for each offset its vertex and its shape.
 
     Raises: ValueError, naming the key.

@@ -37,7 +37,6 @@ DIRECTION_STEP = 1e-5
 """Metres. int16 then spans +-0.33 m per unit of a shape coefficient; larger directions are stored
 as float32.
 """
-WEIGHT_STEPS = 65535
 UV_STEPS = 65535
 KEYS = {
     *(
@@ -157,7 +156,7 @@ def save_body(path: str | Path, body: BodyModel) -> None:
         "regressor_vertices": _indices(regressor_columns),
         "regressor_values": regressor_values.astype(np.float32),
         "weight_joints": _indices(weight_columns),
-        "weight_values": np.rint(weight_values * WEIGHT_STEPS).astype(np.uint16),
+        "weight_values": np.rint(weight_values * 65535).astype(np.uint16),
         "faces": _indices(np.asarray(body.faces)),
         "parents": np.asarray(body.parents, np.int16),
         "joint_names": np.asarray(body.joint_names),

@@ -32,12 +32,6 @@ from humangs_jax.geometry import quaternion, transform
 
 
 EXACT = transform.EXACT
-THINNING = 8
-"""Only every eighth vertex is used: enough to average skinning weights over centimetres."""
-BETWEEN = 0.1
-"""Share of either leg in the weights around a point from which on it is between them."""
-BLOCK = 2048
-"""Points whose distances to these vertices are in memory at once."""
 
 
 def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
@@ -130,7 +124,8 @@ def blend_leg_weights(
     Arguments: points in the rest pose, metres. distances: from the vertex of each. weights: of that
     vertex. legs: the joints of each leg.
     """
-    near, near_weights = vertices[::THINNING], vertex_weights[::THINNING]
+    # every eighth vertex is enough to average skinning weights over centimetres
+    near, near_weights = vertices[::8], vertex_weights[::8]
     distances, far = jax.lax.top_k(distances, -(-len(points) // 4))
 
     def around(point_and_distance):
@@ -139,11 +134,12 @@ def blend_leg_weights(
         exponents = -squared / (2 * jnp.square(jnp.maximum(distance, reach / 2)))
         return jnp.einsum("n,nj->j", jax.nn.softmax(exponents), near_weights, precision=EXACT)
 
-    spread = jax.lax.map(around, (points[far], distances), batch_size=BLOCK)
-    between = jnp.min(
-        jnp.einsum("gj,lj->gl", spread, legs.astype(spread.dtype), precision=EXACT), axis=-1
-    )
-    share = jnp.clip(2 * distances / reach - 1.5, 0, 1) * jnp.clip(between / BETWEEN, 0, 1)
+    # 2048 points at once: their distances to all these vertices are in memory
+    spread = jax.lax.map(around, (points[far], distances), batch_size=2048)
+    # a point is between the legs where each has at least a tenth of the weight
+    of_legs = jnp.einsum("gj,lj->gl", spread, legs.astype(spread.dtype), precision=EXACT)
+    between = jnp.clip(jnp.min(of_legs, axis=-1) / 0.1, 0, 1)
+    share = jnp.clip(2 * distances / reach - 1.5, 0, 1) * between
     return weights.at[far].add(share[:, None] * (spread - weights[far]))
 
 

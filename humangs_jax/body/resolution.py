@@ -42,8 +42,6 @@ from humangs_jax.geometry.mesh import (
 # --------------------------------------------------------------------------------------------------
 
 
-SMALLEST_AREA = 1e-12
-"""Metres^2: vertices without faces have no area."""
 FINEST = 64
 """Edges are made at most this many times shorter: finer asks for billions of faces, and is a length
 in another unit.
@@ -106,9 +104,9 @@ def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, spar
         faces = _cut(faces, midpoint[edge_of_side])
         if moves is not None:
             moves.split(edges[long])
-    spacing = np.sqrt(
-        vertex_areas(linear["template"], faces) / np.maximum(linear.pop("area"), SMALLEST_AREA)
-    )
+    # vertices without faces have no area
+    before = np.maximum(linear.pop("area"), 1e-12)
+    spacing = np.sqrt(vertex_areas(linear["template"], faces) / before)
     added = len(linear["template"]) - len(body.template)
     # joints follow the original vertices
     regressor = from_host(np.pad(np.asarray(body.joint_regressor), ((0, 0), (0, added))))
@@ -190,16 +188,13 @@ def _cut(
     count = (middles >= 0).sum(1)
     parts = [faces[count == 0]]
     # turn each face until the pattern of its midpoints is the one that is written out below
-    for sides, first in (
-        (1, lambda m: m[:, 0] >= 0),
-        (2, lambda m: m[:, 2] < 0),
-        (3, lambda m: m[:, 0] >= 0),
-    ):
+    for sides in (1, 2, 3):
         for turn in range(3):
             chosen = count == sides
             m = np.roll(middles[chosen], -turn, axis=1)
-            a, b, c = np.roll(faces[chosen], -turn, axis=1)[first(m)].T
-            p, q, r = m[first(m)].T
+            first = m[:, 2] < 0 if sides == 2 else m[:, 0] >= 0
+            a, b, c = np.roll(faces[chosen], -turn, axis=1)[first].T
+            p, q, r = m[first].T
             if sides == 1:
                 parts += [np.stack([a, p, c], 1), np.stack([p, b, c], 1)]
             elif sides == 2:
@@ -227,18 +222,6 @@ in place.
 VIEWS = 40
 CELL = 0.004
 """Metres: size of a depth-buffer cell, and with it how narrow a gap lets light through."""
-MOST_STEPS = 40
-"""A side of a face is divided into at most this many parts for the depth buffer."""
-SMALLEST_TURN = 0.3
-"""A face may turn by at most acos(0.3) = 73 degrees in one collapse."""
-SMALLEST_QUALITY = 0.08
-"""Lower bound of 4 sqrt(3) area / (sum of squared edges), 1 for an equilateral triangle, unless it
-was worse.
-"""
-LOCAL = 200
-"""Smallest number of vertices near a joint that share the correction of its regressor (or three per
-equation, if more).
-"""
 RIDGE = 1e-13
 """Relative to the trace of the normal equations, which are singular where a shape direction moves
 nothing.
@@ -249,7 +232,8 @@ def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> 
     """Spreads points over the faces, corners included, about `spacing` apart, metres."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    steps = np.clip(np.ceil(longest / spacing), 1, MOST_STEPS).astype(int)
+    # parts of a side, at most 40
+    steps = np.clip(np.ceil(longest / spacing), 1, 40).astype(int)
     points = []
     for n in np.unique(steps):
         grid = np.array([(a, b, n - a - b) for a in range(n + 1) for b in range(n + 1 - a)]) / n
@@ -320,16 +304,18 @@ class _Mesh:
         """Says whether u -> v keeps the topology, the texture charts whole, and folds no face nor
         makes it a needle.
         """
+        # the topology: u and v share the corners of the faces between them and no others
         shared = self.between(u, v)
         common = self.beside[u] & self.beside[v]
         if len(common) != len(shared) or not 1 <= len(shared) <= 2:
             return False
-        if (
-            len(self.around[u]) != len(self.beside[u]) and len(shared) != 1
-        ):  # u on a rim moves along it only
+        on_a_rim = len(self.around[u]) != len(self.beside[u])
+        if on_a_rim and len(shared) != 1:  # it moves along the rim only
             return False
         if self.uv_moves(u, shared, v) is None:
             return False
+        # each face that stays: it is no copy of another one, turns by at most acos(0.3) = 73
+        # degrees, and its quality (1 is equilateral) falls below 0.08 only if it was worse
         around_v = {frozenset(self.faces[f]) for f in self.around[v]}
         for f in self.around[u]:
             if f in shared:
@@ -341,9 +327,9 @@ class _Mesh:
             p, q, r = (self.positions[i] for i in after)
             old, new = _normal(a, b, c), _normal(p, q, r)
             lengths = (_squared(old) * _squared(new)) ** 0.5
-            if old[0] * new[0] + old[1] * new[1] + old[2] * new[2] <= SMALLEST_TURN * lengths:
+            if old[0] * new[0] + old[1] * new[1] + old[2] * new[2] <= 0.3 * lengths:
                 return False
-            if _quality(new, p, q, r) < min(SMALLEST_QUALITY, _quality(old, a, b, c)):
+            if _quality(new, p, q, r) < min(0.08, _quality(old, a, b, c)):
                 return False
         return True
 
@@ -385,6 +371,7 @@ def _squared(x: Sequence[float]) -> float:
 def _quality(
     normal: Sequence[float], a: Sequence[float], b: Sequence[float], c: Sequence[float]
 ) -> float:
+    """Returns 4 sqrt(3) area / (sum of squared edges): 1 for an equilateral triangle."""
     lengths = sum((p[i] - q[i]) ** 2 for p, q in ((a, b), (b, c), (c, a)) for i in range(3))
     return 2 * 3**0.5 * _squared(normal) ** 0.5 / max(lengths, 1e-30)
 
@@ -455,14 +442,6 @@ def collapse_sequence(
     return order, into
 
 
-def _follow(into: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Returns for each vertex the kept one that it ends on."""
-    target = np.where(kept, np.arange(len(into)), into)
-    while not kept[target].all():
-        target = target[target]
-    return target
-
-
 def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """Makes a joint regressor on the kept vertices that gives the joints of the full body, whatever
     its shape.
@@ -476,13 +455,14 @@ def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> n
     moved = moved[:, kept]
     template = np.asarray(body.template, np.float64)
     directions = np.asarray(body.shape_directions, np.float64)
-    # What a row of the regressor must reproduce: the template, every direction, and 1.
+    # what a row of the regressor must reproduce: the template, every direction, and 1.
     full = np.concatenate(
         [template, directions.reshape(len(template), -1), np.ones((len(template), 1))], axis=1
     )
     error = regressor @ full - moved @ full[kept]
     joints = regressor @ template
-    local = min(max(LOCAL, 3 * full.shape[1]), len(kept))
+    # vertices near a joint that share the correction: 200, or three per equation
+    local = min(max(200, 3 * full.shape[1]), len(kept))
     for j in range(len(moved)):
         near = np.argpartition(np.linalg.norm(template[kept] - joints[j], axis=1), local - 1)[
             :local
@@ -504,9 +484,8 @@ def _carry_uvs(
     nearest in the texture.
     """
     uvs, uv_faces = np.asarray(body.uvs), np.asarray(body.uv_faces)
-    pairs = np.unique(
-        faces.ravel().astype(np.int64) * len(uvs) + uv_faces.ravel()
-    )  # (vertex, texture vertex)
+    # (vertex, texture vertex)
+    pairs = np.unique(faces.ravel().astype(np.int64) * len(uvs) + uv_faces.ravel())
     start = np.searchsorted(pairs, np.arange(len(target) + 1) * len(uvs))
     corners, corner_uvs = faces[kept_faces].ravel(), uv_faces[kept_faces].ravel()
     ends = target[corners]
@@ -558,8 +537,12 @@ def decimate_with_kept(
             f"vertex_count {vertex_count}: body '{body.name}' can be reduced to {smallest} vertices"
             " at most"
         )
-    kept = np.flatnonzero(order < vertex_count)
-    target = _follow(into, order < vertex_count)
+    stays = order < vertex_count
+    kept = np.flatnonzero(stays)
+    # for each vertex the kept one that it ends on
+    target = np.where(stays, np.arange(total), into)
+    while not stays[target].all():
+        target = target[target]
     renumber = np.full(total, -1)
     renumber[kept] = np.arange(vertex_count)
     faces = np.asarray(body.faces)
@@ -570,9 +553,10 @@ def decimate_with_kept(
     else:
         uvs, uv_faces = _carry_uvs(body, faces, target, solid)
     dtype = body.template.dtype
-    rows = lambda array: from_host(
-        np.asarray(array)[kept]
-    )  # by numpy: no compilation for each size
+
+    def rows(array):
+        return from_host(np.asarray(array)[kept])  # by numpy: no compilation for each size
+
     coarse = replace(
         body,
         template=rows(body.template),

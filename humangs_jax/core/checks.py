@@ -248,12 +248,13 @@ def check_values(
     }
     if any(isinstance(array, Tracer) for array, _ in given.values()):
         return
-    on_device = {name: array for name, (array, _) in given.items() if not on_host(array)}
-    extremes = {
-        name: _extremes_on_host(array)
-        for name, (array, _) in given.items()
-        if name not in on_device
-    }
+    on_device, extremes = {}, {}
+    for name, (array, _) in given.items():
+        if on_host(array):
+            numbers = np.asarray(array)
+            extremes[name] = numbers.min(), numbers.max()
+        else:
+            on_device[name] = array
     if on_device:
         extremes |= zip(on_device, np.asarray(_extremes(tuple(on_device.values()))), strict=True)
     for name, (array, values) in given.items():
@@ -272,11 +273,6 @@ def require_concrete(owner: str, why: str, *trees: Any) -> None:
         raise TypeError(
             f"{owner} {why}: call it outside of jit, vmap and grad, which know shapes only"
         )
-
-
-def _extremes_on_host(array: Any) -> tuple[Any, Any]:
-    values = np.asarray(array)
-    return values.min(), values.max()
 
 
 @jax.jit

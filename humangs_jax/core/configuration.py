@@ -124,7 +124,7 @@ class ArgumentError(ValueError):
         return f"{name} {self.problem}"
 
 
-class UnknownPresetError(KeyError):
+class _UnknownPresetError(KeyError):
     """A `KeyError` whose text is a line, not its repr."""
 
     def __str__(self) -> str:
@@ -142,7 +142,7 @@ class Presets(dict[str, T]):
         self.hint = hint
 
     def __missing__(self, name: Any) -> T:
-        raise UnknownPresetError(
+        raise _UnknownPresetError(
             f"no preset {name!r}: expected one of {', '.join(self)}{self.hint}"
         )
 
@@ -205,7 +205,8 @@ def in_words(annotation: Any) -> str:
         if typing.get_origin(option) is Literal:
             words += map(repr, typing.get_args(option))
         else:
-            words.append(_named(option).replace("NoneType", "None"))
+            name = option.__name__ if isinstance(option, type) else str(option)
+            words.append(name.replace("NoneType", "None"))
     if len(words) == 1:
         return words[0]
     return f"one of {', '.join(words)}"
@@ -246,14 +247,11 @@ class Part:
 _MADE = "_made"
 
 
-PLACE = ("parent", "name")
-"""Fields of a `Part` that say where it is, and are no configuration."""
-
-
 @functools.cache
 def field_names(cls: Any) -> tuple[str, ...]:
     """Returns the names of the fields of a configuration."""
-    place = PLACE if issubclass(cls, Part) else ()
+    # the fields of a `Part` that say where it is are no configuration
+    place = ("parent", "name") if issubclass(cls, Part) else ()
     return tuple(field.name for field in dataclasses.fields(cls) if field.name not in place)
 
 
@@ -384,17 +382,13 @@ def _plain(value: Any, kind: bool = False) -> Any:
         named = {KIND: type(value).__name__} if kind else {}
 
         def plain(name):
-            return _plain(getattr(value, name), _holds_part(annotations[name]))
+            options = annotations[name], *typing.get_args(annotations[name])
+            return _plain(getattr(value, name), any(map(_is_part, options)))
 
         return named | {name: plain(name) for name in field_names(type(value))}
     if isinstance(value, tuple | list):
         return [_plain(item) for item in value]
     return value
-
-
-def _holds_part(annotation: Any) -> bool:
-    """Says whether a field holds a part, or a part or None."""
-    return any(_is_part(option) for option in (annotation, *typing.get_args(annotation)))
 
 
 def _is_part(annotation: Any) -> bool:
@@ -495,9 +489,3 @@ def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
         return cls(**fields)
     except ArithmeticError as error:  # sizes of 0
         raise ValueError(f"{path}: {cls.__name__}: {error}") from error
-
-
-def _named(annotation: Any) -> str:
-    if isinstance(annotation, type):
-        return annotation.__name__
-    return str(annotation)

@@ -33,7 +33,7 @@ def new_name(name: str) -> str | None:
     return None
 
 
-class MovedModules:
+class _MovedModules:
     """Finds modules by their old names: the same modules, imported once."""
 
     def __init__(self) -> None:
@@ -67,5 +67,5 @@ class MovedModules:
 
 def find_moved_modules() -> None:
     """Make the old names known to `import`."""
-    if not any(isinstance(finder, MovedModules) for finder in sys.meta_path):
-        sys.meta_path.insert(0, MovedModules())
+    if not any(isinstance(finder, _MovedModules) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _MovedModules())

@@ -23,10 +23,6 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any, TypeVar
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # malloc.h
-_KEPT = 1 << 30
-"""Bytes; blocks up to this size stay with the process once it has needed them."""
-
 
 def keep_freed_memory() -> bool:
     """Lets the process keep what it frees. Programs call it once, before the first large array; the
@@ -38,8 +34,10 @@ def keep_freed_memory() -> bool:
     if not sys.platform.startswith("linux"):
         return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    # one arena for all threads: the others hold 64 MiB at most
-    settings = ((_M_MMAP_THRESHOLD, _KEPT), (_M_TRIM_THRESHOLD, _KEPT), (_M_ARENA_MAX, 1))
+    # numbers of malloc.h: blocks of up to 1 GiB stay with the process once it has needed them, and
+    # there is one arena for all threads (the others would hold 64 MiB at most)
+    mmap_threshold, trim_threshold, arena_max, kept = -3, -1, -8, 1 << 30
+    settings = ((mmap_threshold, kept), (trim_threshold, kept), (arena_max, 1))
     return mallopt is not None and all([mallopt(*setting) for setting in settings])
 
 
@@ -179,13 +177,14 @@ def end_with_parent() -> None:
     queue stays open in each other.
     """
     parent = multiprocessing.parent_process()
-    if parent is not None:
-        threading.Thread(target=_wait, args=(parent.sentinel,), daemon=True).start()
+    if parent is None:
+        return
 
+    def wait() -> None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
 
-def _wait(sentinel: int) -> None:
-    connection.wait([sentinel])
-    os._exit(1)
+    threading.Thread(target=wait, daemon=True).start()
 
 
 # How XLA compiles: a program of this package takes seconds to a minute. JAX has the cache; here is

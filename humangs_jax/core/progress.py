@@ -21,13 +21,6 @@ import weakref
 from collections.abc import Generator, Hashable, Iterable, Iterator, Sequence
 from typing import Any
 
-SHOWN = {"Zs", "Cn", "Co"}
-"""Categories that Python escapes in `repr` but that do nothing to a terminal: wide spaces,
-characters newer than Python.
-"""
-JOINERS = "\u200c\u200d"
-"""Format characters that words of Persian and Indic languages need."""
-
 
 def printable(text: object, lines: bool = False) -> str:
     r"""Escapes every character that a terminal would act on as Python does (\x1b, \u202e, \n).
@@ -40,14 +33,16 @@ def printable(text: object, lines: bool = False) -> str:
     if text.isprintable():
         return text
     kept = "\n\t" if lines else ""
-    return "".join(c if c.isprintable() or c in kept or _harmless(c) else _escaped(c) for c in text)
+    return "".join(c if c in kept else _printable_character(c) for c in text)
 
 
-def _harmless(c: str) -> bool:
-    return c in JOINERS or unicodedata.category(c) in SHOWN
-
-
-def _escaped(c: str) -> str:
+def _printable_character(c: str) -> str:
+    """Escapes a character that a terminal would act on."""
+    # wide spaces and characters newer than Python, which `repr` escapes, too, are harmless; words
+    # of Persian and Indic languages need the two joiners
+    harmless = c in "\u200c\u200d" or unicodedata.category(c) in ("Zs", "Cn", "Co")
+    if c.isprintable() or harmless:
+        return c
     if "\udc80" <= c <= "\udcff":  # a byte of a file name, as os.fsdecode has it
         return f"\\x{ord(c) - 0xDC00:02x}"
     return c.encode("unicode_escape").decode("ascii")

@@ -248,8 +248,12 @@ def shape_fault(tree: Any) -> str | None:
     cls, sizes = type(tree), dict[str, int]()
     if cls not in _PYTREES:
         return None
-    fields = _annotated_axes(cls)
-    ranks = list(_batch_ranks(tree, fields))
+    fields, ranks = _annotated_axes(cls), []
+    # how many axes each array has more than its annotation: a batch has as many as most of them
+    for name, field in fields.items():
+        shape = getattr(getattr(tree, name), "shape", None)
+        if field.axes is not None and isinstance(shape, tuple):
+            ranks.append(len(shape) - len(field.axes))
     usual = max(ranks, key=ranks.count, default=0)  # the first of equally many
     batch_rank = 0
     if issubclass(cls, Batchable):
@@ -277,14 +281,6 @@ class _Field:
     """It may be None."""
 
 
-def _batch_ranks(tree: Any, fields: dict[str, _Field]) -> Iterator[int]:
-    """Counts for each array of a pytree how many axes it has more than its annotation."""
-    for name, field in fields.items():
-        shape = getattr(getattr(tree, name), "shape", None)
-        if field.axes is not None and isinstance(shape, tuple):
-            yield len(shape) - len(field.axes)
-
-
 def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, int]) -> str | None:
     """Says what is wrong with one array. sizes: of the axes that are known, to which those of this
     array are added.
@@ -298,7 +294,8 @@ def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, in
     if not isinstance(shape, tuple):
         if not axes and isinstance(value, int | float):
             return None  # a number is an array without axes
-        return f": expected an array of shape {_shown_shape(wanted)}, got {_shown_kind(value)}"
+        kind = "None" if value is None else f"{type(value).__name__}; jnp.asarray makes one"
+        return f": expected an array of shape {_shown_shape(wanted)}, got {kind}"
     # a leaf that a batch shares has no batch axes
     batch = batch_rank if len(shape) == batch_rank + len(axes) else 0
     fits = len(shape) == batch + len(axes)
@@ -311,7 +308,10 @@ def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, in
         and not jnp.issubdtype(value.dtype, jnp.inexact)
         and value.dtype != jax.dtypes.float0
     ):
-        return f": expected floating-point numbers, got {value.dtype}{_advice(value.dtype)}"
+        advice = "x.astype(float) makes them"
+        if value.dtype == np.uint8:
+            advice = "colors of 0 to 255 are divided by 255"
+        return f": expected floating-point numbers, got {value.dtype}; {advice}"
     sizes |= {
         axis: size for axis, size in zip(axes, shape[batch:], strict=True) if isinstance(axis, str)
     }
@@ -320,19 +320,6 @@ def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, in
 
 def _shown_shape(axes: Sequence[str | int]) -> str:
     return f"({', '.join(map(str, axes))}{',' * (len(axes) == 1)})"
-
-
-def _shown_kind(value: Any) -> str:
-    if value is None:
-        return "None"
-    return f"{type(value).__name__}; jnp.asarray makes one"
-
-
-def _advice(dtype: Any) -> str:
-    """Says what to do with integers."""
-    if dtype == np.uint8:
-        return "; colors of 0 to 255 are divided by 255"
-    return "; x.astype(float) makes them"
 
 
 def _size_fault(tree: Any) -> str | None:

@@ -33,10 +33,6 @@ numbers in float32.
 """
 
 
-RIGHT_ANGLE = np.pi / 2 + 1e-6
-"""Radians, with the rounding of float32."""
-
-
 @pytree_dataclass
 class Camera(Batchable):
     """A camera, or a batch of cameras of one image size and lens (leading axes on the arrays).
@@ -342,7 +338,8 @@ def orbit(
     azimuths = azimuths.astype(
         jnp.promote_types(azimuths.dtype, jnp.float32)
     )  # integers, too, are radians
-    if not isinstance(elevations, Tracer) and np.any(np.abs(elevations) > RIGHT_ANGLE):
+    right_angle = np.pi / 2 + 1e-6  # with the rounding of float32
+    if not isinstance(elevations, Tracer) and np.any(np.abs(elevations) > right_angle):
         raise ValueError(f"orbit: elevations {elevations}: expected radians between -pi/2 and pi/2")
     distance, elevations = (
         jnp.broadcast_to(jnp.asarray(x, azimuths.dtype), azimuths.shape)

@@ -28,10 +28,6 @@ COUNTS: dict[str, tuple[int, ...]] = {
     "orthographic": (),
 }
 """Numbers of coefficients, by lens."""
-SMALL_SQUARE = 1e-3
-"""Below this r^2, atan(r) / r is its Taylor series, cut after r^10: exact to the rounding of
-float64.
-"""
 RINGS = 16
 """Places along the way from the axis to a point, at each of which the image has to grow
 outwards.
@@ -73,7 +69,8 @@ def distorted(
 
 def _fisheye_scale(coefficients: Float[Array, " n"] | None, rr: Array) -> Array:
     """Returns t / r (1 + k1 t^2 + ...) from r^2, smooth on the axis."""
-    small = rr < SMALL_SQUARE
+    # near the axis atan(r) / r is its Taylor series, cut after r^10: exact to float64's rounding
+    small = rr < 1e-3
     near = jnp.where(small, rr, 0.0)
     series = 1 - near * (1 / 3 - near * (1 / 5 - near * (1 / 7 - near * (1 / 9 - near / 11))))
     r = jnp.sqrt(jnp.where(small, 1.0, rr))

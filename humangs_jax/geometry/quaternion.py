@@ -11,19 +11,6 @@ from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.numerics import safe_normalize
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-SMALL_ANGLE_SQUARED = 1e-4
-"""Below this the Taylor series of sin(t)/t and (1-cos t)/t^2, cut after t^4, are exact to float32
-rounding (t^6/5040 < 2e-16).
-"""
-
-SMALLEST_SQUARE = 1e-30
-"""Of a sine: below it the sine is the angle, and derivatives of its root would overflow in float32.
-"""
-
-OPPOSITE = 1e-12
-"""Unit vectors whose product is less than this above -1 count as opposite: their cross product is
-rounding.
-"""
 
 
 def normalize(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
@@ -52,7 +39,7 @@ def between(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, 
     """
     real = jnp.sum(jnp.square(a + b), axis=-1, keepdims=True) / 2  # 1 + a.b without cancellation
     across = jnp.cross(a, jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a), axis=-1)])
-    opposite = real < OPPOSITE
+    opposite = real < 1e-12  # their cross product is rounding
     imaginary = jnp.where(opposite, across, jnp.cross(a, b))
     return normalize(jnp.concatenate([jnp.where(opposite, 0.0, real), imaginary], axis=-1))
 
@@ -118,7 +105,8 @@ def sine_and_cosine_ratios(
     angle_squared: Float[Array, "*b"],
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """Returns sin(t)/t and (1 - cos t)/t^2 from t^2, smooth through 0."""
-    small = angle_squared < SMALL_ANGLE_SQUARED
+    # the Taylor series, cut after t^4, are exact to float32's rounding here (t^6/5040 < 2e-16)
+    small = angle_squared < 1e-4
     squared = jnp.where(small, 1.0, angle_squared)
     angle = jnp.sqrt(squared)
     sine = jnp.where(small, 1 - angle_squared / 6 + angle_squared**2 / 120, jnp.sin(angle) / angle)
@@ -159,7 +147,8 @@ def to_axis_angle(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
     """
     q = jnp.where(q[..., :1] < 0, -q, q)
     squared = jnp.sum(jnp.square(q[..., 1:]), axis=-1, keepdims=True)
-    turned = squared > SMALLEST_SQUARE
+    # below, the sine is the angle, and derivatives of its root would overflow in float32
+    turned = squared > 1e-30
     sine = jnp.sqrt(jnp.where(turned, squared, 1.0))
     return q[..., 1:] * jnp.where(turned, 2 * jnp.arctan2(sine, q[..., :1]) / sine, 2.0)
 
@@ -167,7 +156,7 @@ def to_axis_angle(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
 def interpolate(
     a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"], share: Float[Array, "*#b"]
 ) -> Float[Array, "*b 3"]:
-    """The rotation vector that many shares of the shortest way from a to b: spherical linear
+    """Returns the rotation vector at a share of the shortest way from a to b: spherical linear
     interpolation (Shoemake 1985, https://doi.org/10.1145/325165.325242).
     """
     start = from_axis_angle(a)
@@ -178,11 +167,6 @@ def interpolate(
 # Singular vectors: LAPACK decomposes small matrices one by one; this runs on planes of the whole
 # batch, on any backend. Working on the matrix itself, never on its Gram matrix, keeps small
 # singular values accurate (Demmel & Veselić 1992, https://doi.org/10.1137/0613074).
-
-SWEEPS = 6
-"""Cyclic Jacobi converges quadratically; 3x3 matrices reach float64 rounding after five sweeps
-(tests), float32 after four.
-"""
 
 
 def left_singular_vectors(
@@ -195,7 +179,8 @@ def left_singular_vectors(
     completed to a rotation.
     """
     columns = [m[..., :, i] for i in range(3)]
-    for _ in range(SWEEPS):
+    # cyclic Jacobi converges quadratically: 3x3 matrices reach float64's rounding after five sweeps
+    for _ in range(6):
         for p, q in ((0, 1), (0, 2), (1, 2)):
             columns[p], columns[q] = _orthogonalize(columns[p], columns[q])
     norms = jnp.stack([jnp.linalg.norm(c, axis=-1) for c in columns], axis=-1)

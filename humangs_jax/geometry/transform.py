@@ -46,12 +46,6 @@ def invert_rigid(transform: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
     )
 
 
-SERIES_BELOW = 0.25
-"""Squared angles below which (t - sin t) / t^3 is its Taylor series: the difference would
-cancel.
-"""
-
-
 def from_twist(twist: Float[Array, "*b 6"]) -> Float[Array, "*b 4 4"]:
     """Returns the rigid motion exp(twist) of SE(3), with exact derivatives at the zero twist.
 
@@ -61,7 +55,8 @@ def from_twist(twist: Float[Array, "*b 6"]) -> Float[Array, "*b 4 4"]:
     w, v = twist[..., :3], twist[..., 3:]
     squared = jnp.sum(w * w, axis=-1, keepdims=True)
     sine, cosine = quaternion.sine_and_cosine_ratios(squared)
-    small = squared < SERIES_BELOW
+    # for small angles (t - sin t) / t^3 is its Taylor series: the difference would cancel
+    small = squared < 0.25
     a = jnp.where(small, squared, 0.0)
     series = 1 / 6 - a * (1 / 120 - a * (1 / 5040 - a * (1 / 362880 - a / 39916800)))
     third = jnp.where(small, series, (1 - sine) / jnp.where(small, 1.0, squared))

@@ -95,12 +95,14 @@ Shape = tuple[int | str | None, ...]
 
 
 def _fits(array: np.ndarray, shape: Shape) -> bool:
+    """Says whether an array has this shape."""
     return array.ndim == len(shape) and all(
         not isinstance(b, int) or a == b for a, b in zip(array.shape, shape, strict=True)
     )
 
 
 def _in_words(shape: Shape) -> str:
+    """Shows a shape for an error line."""
     return str(tuple("any" if size is None else size for size in shape)).replace("'", "")
 
 
@@ -121,18 +123,13 @@ def check_array(
     if not array.size:
         return
     least, most = float(array.min()), float(array.max())  # NaN if any entry is
-    largest = float(
-        np.finfo(np.float32).max
-    )  # what becomes inf when it is cast is no number either
+    # what becomes infinite when it is cast to float32 is no number either
+    largest = float(np.finfo(np.float32).max)
     if not (max(low, -largest) <= least and most <= min(high, largest)):
         words = "finite numbers"
         if math.inf not in (-low, high) or low == 0:
             words = f"numbers in [{low:g}, {high:g}]"
         raise InvalidFileError(f"{name}: expected {words}, got {least:.9g} to {most:.9g}")
-
-
-SUM_TOLERANCE = 1e-2
-"""Of weights of sum 1: eight of them in half floats are off by less."""
 
 
 def check_row_sums(name: str, weights: np.ndarray) -> None:
@@ -141,7 +138,7 @@ def check_row_sums(name: str, weights: np.ndarray) -> None:
     if not sums.size:
         return
     worst = float(sums[np.abs(sums - 1).argmax()])
-    if abs(worst - 1) > SUM_TOLERANCE:
+    if abs(worst - 1) > 1e-2:  # eight weights in half floats are off by less
         raise InvalidFileError(f"{name}: expected rows with the sum 1, got {worst:.6g}")
 
 
@@ -293,8 +290,6 @@ LONGEST_HEADER = 512
 """Characters; that of a plain array takes some hundred, and longer ones can exhaust Python's
 parser.
 """
-PLAIN_KINDS = "biufcSU"
-"""Kinds of dtypes that are read: numbers and strings, no objects, no records."""
 
 
 def read_npz(
@@ -383,7 +378,8 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
     shape, columns_first, dtype = read_header(member)
     if dtype.hasobject:
         return None
-    if dtype.kind not in PLAIN_KINDS or (dtype.itemsize == 0 and math.prod(shape) > 1):
+    plain = dtype.kind in "biufcSU"  # numbers and strings, no objects, no records
+    if not plain or (dtype.itemsize == 0 and math.prod(shape) > 1):
         raise InvalidFileError(f"expected numbers or strings, got {dtype}")
     left = size - member.tell()
     if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != left:

@@ -31,8 +31,6 @@ MOVE_AWAY = "move it away, or choose another folder"
 """What can be done where a file that was not written here has the name of one that is to be
 written.
 """
-TOLD = 12
-"""Entries of a folder that are named before it is deleted; the others are counted."""
 _TEMPORARY = re.compile(
     r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?"
 )
@@ -48,10 +46,10 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
     Raises: OSError.
     """
-    write_bytes(path, encoded(text))
+    write_bytes(path, _encoded(text))
 
 
-def encoded(text: str) -> bytes:
+def _encoded(text: str) -> bytes:
     """Returns what `write_text` writes. Half surrogates that are no bytes of a name are escaped."""
     try:
         return text.encode("utf-8", "surrogateescape")
@@ -63,7 +61,7 @@ def write_texts(texts: Mapping[str | os.PathLike[str], str]) -> None:
     """Write files in UTF-8, all of them or none. Raises: OSError."""
     replace_files(
         {
-            path: functools.partial(Path.write_bytes, data=encoded(text))
+            path: functools.partial(Path.write_bytes, data=_encoded(text))
             for path, text in texts.items()
         }
     )
@@ -258,12 +256,15 @@ def contents(folder: str | os.PathLike[str]) -> str:
     """Returns what is in a folder, in a few words: "capture.json, images (60 files)"; empty if
     there is nothing.
     """
-    entries = _entries(folder)
-    told = [_told(Path(folder, entry)) for entry in entries[:TOLD]]
-    return ", ".join(told) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
+    entries, most = _entries(folder), 12
+    shown = ", ".join(_described(Path(folder, entry)) for entry in entries[:most])
+    if len(entries) > most:
+        return f"{shown} and {len(entries) - most} more"
+    return shown
 
 
-def _told(entry: Path) -> str:
+def _described(entry: Path) -> str:
+    """Names an entry of a folder; a folder with the number of its files."""
     if entry.is_symlink() or not entry.is_dir():
         return entry.name
     count = sum(len(files) for _, _, files in os.walk(entry))
@@ -307,9 +308,8 @@ def add_files(
         `folder`, if it cannot be written; whatever `write` raises.
     """
     folder = Path(folder)
-    inside = (
-        folder.is_dir()
-    )  # on the same disk, even if others hold the folder and what is beside it
+    # in it where it exists: then on the same disk, even if others hold what is beside it
+    inside = folder.is_dir()
     if inside:
         _sweep(folder.resolve())
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -398,7 +398,9 @@ def _lock_of(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def _locked(folder: Path, wait: bool, lock: Path | None = None) -> Generator[None]:
-    """lock: a file that is made for this and stands for the folder."""
+    """Holds the lock of a folder. wait: until another process gives it back; else that is an error.
+    lock: a file that is made for this and stands for the folder.
+    """
     try:
         import fcntl
     except ImportError:  # Windows
@@ -454,6 +456,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _tag() -> str:
+    """Returns what makes a temporary name unique."""
     return f"{MACHINE}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
 
 
@@ -476,6 +479,7 @@ def _sweep(parent: Path) -> None:
 
 
 def _abandoned(path: Path, machine: str, pid: int) -> bool:
+    """Says whether nobody writes a temporary file any more."""
     try:
         age = time.time() - path.stat().st_mtime
     except FileNotFoundError:
@@ -484,6 +488,7 @@ def _abandoned(path: Path, machine: str, pid: int) -> bool:
 
 
 def _runs(pid: int) -> bool:
+    """Says whether a process of this machine runs."""
     try:
         if os.name == "posix":  # elsewhere it would end the process
             os.kill(pid, 0)

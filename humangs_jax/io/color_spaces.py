@@ -55,43 +55,34 @@ def light_to_bt709(light: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*sh
     return np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
 
 
-PAPER_NITS = 203
-"""Candela per square metre that BT.2408 gives white paper in PQ and, as the level 0.75, in HLG."""
-PAPER_HLG = 0.265
-"""Light of the level 0.75 in HLG; 1 is the brightest that it holds."""
-
-
 def _pq_to_light(levels: np.ndarray) -> np.ndarray:
     """Applies the curve PQ, SMPTE ST 2084."""
     root = levels ** (1 / 78.84375)
     nits = 10_000 * (np.maximum(root - 0.8359375, 0) / (18.8515625 - 18.6875 * root)) ** (
         1 / 0.1593017578125
     )
-    return nits / PAPER_NITS
+    return nits / 203  # candela per square metre that BT.2408 gives white paper
 
 
 def _hlg_to_light(levels: np.ndarray) -> np.ndarray:
     """Applies the curve HLG, ARIB STD-B67, which gives the light before the camera."""
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     light = np.where(levels <= 0.5, levels**2 / 3, (np.exp((levels - c) / a) + b) / 12)
-    return light / PAPER_HLG
+    return light / 0.265  # white paper, the level 0.75 (BT.2408); 1 is the brightest
 
 
 def _power(exponent: float) -> Curve:
     return lambda levels: np.maximum(levels, 0) ** exponent
 
 
-KNEE = 0.75
-"""Light above which high dynamic range is compressed towards 1."""
-
-
 def _compressed(light: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Compresses light so that its largest channel is below 1; all three are scaled alike, so that
     the hue stays.
     """
+    knee = 0.75  # light up to here stays
     largest = np.maximum(light.max(axis=-1, keepdims=True), 1e-6)
-    beyond = np.maximum(largest - KNEE, 0) / (1 - KNEE)
-    return light * np.where(largest > KNEE, (1 - (1 - KNEE) * np.exp(-beyond)) / largest, 1)
+    beyond = np.maximum(largest - knee, 0) / (1 - knee)
+    return light * np.where(largest > knee, (1 - (1 - knee) * np.exp(-beyond)) / largest, 1)
 
 
 # Primaries
@@ -156,20 +147,13 @@ def of_code_points(primaries: int, transfer: int) -> Encoding | None:
     return Encoding((CURVES.get(transfer, srgb_to_light),), matrix, bright, camera=transfer == HLG)
 
 
-GAMMA_OF_SRGB = 1 / 2.2
-"""What PNG files say of sRGB."""
-GAMMA_SLACK = 0.06
-"""Difference that is still taken for sRGB: what programs write of videos (1 / 1.96), which are
-shown as sRGB, too.
-"""
-
-
 def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Encoding | None:
     """Returns the encoding of PNG's gAMA and cHRM (white, red, green, blue: x and y of each); None
     where that is sRGB's.
     """
     curve, matrix = srgb_to_light, np.eye(3)
-    if gamma is not None and 0.1 < gamma < 10 and abs(gamma - GAMMA_OF_SRGB) > GAMMA_SLACK:
+    # PNG files say 1 / 2.2 of sRGB; what programs write of videos (1 / 1.96) is shown as sRGB, too
+    if gamma is not None and 0.1 < gamma < 10 and abs(gamma - 1 / 2.2) > 0.06:
         curve = _power(1 / gamma)
     if chromaticities is not None and len(chromaticities) == 8:
         points = tuple(zip(chromaticities[::2], chromaticities[1::2], strict=True))
@@ -179,22 +163,17 @@ def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> E
             except (ZeroDivisionError, np.linalg.LinAlgError):
                 return None
     encoding = Encoding((curve,), matrix)
-    if not np.abs(matrix).max() < LARGEST_FACTOR or is_srgb(encoding):
+    # larger factors are of primaries that do not exist
+    if not np.abs(matrix).max() < 10 or is_srgb(encoding):
         return None
     return encoding
 
 
-LARGEST_FACTOR = 10
-"""Of a matrix between primaries that exist."""
-SAME = 0.5 / 255
-"""Colors that differ by less are the same: files whose profile is sRGB keep their values."""
-
-
 def is_srgb(encoding: Encoding) -> bool:
-    """Says whether the file's values are sRGB already."""
+    """Says whether the file's values are sRGB already, to less than half a level of 8 bits."""
     steps = np.linspace(0, 1, 9)
     grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
-    return bool(np.abs(in_srgb(grid, encoding) - grid).max() < SAME)
+    return bool(np.abs(in_srgb(grid, encoding) - grid).max() < 0.5 / 255)
 
 
 # To sRGB
@@ -221,12 +200,6 @@ def _encode(encoding: Encoding) -> Curve:
     return light_to_srgb
 
 
-STEPS = 1 << 18
-"""Of the table of the curve back to sRGB: the steepest part is off by 1/80 of a level of 8 bits."""
-BLOCK = 1 << 20
-"""Pixels that are converted together."""
-
-
 def pixels_in_srgb(
     levels: UInt[np.ndarray, "h w c"], most: int, encoding: Encoding
 ) -> Float[np.ndarray, "h w 3"]:
@@ -236,17 +209,18 @@ def pixels_in_srgb(
     height, width, channels = levels.shape
     curves = encoding.curves * (3 // len(encoding.curves))
     tables = [curve(np.arange(most + 1) / most).astype(np.float32) for curve in curves]
-    back = _encode(encoding)(np.arange(STEPS) / (STEPS - 1)).astype(np.float32)
-    found, rows = np.empty((height, width, 3), np.float32), max(1, BLOCK // width)
-    for top in range(
-        0, height, rows
-    ):  # a block after the other: a photo of 64 million pixels takes no gigabytes
+    # the curve back to sRGB in a table, whose steepest part is off by 1/80 of a level of 8 bits
+    last = (1 << 18) - 1
+    back = _encode(encoding)(np.arange(last + 1) / last).astype(np.float32)
+    found = np.empty((height, width, 3), np.float32)
+    rows = max(1, (1 << 20) // width)
+    # a block after the other: a photo of 64 million pixels takes no gigabytes
+    for top in range(0, height, rows):
         block = levels[top : top + rows]
         light = np.stack([tables[i][block[..., i % channels]] for i in range(3)], axis=-1)
         light = _light_in_srgb(light.reshape(-1, 3), encoding)
-        found[top : top + rows] = back[np.rint(light * (STEPS - 1)).astype(np.int32)].reshape(
-            -1, width, 3
-        )
+        converted = back[np.rint(light * last).astype(np.int32)]
+        found[top : top + rows] = converted.reshape(-1, width, 3)
     return found
 
 
@@ -263,16 +237,7 @@ def cube(encoding: Encoding, side: int = 49) -> str:
 # ICC profiles
 # --------------------------------------------------------------------------------------------------
 
-PROFILE_BYTES = 4 << 20
-"""Of a profile that is looked at; those of presses have up to 3 MB."""
-MOST_TAGS = 200
-CLASSES = (b"mntr", b"scnr", b"prtr", b"spac")
-"""Profiles of monitors, scanners, printers and color spaces: others (links, names, effects)
-describe no photo.
-"""
 SPACES = {b"RGB ": "colors", b"GRAY": "greys", b"CMYK": "CMYK"}
-WHITE_SLACK = 0.1
-"""By which the sum of the primaries of a profile differs from white."""
 
 
 class Profile(NamedTuple):
@@ -289,12 +254,15 @@ def read_profile(data: bytes) -> Profile:
 
     Raises: InvalidFileError for one that is damaged, or of no photo.
     """
-    # the header: size, signature, kind of device and of colors
-    if len(data) > PROFILE_BYTES:
-        raise InvalidFileError(f"it has {len(data):,} bytes, expected at most {PROFILE_BYTES:,}")
+    # the header: size (profiles of presses have up to 3 MB), signature, kind of device and colors
+    most = 4 << 20
+    if len(data) > most:
+        raise InvalidFileError(f"it has {len(data):,} bytes, expected at most {most:,}")
     if len(data) < 132 or data[36:40] != b"acsp" or int.from_bytes(data[:4], "big") > len(data):
         raise InvalidFileError("it is damaged or cut off")
-    if data[12:16] not in CLASSES or data[16:20] not in SPACES:
+    # monitors, scanners, printers and color spaces; links, names and effects describe no photo
+    classes = (b"mntr", b"scnr", b"prtr", b"spac")
+    if data[12:16] not in classes or data[16:20] not in SPACES:
         kind = f"{data[12:16]!r} of {data[16:20]!r}"
         raise InvalidFileError(
             f"it is of the kind {kind}, expected one of a photo in RGB, grey or CMYK"
@@ -307,7 +275,7 @@ def read_profile(data: bytes) -> Profile:
             return Profile(space, None)
         with np.errstate(all="ignore"):
             if space == "greys":
-                encoding = _of_grey(tags)
+                encoding = Encoding((_curve(tags[b"kTRC"]),), np.eye(3))
             else:
                 encoding = _of_colors(tags)
             steps = np.linspace(0, 1, 256)
@@ -335,20 +303,16 @@ def _within_white(curve: Curve) -> Curve:
 
 def _tags(data: bytes) -> dict[bytes, bytes]:
     count = int.from_bytes(data[128:132], "big")
-    if count > MOST_TAGS:
-        raise InvalidFileError(f"it has {count:,} parts, expected at most {MOST_TAGS}")
+    if count > 200:
+        raise InvalidFileError(f"it has {count:,} parts, expected at most 200")
     entries = [struct.unpack_from(">4sII", data, 132 + 12 * i) for i in range(count)]
     return {name: data[at : at + size] for name, at, size in entries}
-
-
-def _of_grey(tags: dict[bytes, bytes]) -> Encoding:
-    return Encoding((_curve(tags[b"kTRC"]),), np.eye(3))
 
 
 def _of_colors(tags: dict[bytes, bytes]) -> Encoding:
     columns = [struct.unpack_from(">3i", tags[name + b"XYZ"], 8) for name in (b"r", b"g", b"b")]
     to_xyz = np.asarray(columns, float).T / 65536
-    if np.abs(to_xyz.sum(axis=1) - _xyz(D50)).max() > WHITE_SLACK:
+    if np.abs(to_xyz.sum(axis=1) - _xyz(D50)).max() > 0.1:
         raise InvalidFileError("its primaries do not make white")
     return Encoding(
         tuple(_curve(tags[name + b"TRC"]) for name in (b"r", b"g", b"b")), FROM_XYZ @ to_xyz

@@ -9,8 +9,6 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt8
 
-KEPT_BYTES = 256 << 20
-"""Bytes of pixels that are kept: twenty photos of four megapixels."""
 WHOLE_LEVELS = np.float32(255)
 """Pixels that are whole multiples of 1 / 255 are kept as bytes, others as they are."""
 
@@ -51,9 +49,9 @@ _current: contextvars.ContextVar[Decoded | None] = contextvars.ContextVar("decod
 
 
 @contextlib.contextmanager
-def decoded_once(most: int = KEPT_BYTES) -> Generator[None]:
+def decoded_once(most: int = 256 << 20) -> Generator[None]:
     """Lets `io.images` decode each photo once within the block, as long as its pixels fit into
-    `most` bytes; then all are forgotten.
+    `most` bytes (by default those of twenty photos of four megapixels); then all are forgotten.
     """
     token = _current.set(Decoded(most))
     try:

@@ -17,18 +17,6 @@ from humangs_jax.io.reading import InvalidFileError
 HEIC_BRANDS = frozenset((b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1"))
 """Of the box `ftyp` that such a file begins with (ISO/IEC 23008-12)."""
 AVIF_BRANDS = frozenset((b"avif", b"avis"))
-PALETTE = 3
-"""PNG's color type of pixels that are numbers of a palette."""
-FRAME_TAGS = (0xA002, 0xA003)
-"""EXIF's width and height of the photo as it was taken."""
-SAME_SHAPE = 0.01
-"""Share by which a photo that was made smaller has other sides than EXIF says; and besides a pixel,
-by rounding.
-"""
-LARGEST_SIDE = 1 << 24
-"""Pixels; sensors have less."""
-MARKED_BRANDS = 16
-"""Brands of a box `ftyp` that are looked at; files have up to ten."""
 
 JPEG_START = b"\xff\xd8"
 JPEG_MARKER = re.compile(rb"\xff([^\x00\xff])")
@@ -95,7 +83,8 @@ def iso_kind(data: bytes) -> str | None:
     """
     if data[4:8] != b"ftyp":
         return None
-    end = min(int.from_bytes(data[:4], "big"), 16 + 4 * MARKED_BRANDS)
+    # files have up to ten further brands
+    end = min(int.from_bytes(data[:4], "big"), 16 + 4 * 16)
     further = {data[at : at + 4] for at in range(16, end, 4)}
     if data[8:12] in AVIF_BRANDS or (data[8:12] in (b"mif1", b"msf1") and further & AVIF_BRANDS):
         return "AVIF"
@@ -115,16 +104,13 @@ def png_chunks(data: bytes) -> dict[bytes, bytes]:
     return found
 
 
-NCLX = b"colrnclx"
-"""A box of HEIC and AVIF files before their code points of colors."""
-
-
 def nclx_colors(data: bytes) -> tuple[int, int] | None:
     """Returns code points (H.273) of the primaries and the curve of an AVIF, of the first box that
     has some.
     """
-    at = data.find(NCLX)
-    numbers = data[at + len(NCLX) : at + len(NCLX) + 4]
+    box = b"colrnclx"
+    at = data.find(box)
+    numbers = data[at + len(box) : at + len(box) + 4]
     if at < 0 or len(numbers) < 4:
         return None
     return int.from_bytes(numbers[:2], "big"), int.from_bytes(numbers[2:], "big")
@@ -147,7 +133,8 @@ def check_png_chunks(data: bytes) -> None:
         raise InvalidFileError(
             f"not a readable image: cut off, without the chunk {min(missing).decode()}"
         )
-    if data[25] == PALETTE and b"PLTE" not in names:
+    color_type = data[25]
+    if color_type == 3 and b"PLTE" not in names:
         raise InvalidFileError(
             "not a readable image: its pixels are numbers of a palette, and it has none"
         )
@@ -157,11 +144,12 @@ def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] 
     """Returns the width and height in EXIF's tags if a photo of this size was cut out of such a
     frame, else None.
     """
-    width, height = (tags.get(tag) for tag in FRAME_TAGS)
+    # EXIF's width and height of the photo as it was taken
+    width, height = tags.get(0xA002), tags.get(0xA003)
     if not isinstance(width, int) or not isinstance(height, int):
         return None
     frame, turned = (width, height), (height, width)
-    if not 0 < min(frame) <= max(frame) < LARGEST_SIDE or _same_shape(size, frame):
+    if not 0 < min(frame) <= max(frame) < 1 << 24 or _same_shape(size, frame):
         return None
     # 3 : 4 of a frame of 4 : 3 may be turned, or cut out of it at its full height
     cut_upright = size != turned and (size[0] == frame[0] or size[1] == frame[1])
@@ -171,6 +159,7 @@ def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] 
 
 
 def _same_shape(size: tuple[int, int], frame: tuple[int, int]) -> bool:
+    """Says whether two sizes have the same shape, but for a pixel and a hundredth, by rounding."""
     scale = np.hypot(*size) / np.hypot(*frame)
     off = np.abs(scale * np.asarray(frame) - size)
-    return bool((off <= 1 + SAME_SHAPE * np.asarray(size)).all())
+    return bool((off <= 1 + 0.01 * np.asarray(size)).all())

@@ -60,12 +60,8 @@ HEAD = 256
 GREY_SLACK = 16 / 255
 """Channels of a grey image that was compressed differ by less."""
 GREY_MASK = "grey from 0 (background) to 255 (person)"
-ORIENTATION_TAG = 0x0112
-"""Number of the orientation in EXIF."""
 EXIF_TAGS = 0x8769
 """Number of the table of EXIF tags in the first table."""
-FOCAL_LENGTH_35MM_TAG = 0xA405
-"""Number of the focal length on 35 mm film in EXIF."""
 DIAGONAL_35MM = 43.27
 """Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle
 along the diagonal.
@@ -93,10 +89,6 @@ DRAWN = "humangs_jax"
 """Value of the text `Software` in PNG files that show results, which are never photos."""
 MASK = "humangs_jax mask"
 """Value of the same text in masks."""
-MARK_HEAD = 1024
-"""Bytes of a PNG file in which the text stands: it is written before the pixels."""
-GREY_AND_ALPHA = 4
-"""The color type of two channels."""
 
 
 def read_image(
@@ -153,7 +145,9 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
         codes = to_uint8(colors).astype(np.uint32) @ np.asarray([1 << 16, 1 << 8, 1], np.uint32)
         count = np.count_nonzero(np.unique(codes))
         if count != 1 or codes.all():
-            black = " without black" if codes.all() else ""
+            black = ""
+            if codes.all():
+                black = " without black"
             raise InvalidFileError(
                 f"{count} colors{black}: which is the person? expected one on black, or {GREY_MASK}"
             )
@@ -170,9 +164,8 @@ def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
     """
     used = np.unique(labels)
     black = [label for label in used.tolist() if not palette[label].any()]
-    if (
-        0 in used
-    ):  # tools count the background as 0, people draw it black: where these differ nobody knows
+    # tools count the background as 0, people draw it black: where these differ nobody knows
+    if 0 in used:
         background = 0 if 0 in black else None
     elif not black and not palette[0].any():
         background = 0
@@ -184,7 +177,9 @@ def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
     colors = palette[used]
     if len(used) > 2 and colors.max() >= 128 and _is_grey(colors / 255):
         return palette[labels].mean(axis=-1, dtype=np.float32) / np.float32(255)
-    shown = ", ".join(map(str, others[:5])) + (", ..." if len(others) > 5 else "")
+    shown = ", ".join(map(str, others[:5]))
+    if len(others) > 5:
+        shown += ", ..."
     which = "0 is not black: which is the background"
     if background is not None:
         which = "which is the person"
@@ -211,7 +206,7 @@ def orientation(path: str | Path) -> int:
     Raises: as `open_image`.
     """
     with open_image(path) as (image, data):
-        flag = _exif(image, data).get(ORIENTATION_TAG, 1)
+        flag = _exif(image, data).get(0x0112, 1)
         return flag if flag in range(2, 9) else 1
 
 
@@ -224,7 +219,7 @@ def focal_length(path: str | Path) -> float | None:
     """
     with open_image(path) as (image, data):
         tags = _exif(image, data, EXIF_TAGS)
-        equivalent = tags.get(FOCAL_LENGTH_35MM_TAG)
+        equivalent = tags.get(0xA405)
         if (
             not isinstance(equivalent, int)
             or equivalent <= 0
@@ -314,7 +309,7 @@ def mark_of(path: str | Path) -> str | None:
     that cannot be read.
     """
     with contextlib.suppress(OSError, ValueError), open_file(path, "image_bytes") as file:
-        head = file.read(MARK_HEAD)
+        head = file.read(1024)  # the text stands before the pixels
         for mark in (DRAWN, MASK):
             text = f"{MARK_KEY}\0{mark}".encode()
             chunk = struct.pack(">I", len(text)) + b"tEXt" + text
@@ -516,10 +511,11 @@ def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray,
     """
     kept = kept_photos()
     with open_image(path) as (image, data):
-        key = b""
+        key, found = b"", None
         if kept is not None:
             key = content_key(data, as_stored)
-        if kept is not None and (found := kept.find(key)) is not None:
+            found = kept.find(key)
+        if found is not None:
             return found
         levels, most = _levels(image, data)
         colors = None
@@ -555,7 +551,7 @@ def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
     """
     if data[26:28] != b"\0\0" or data[28] > 1:
         raise InvalidFileError("not a readable image: a PNG header with unknown methods")
-    if data[25] == GREY_AND_ALPHA:
+    if PNG_COLOR_TYPES[data[25]] == "LA":
         both = _decoded(data, "RGBA")  # the four bytes of a pixel
         return both[..., 0::2] << 8 | both[..., 1::2]
     mode = PNG_COLOR_TYPES[data[25]]
@@ -581,27 +577,26 @@ def _colors_in_srgb(
     """Returns colors of a file that says how they are encoded; None where levels are in sRGB
     already.
     """
-    own = levels[..., : 1 if levels.shape[-1] < 3 else 3]
+    channels = 1 if levels.shape[-1] < 3 else 3
+    levels = levels[..., :channels]
     try:
         encoding = _encoding_in_header(image, data)
         profile = image.info.get("icc_profile")
         if encoding is None and profile:
             found = read_profile(profile)
-            if found.space not in PROFILE_OF_MODE.get(image.mode, ("colors", "greys")):
+            # photos in colors have profiles of colors; those in grey may have either
+            own = {"CMYK": ("CMYK",), "RGB": ("colors",), "RGBA": ("colors",), "P": ("colors",)}
+            if found.space not in own.get(image.mode, ("colors", "greys")):
                 raise InvalidFileError(f"it is one of {found.space}, and the photo is none")
             if found.encoding is None:
-                return _by_tables(image, profile, own, most)
+                return _by_tables(image, profile, levels, most)
             encoding = found.encoding
     except InvalidFileError as error:
         _tell(f"{path}: its color profile is not used: {error}")
         return None
     if encoding is None or is_srgb(encoding):
         return None
-    return pixels_in_srgb(own, most, encoding)
-
-
-PROFILE_OF_MODE = {"CMYK": ("CMYK",), "RGB": ("colors",), "RGBA": ("colors",), "P": ("colors",)}
-"""Profiles that fit Pillow's mode of a photo; greys may have one of colors, too."""
+    return pixels_in_srgb(levels, most, encoding)
 
 
 def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:

@@ -76,7 +76,7 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
     return content, binary
 
 
-def view_of(view: dict[str, Any], binary: bytes) -> bytes:
+def _view_of(view: dict[str, Any], binary: bytes) -> bytes:
     """Returns the bytes that a view of the buffer names. Raises: InvalidFileError."""
     start, size, step = view.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 1)
     if not all(type(n) is int and n >= 0 for n in (start, size)) or start + size > len(binary):
@@ -104,7 +104,7 @@ def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndar
     if "sparse" in accessor or "bufferView" not in accessor:
         raise InvalidFileError("numbers that are mostly zeros (sparse): expected all of them")
     view = content["bufferViews"][_index(accessor["bufferView"])]
-    data, columns = view_of(view, binary), COLUMNS[accessor["type"]]
+    data, columns = _view_of(view, binary), COLUMNS[accessor["type"]]
     dtype = np.dtype(COMPONENTS[accessor["componentType"]])
     count, start, width = count_of(accessor), accessor.get("byteOffset", 0), _width(accessor)
     step = view.get("byteStride", width)
@@ -128,6 +128,7 @@ def _index(value: Any) -> int:
 
 
 def _width(accessor: dict[str, Any]) -> int:
+    """Counts the bytes of an element."""
     return COLUMNS[accessor["type"]] * np.dtype(COMPONENTS[accessor["componentType"]]).itemsize
 
 
@@ -208,9 +209,8 @@ class GlbWriter:
             "bufferViews": self.views,
             "buffers": [{"byteLength": len(self.data)}],
         }
-        text = json.dumps(
-            document, separators=(",", ":"), allow_nan=False
-        ).encode()  # JSON has no NaN
+        # JSON has no NaN
+        text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
         chunks = struct.pack("<II", len(text), JSON_CHUNK) + text
         chunks += struct.pack("<II", len(self.data), BINARY_CHUNK) + bytes(self.data)
@@ -273,41 +273,35 @@ def read_obj(path: str | Path) -> list[Any]:
         return parts
 
 
-CHEAPER = 50
-"""To look at a vertex, than a corner of a triangle."""
-_MATERIAL = re.compile(r"^usemtl\b(.*)$", re.MULTILINE)
-_FACES = re.compile(r"^f[ \t].*\n?", re.MULTILINE)
-_GROUPS = re.compile(r"^(?:o|g|s)\b.*\n?", re.MULTILINE)
-
-
 def _grouped(text: str) -> str:
     """Brings the faces of each material together, at the end of an OBJ file. Without materials, and
     for objects and groups, all faces are one: trimesh takes longer than linear for each change,
     even for one that it finds in a comment.
     """
     text = text.replace("\r\n", "\n").replace("\\\n", "")
-    begin, *changes = _MATERIAL.split(text)
+    faces = re.compile(r"^f[ \t].*\n?", re.MULTILINE)
+    begin, *changes = re.split(r"^usemtl\b(.*)$", text, flags=re.MULTILINE)
     of_material: dict[str, list[str]] = {}
     for name, chunk in zip(changes[::2], changes[1::2], strict=True):
-        of_material.setdefault(name.strip(), []).extend(_FACES.findall(chunk))
+        of_material.setdefault(name.strip(), []).extend(faces.findall(chunk))
     check_limit("parts", len(of_material), "materials")
-    looks = (
-        len(of_material) * text.count("\nv ") // CHEAPER
-    )  # trimesh looks at all vertices for each
-    check_limit("corners", looks, f"times {CHEAPER} vertices of {len(of_material)} materials")
-    others = _GROUPS.sub(
-        "", "\n".join([begin, *(_FACES.sub("", chunk) for chunk in changes[1::2])])
-    )
+    # trimesh looks at all vertices for each material; a look is cheaper than a corner of a triangle
+    cheaper = 50
+    looks = len(of_material) * text.count("\nv ") // cheaper
+    check_limit("corners", looks, f"times {cheaper} vertices of {len(of_material)} materials")
+    # all other lines, without those of objects and groups
+    others = "\n".join([begin, *(faces.sub("", chunk) for chunk in changes[1::2])])
+    others = re.sub(r"^(?:o|g|s)\b.*\n?", "", others, flags=re.MULTILINE)
 
     def plain(lines):
         return lines.replace("usemtl", "-")
 
-    faces = [
+    drawn = [
         f"usemtl {plain(name)}\n{plain(''.join(lines))}"
         for name, lines in of_material.items()
         if lines
     ]
-    return "\n".join([plain(others), *faces])
+    return "\n".join([plain(others), *drawn])
 
 
 class _Folder:
@@ -359,17 +353,15 @@ class _Folder:
             logger.warning("%s: %s", path, FileError("", f"left out {shown(key)}{more}", why))
 
 
-_OPTIONS = re.compile(r"^(?:-\w+(?:\s+(?:on|off|[lrgbmz]|[-+.\deE]+))+\s+)+")
-"""Of a texture in an `.mtl`: `-s 1 1 1`, `-clamp on`, before its name."""
-
-
 def _names_in(text: str) -> list[str]:
     """Returns what the name of a material or texture may be, the likeliest first.
 
     It may be meant as it stands, with spaces; without quotes, options of textures and separators of
     Windows; and, of several materials in one line, the first may be meant.
     """
-    plain = _OPTIONS.sub("", text).strip().strip("\"'").replace("\\ ", " ")
+    # before the name of a texture stand options, as `-s 1 1 1` or `-clamp on`
+    options = r"^(?:-\w+(?:\s+(?:on|off|[lrgbmz]|[-+.\deE]+))+\s+)+"
+    plain = re.sub(options, "", text).strip().strip("\"'").replace("\\ ", " ")
     first = re.match(r"\S+\.mtl\b", plain, re.IGNORECASE)
     names = [text, plain, plain.replace("\\", "/"), *([first[0]] if first else [])]
     return list(dict.fromkeys(names))

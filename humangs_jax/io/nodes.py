@@ -112,11 +112,11 @@ def _local(
 
 
 def _sampled(track: Track, times: Float[np.ndarray, " m"], path: str) -> Float[np.ndarray, "m c"]:
+    """Returns the values of a track at some times."""
     keys, values, stepped = track
     if stepped or len(keys) == 1:
-        times = times + 0.01 * (
-            times[1] - times[0] if len(times) > 1 else 1.0
-        )  # keys are rounded to float32
+        step = times[1] - times[0] if len(times) > 1 else 1.0
+        times = times + 0.01 * step  # keys are rounded to float32
         return values[np.clip(np.searchsorted(keys, times, side="right") - 1, 0, len(keys) - 1)]
     times = np.clip(times, keys[0], keys[-1])
     if path == "rotation":
@@ -125,5 +125,6 @@ def _sampled(track: Track, times: Float[np.ndarray, " m"], path: str) -> Float[n
 
 
 def check_finite(values: Float[np.ndarray, "..."], what: str) -> None:
+    """Checks that all numbers are finite. Raises: InvalidFileError."""
     if not np.isfinite(values).all():
         raise InvalidFileError(f"{what}: expected finite numbers")

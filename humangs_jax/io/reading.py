@@ -33,12 +33,8 @@ logger = logging.getLogger(__name__)
 ENVIRONMENT = "HUMANGS_LIMITS"
 """Variable with other limits, such as "pixels=2e8,photos_outside=1"."""
 OUTSIDE = f"{ENVIRONMENT}=photos_outside=1 allows it"
-CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
-"""No path in a file needs these."""
 LONGEST_LINE = 1000
 """Most characters of an error, in which values of files are quoted."""
-LONGEST_REASON = 300
-"""Most characters of what a library says in it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,6 +128,7 @@ def set_limits(new: Limits | None) -> None:
 
 
 def _limits_of_text(text: str) -> Limits:
+    """Reads "pixels=2e8,photos_outside=1"."""
     changes: dict[str, Any] = {}
     kinds: dict[str, Any] = {
         field.name: type(field.default) for field in dataclasses.fields(Limits)
@@ -165,7 +162,7 @@ class _Shown(reprlib.Repr):
         """Shows large integers by their size: Python refuses to write integers of thousands of
         digits.
         """
-        if abs(x) < SHOWN_INTEGER:
+        if abs(x) < 10**40:
             return repr(x)
         return f"an integer of {x.bit_length():,} bits"
 
@@ -183,17 +180,15 @@ def shown(value: object) -> str:
 
     The parts of a list may be the list itself, or a million others.
     """
-    return _SHOWN.repr(value)
+    return _Shown().repr(value)
 
 
 LARGEST_AMOUNT = 10**15
 """Larger amounts are not written out in errors."""
-SHOWN_INTEGER = 10**40
-"""Larger integers are not written out in errors."""
-_SHOWN = _Shown()
 
 
 def _one_line(text: object, longest: int = LONGEST_LINE) -> str:
+    """Makes one printable line of a text."""
     line = printable(" ".join(str(text).split()))
     if len(line) <= longest:
         return line
@@ -255,6 +250,7 @@ def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Gen
 
 
 def _why(kind: str, error: Exception) -> str:
+    """Says why a reader failed, in a line."""
     if isinstance(error, MemoryError):
         reason = "out of memory"
     elif isinstance(error, RecursionError):
@@ -269,7 +265,7 @@ def _why(kind: str, error: Exception) -> str:
             reason = f"{type(error).__name__} {error}"
         else:
             reason = str(error)
-    return f"not a readable {kind}: {_one_line(reason, LONGEST_REASON)}"
+    return f"not a readable {kind}: {_one_line(reason, longest=300)}"
 
 
 def check_limit(name: str, amount: float | int, unit: str) -> None:
@@ -380,7 +376,8 @@ def inside(folder: str | os.PathLike[str], name: str, photo: bool = False) -> Pa
     Raises: InvalidFileError.
     """
     path = Path(folder) / name
-    if CONTROL.search(str(name)):  # it would be several lines, or none, in a report
+    # control characters would make several lines, or none, of a path in a report
+    if re.search(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]", str(name)):
         raise InvalidFileError(f"{name!r} is no path: expected one without control characters")
     if photo and limits().photos_outside:
         return path

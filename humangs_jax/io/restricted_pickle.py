@@ -469,6 +469,7 @@ NAMES: dict[tuple[str, str], Any] = {
 
 
 def _instance(cls: Any) -> StandIn:
+    """Makes a stand-in of one of the classes of this module."""
     if not isinstance(cls, type) or not issubclass(cls, StandIn):
         raise InvalidFileError("refused to make an object of another class")
     return cls()

@@ -39,16 +39,12 @@ from humangs_jax.io.reading import (
 from humangs_jax.io.restricted_pickle import NAMES, Call, PlainDict, RestrictedUnpickler, objects
 
 ZIP_START = b"PK\x03\x04"
-MAGIC_NUMBER = 0x1950A86A20F9469CFC6C
-"""First value of a stream of torch."""
-STREAM_START = b"\x8a\x0a" + MAGIC_NUMBER.to_bytes(10, "little") + b"."
-"""Its pickle, behind the two bytes of the protocol."""
+STREAM_START = b"\x8a\x0a" + 0x1950A86A20F9469CFC6C.to_bytes(10, "little") + b"."
+"""How a stream of torch begins, behind two bytes of the protocol: the pickle of a magic number."""
 OLD_STREAM = (
     "written before torch 1.6: torch.save(torch.load(FILE), FILE) of a newer torch writes it again"
 )
 """What to do about a file that is such a stream."""
-COMPRESSED = (b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda", b"\x1f\x8b")
-"""How zlib's streams and gzip's begin, in which joblib writes."""
 LARGEST_RATIO = 16
 """Members may unpack to this many times the size of the file: torch does not compress at all."""
 LARGEST_SHARE = 4
@@ -71,11 +67,6 @@ STORAGE_DTYPES = {
     "ByteStorage": np.dtype("u1"),
     "BoolStorage": np.dtype("?"),
 }
-STATE_DICTS = ("model", "state_dict")
-"""Keys under which training scripts keep the state dict; what lies under others (the optimizer's
-state) is never read.
-"""
-
 
 # The pickle
 # --------------------------------------------------------------------------------------------------
@@ -135,6 +126,7 @@ class _Tensor(NamedTuple):
 
 
 def _counts(x: Any) -> bool:
+    """Says whether this is a tuple of counts."""
     return type(x) is tuple and all(type(n) is int and n >= 0 for n in x)
 
 
@@ -263,7 +255,9 @@ def read_torch_file(
     pickle asks for more than tensors, or if a storage is missing or too short, naming it.
     """
     with reading(path, "torch file"), open_file(path) as file:
-        return _tensors_of(file, os.path.getsize(path), wanted, STATE_DICTS)
+        # keys of training scripts; what lies under others (the optimizer's state) is never read
+        keys = ("model", "state_dict")
+        return _tensors_of(file, os.path.getsize(path), wanted, keys)
 
 
 def tensors_in(data: bytes, keys: tuple[str, ...]) -> Tensors:
@@ -314,9 +308,8 @@ def _state_dict(
             )
     arrays: Tensors = {}
     left, held = LARGEST_SHARE * size, None
-    for key in sorted(
-        chosen, key=lambda key: chosen[key].storage.name
-    ):  # each storage is read once, and one at a time is held
+    # each storage is read once, and one at a time is held
+    for key in sorted(chosen, key=lambda key: chosen[key].storage.name):
         tensor = chosen[key]
         if tensor.storage.name != held:
             held = tensor.storage.name
@@ -382,7 +375,8 @@ def read_values(path: str | os.PathLike[str]) -> Any:
     """
     with reading(path, "pickle"):
         data = read_bytes(path, "array_bytes")
-        if data[:2] in COMPRESSED:
+        # joblib writes zlib's streams, and gzip's
+        if data[:2] in (b"\x78\x01", b"\x78\x5e", b"\x78\x9c", b"\x78\xda", b"\x1f\x8b"):
             most = max(limits().plain_bytes, limits().ratio * len(data))
             unpacked = zlib.decompressobj(47).decompress(data, most + 1)
             check_unpacked(len(data), len(unpacked))

@@ -29,8 +29,6 @@ RELUCTANCE = 2e-4
 """Squared error that the largest move has to win, so that windows without detail stay."""
 SMOOTHNESS = 0.04
 """Standard deviation of the weights that make moves smooth, as a share of the person's height."""
-FURTHER = 1.5
-"""Smooth moves may be this many times as large as `REACH`: the mean of their neighbours is less."""
 LARGEST = 128
 """Pixels: larger people are reduced by whole factors before the comparison, for speed."""
 NOBODY = 1e-3
@@ -41,7 +39,7 @@ CLEAR = 1.0
 """Decibels above what is needed, from which on one photo is enough."""
 
 
-def aligned_errors(
+def _aligned_errors(
     image: Float[np.ndarray, "h w c"], photo: Float[np.ndarray, "h w c"], reach: int, window: int
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 2"]]:
     """Returns the squared errors e (means over the channels), and the moves d in pixels (y, x), see
@@ -93,13 +91,13 @@ def aligned_psnr(
         counted = np.ones(photo.shape[:2], bool)
     else:
         counted = np.asarray(counted)
-    height = person_height(photo[..., 3])
+    height = _person_height(photo[..., 3])
     factor = max(1, -(-height // LARGEST))
     image, photo = (reduced(np.clip(each, 0, 1), factor) for each in (image, photo))
     weights = reduced(counted[..., None].astype(np.float32), factor)[..., 0]
     if not weights.any():
         return LARGEST_PSNR
-    errors, _ = aligned_errors(image, photo, *sizes(height / factor))
+    errors, _ = _aligned_errors(image, photo, *sizes(height / factor))
     mean = float(np.sum(errors * weights) / np.sum(weights))
     return min(LARGEST_PSNR, -10 * float(np.log10(max(mean, 1e-30))))
 
@@ -112,11 +110,12 @@ def smooth_moves(
 
     Means of the moves around each pixel, weighted by distance and by what is the person's.
     """
-    height = person_height(photo[..., 3])
+    height = _person_height(photo[..., 3])
     factor = max(1, -(-height // LARGEST))
     small, small_photo = (reduced(np.clip(each, 0, 1), factor) for each in (image, photo))
     reach, window = sizes(height / factor)
-    _, moves = aligned_errors(small, small_photo, round(FURTHER * reach), window)
+    # single moves may be larger than `REACH`: the means of neighbours are smaller
+    _, moves = _aligned_errors(small, small_photo, round(1.5 * reach), window)
     person = np.maximum(small[..., 3], small_photo[..., 3]) + NOBODY
     spread = SMOOTHNESS * height / factor
     total = gaussian_filter(person, spread)
@@ -133,7 +132,7 @@ def misplaced(image: Float[np.ndarray, "h w 4"], photo: Float[np.ndarray, "h w 4
     if not person.any():
         return 0.0
     lengths = np.linalg.norm(smooth_moves(image, photo), axis=-1)
-    return float(lengths[person].mean()) / person_height(photo[..., 3])
+    return float(lengths[person].mean()) / _person_height(photo[..., 3])
 
 
 def moved_photo(
@@ -151,7 +150,7 @@ def _sampled(
     return map_coordinates(image, places, order=1, mode="nearest")
 
 
-def person_height(mask: Float[np.ndarray, "h w"]) -> int:
+def _person_height(mask: Float[np.ndarray, "h w"]) -> int:
     """Counts the rows from the first to the last of a mask; those of the image if it is empty."""
     rows = np.flatnonzero((mask > 0.5).any(axis=1))
     if len(rows):

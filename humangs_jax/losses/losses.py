@@ -26,7 +26,7 @@ from humangs_jax.network.parts import Drawn
 
 T = TypeVar("T")
 FAR_SURFACE = 0.1
-"""Metres."""
+"""Largest distance between surfaces that counts, metres."""
 
 
 @configuration
@@ -128,6 +128,7 @@ def loss_terms(
 
 
 def _needed(thing: T | None, name: str, title: str) -> T:
+    """Returns what a term needs. Raises: ValueError if it is missing."""
     if thing is None:
         raise ValueError(f"loss.{name} is not 0, but there is no {title}")
     return thing
@@ -302,7 +303,7 @@ class SsimWindow:
 
     @property
     def covariance_factor(self) -> float:
-        """Of the windowed mean of products."""
+        """Factor of the windowed mean of products."""
         if self.sample:
             return self.size**2 / (self.size**2 - 1)
         return 1.0
@@ -314,6 +315,7 @@ TORCHMETRICS = SsimWindow(sample=False)
 
 
 def _windowed(x: Float[Array, "*b h w c"], window: SsimWindow) -> Float[Array, "*b y x c"]:
+    """Sums shifted slices along rows, then along columns."""
     height, width = x.shape[-3] - window.size + 1, x.shape[-2] - window.size + 1
     rows = jnp.asarray(
         sum(float(weight) * x[..., i : i + height, :, :] for i, weight in enumerate(window.weights))

@@ -135,7 +135,7 @@ SQUEEZENET: Slices = (
     (Fire("12", 512, 64, 512),),
 )
 BACKBONES: dict[str, Slices] = {"vgg": VGG16, "alex": ALEXNET, "squeeze": SQUEEZENET}
-"""Of LPIPS."""
+"""Backbones of LPIPS by their names."""
 
 
 def convolutions(slices: Slices) -> Iterator[Conv]:
@@ -274,10 +274,6 @@ def _larger(x: Float[Array, "*b"], y: Float[Array, "*b"]) -> Float[Array, "*b"]:
     return jnp.where((y > x) | jnp.isnan(y), y, x)
 
 
-SHIFT = (-0.030, -0.088, -0.188)
-"""Mean of colors in [-1, 1] that the backbones of LPIPS expect."""
-SCALE = (0.458, 0.448, 0.450)
-"""Scale of these colors."""
 EPSILON = 1e-10
 """Added to the length of a feature vector."""
 
@@ -296,11 +292,13 @@ class Lpips:
 
 def _scaled(image: Array) -> Array:
     """Scales colors in [0, 1] as the backbones of LPIPS expect them."""
-    shift, scale = (jnp.asarray(x, image.dtype) for x in (SHIFT, SCALE))
+    shift = jnp.asarray((-0.030, -0.088, -0.188), image.dtype)
+    scale = jnp.asarray((0.458, 0.448, 0.450), image.dtype)
     return (2 * image - 1 - shift) / scale
 
 
 def _unit(x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:
+    """Divides the features of each pixel by their length."""
     return x / (safe_sqrt(jnp.sum(jnp.square(x), axis=-1, keepdims=True)) + EPSILON)
 
 
@@ -338,12 +336,14 @@ def lpips_to(weights: Lpips, predicted: Float[Array, "h w 3"], target: LpipsMaps
 
 
 def _distances(weights: Lpips, predicted: LpipsMaps, target: LpipsMaps) -> Float[Array, " _"]:
+    """Returns the distance at each depth."""
     distances = []
     for head, (x, own), (y, _) in zip(weights.heads, predicted, target, strict=True):
         different = jnp.sum(head * jnp.square(x - y), axis=-1)
-        distances.append(
-            jnp.mean(different) if own is None else jnp.sum(different) / (own[0] * own[1])
-        )
+        if own is None:
+            distances.append(jnp.mean(different))
+        else:
+            distances.append(jnp.sum(different) / (own[0] * own[1]))
     return jnp.stack(distances)
 
 
@@ -388,7 +388,6 @@ def vgg16_loss(
     )
 
 
-MEAN_COLOR = (123.68, 116.779, 103.939)
 DIVISORS = (1.0, 2.6, 4.8, 3.7, 5.6, 0.15)
 """Divisors of the errors of the pixels and of the five depths."""
 
@@ -415,7 +414,7 @@ def perceptual_errors(
     """
     target = jax.lax.stop_gradient(target)
     images = [255 * image for image in at_least_float32((predicted, target))]
-    mean = jnp.asarray(MEAN_COLOR, images[0].dtype)
+    mean = jnp.asarray((123.68, 116.779, 103.939), images[0].dtype)
     maps = [[x for x, _ in feature_maps(vgg.weights, VGG19, image - mean)] for image in images]
     pairs = zip(
         *([image, *features] for image, features in zip(images, maps, strict=True)), strict=True

@@ -41,10 +41,6 @@ them.
 """
 UNSUPPORTED = "target_pose_tokenizer.1.weight"
 """Marks a variant of the network (canonical target maps) that does not exist here."""
-COUNTER = "num_batches_tracked"
-"""A counter that torch keeps in every batch norm; it is ignored."""
-PIXEL_CHANNELS = 9
-"""rgb and ray, beside the pose features."""
 
 StateDict = dict[str, np.ndarray]
 
@@ -128,7 +124,7 @@ FIELDS = {
 }
 
 
-def release_name(path: str) -> tuple[str, Layout]:
+def _release_name(path: str) -> tuple[str, Layout]:
     """Returns what the release calls one of our variables ("params/encoder/..."), and how it lies
     there.
 
@@ -153,10 +149,11 @@ def to_release(variables: Variables) -> StateDict:
     """
     state = {}
     for path, value in flatten_variables(variables).items():
-        key, layout = release_name(path)
+        key, layout = _release_name(path)
         state[key] = layout.to_release(np.asarray(value))
-        if key.endswith("running_var"):
-            state[f"{key.removesuffix('running_var')}{COUNTER}"] = np.zeros((), np.int64)
+        if key.endswith("running_var"):  # torch keeps a counter in every batch norm
+            counter = f"{key.removesuffix('running_var')}num_batches_tracked"
+            state[counter] = np.zeros((), np.int64)
     return state
 
 
@@ -206,7 +203,7 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
     width = statistics.mode(
         [token_width, *shape("transformer_input_layernorm.weight", 1), *shape("norm.weight", 1)]
     )
-    per_pixel = PIXEL_CHANNELS + 3 * channels
+    per_pixel = 9 + 3 * channels  # rgb and ray, then the neural texture
     patch = max(1, round((patch_numbers / per_pixel) ** 0.5))
     if patch * patch * per_pixel != patch_numbers:
         raise ValueError(
@@ -248,6 +245,7 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
 
 
 def _shape(state: StateDict, key: str, axes: int) -> tuple[int, ...]:
+    """Returns the shape of a tensor. Raises: ValueError for another number of axes."""
     if key not in state:
         raise ValueError(f"tensor {key!r} is missing")
     if state[key].ndim != axes or 0 in state[key].shape:
@@ -256,6 +254,7 @@ def _shape(state: StateDict, key: str, axes: int) -> tuple[int, ...]:
 
 
 def _count_layers(state: StateDict) -> int:
+    """Counts the blocks of the transformer. Raises: ValueError if one is missing."""
     indices = {key.split(".")[1] for key in state if key.startswith("transformer_blocks.")}
     for index in range(len(indices)):
         if str(index) not in indices:
@@ -333,7 +332,7 @@ def _load_checkpoint(path: str | os.PathLike[str], head_width: int | None) -> Co
         raise ValueError(f"{path}: {error}") from error
     tensors = {}
     for ours in flatten_variables(expected_variables(config)):
-        key, layout = release_name(ours)
+        key, layout = _release_name(ours)
         tensors[ours] = layout.from_release(state[key])
     return Converted(
         variables_from_tensors(tensors, config, str(path)), config, state[SKINNING_WEIGHTS], skipped

@@ -35,11 +35,11 @@ from humangs_jax.network.upsampler import Upsampler, UpsamplerConfig
 from humangs_jax.rendering.mesh.rasterizer import BACKGROUND
 
 TEXTURE_STD = 0.1
+"""Standard deviation of the neural texture before training."""
 NOWHERE = 3.0
 """Numbers of the pixels of slots without a patch: as positions they lie outside of the neural
 texture, whose gradient they then cost nothing.
 """
-PLANES = ((0, 1), (0, 2), (1, 2))
 
 
 @configuration
@@ -58,8 +58,8 @@ def sample_triplane(
     """Returns the features of canonical positions (normalised units): those of plane xy, then
     xz, then yz.
     """
+    # indices from the middle have a third of the rounding of (positions + 1) * middle
     middle = (texture.shape[1] - 1) / 2
-    # from the middle: a third of the rounding of (positions + 1) * middle
     indices = positions * middle
     # Nearly half of the pixels of photos show the background, and all of them read the last texel
     # of each plane. Its gradient is one sum here: an accelerator's additions to one place would
@@ -68,7 +68,7 @@ def sample_triplane(
     background = jnp.all(positions == BACKGROUND, axis=-1, keepdims=True)
     if apart:
         indices = jnp.where(background, OUTSIDE - middle, indices)
-    planes = zip(texture, map(list, PLANES), strict=True)
+    planes = zip(texture, ([0, 1], [0, 2], [1, 2]), strict=True)
     read = jnp.concatenate(
         [sample_bilinear(plane, indices[..., axes], middle) for plane, axes in planes], axis=-1
     )
@@ -96,7 +96,7 @@ def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
     return Packing(indices, jnp.minimum(jnp.sum(foreground), capacity))
 
 
-def unpack_tokens(
+def _unpack_tokens(
     tokens: Float[Array, "l d"], packing: Packing, patches: int
 ) -> Float[Array, "p d"]:
     """Puts tokens back at their patches, zeros elsewhere."""
@@ -170,7 +170,7 @@ class PatchTransformer(Encoder):
         Raises: ValueError if images and cameras differ in size, or are not made of whole patches.
         """
         # every patch of every view
-        see = photo_pixels
+        see = _photo_pixels
         if self.geometry == "rays_and_positions":
             see = encoder_pixels
         patches = patchify(see(inputs, ctx), self.patch_size)
@@ -211,7 +211,7 @@ class PatchTransformer(Encoder):
         if self.upsampler is None or self.upsampler.features == "final":
             depths = depths[-1:]
         if packing is not None:
-            depths = [unpack_tokens(x, packing, views * height * width) for x in depths]
+            depths = [_unpack_tokens(x, packing, views * height * width) for x in depths]
         maps = [x.reshape(views, height, width, features) for x in depths]
         if self.upsampler is None:
             return Encoding(maps[0], global_token, dropped, packing, self.patch_size)
@@ -244,7 +244,7 @@ def encoder_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "
     return jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
 
 
-def photo_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
+def _photo_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
     """Returns what an encoder without cameras and poses sees of every pixel: rgb, then its place
     (x, y) in [-1, 1] and waves of it where rays would be, and zeros for the canonical position.
     """

@@ -155,8 +155,8 @@ def convolve_neighborhoods(
     bias: Float[Array, " d"],
     dtype: Any = None,
 ) -> Float[Array, "n d"]:
-    """Returns the sum above for all n positions, or for means of several: the products in `dtype`,
-    the result in that of the coverages.
+    """Applies the kernel to the neighbourhoods of n positions, or to means of several: the products
+    in `dtype`, the result in that of the coverages.
     """
     x, kernel = promote_dtype(neighborhoods, kernel, dtype=dtype)
     products = jnp.matmul(
@@ -185,12 +185,6 @@ def _convolve_on_cpu(
     return _convolve(x, kernel)
 
 
-def _forward(
-    x: Float[Array, "v h w c"], kernel: Float[Array, "k l c d"]
-) -> tuple[Float[Array, "v h w d"], tuple[Float[Array, "v h w c"], Float[Array, "k l c d"]]]:
-    return _convolve(x, kernel), (x, kernel)
-
-
 def _backward(
     residuals: tuple[Float[Array, "v h w c"], Float[Array, "k l c d"]],
     cotangent: Float[Array, "v h w d"],
@@ -206,7 +200,7 @@ def _backward(
     return x_gradient, jnp.transpose(kernel_gradient, (1, 2, 0, 3))
 
 
-_convolve_on_cpu.defvjp(_forward, _backward)
+_convolve_on_cpu.defvjp(lambda x, kernel: (_convolve(x, kernel), (x, kernel)), _backward)
 
 
 class Convolution(nn.Module):

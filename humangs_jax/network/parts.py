@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     Variables: TypeAlias = dict[str, Parameters]
 else:
     Parameters = Variables = Mapping
-TARGET_HEIGHT = 1.8
-"""Height of every canonical body in normalised units."""
 
 
 @pytree_dataclass
@@ -95,7 +93,7 @@ class HumanGSInputs:
 def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
     """Returns s, metres per normalised unit: the canonical body's height over 1.8."""
     y = canonical_vertices[:, 1]
-    return (jnp.max(y) - jnp.min(y)) / TARGET_HEIGHT
+    return (jnp.max(y) - jnp.min(y)) / 1.8
 
 
 class ForwardContext(NamedTuple):

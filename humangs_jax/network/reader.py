@@ -48,14 +48,10 @@ DEPTH_TOLERANCE = 0.05
 """A vertex counts as seen when it lies less than this behind the rasterized surface (normalised
 units).
 """
-COUNT_EPSILON = 1e-8
-"""Added to the number of pooled views, as published: no view at all gives zeros."""
 UNSEEN_COLOR = 0.5
 """Photo color of a vertex that no view sees."""
 WEIGHT_EPSILON = 1e-6
 """Views count by how much the surface faces them; a point with less than this in all is unseen."""
-SQUARED_DISTANCE_EPSILON = 1e-6
-"""Least squared distance between a camera and a point."""
 
 
 @part
@@ -110,7 +106,7 @@ class PixelAlignedReader(Reader):
         read = sample_neighborhoods
         if self.output_width is None:
             read = sample_bilinear
-        counts = jnp.sum(weights, axis=0) + COUNT_EPSILON
+        counts = jnp.sum(weights, axis=0) + 1e-8  # as published: no view at all gives zeros
 
         def mean(sums):
             return jnp.einsum("n...,n->n...", sums, 1 / counts, precision=transform.EXACT)
@@ -284,7 +280,7 @@ def sample_shells(
         )
         visible = framed & ((surface < 0) | (depths < surface + DEPTH_TOLERANCE))
         towards = camera.center - points
-        distance = jnp.sqrt(jnp.maximum(jnp.sum(towards**2, axis=-1), SQUARED_DISTANCE_EPSILON))
+        distance = jnp.sqrt(jnp.maximum(jnp.sum(towards**2, axis=-1), 1e-6))
         facing = jnp.sum(towards * jnp.repeat(normals, len(distances), axis=0), axis=-1) / distance
         weight = jnp.where(visible, jnp.maximum(facing, 0), 0)
         return read[:, :3], read[:, 3], weight, framed

@@ -27,7 +27,6 @@ EVALUATION = "evaluation.md"
 
 TokenSelection = Literal["all", "foreground"]
 AttentionKernel = Literal["xla", "cudnn", "chunked"]
-ComputeType = Literal["float32", "bfloat16", "float16"]
 
 
 @configuration
@@ -52,14 +51,14 @@ class Runtime:
     """Slots for foreground tokens over all views, 0: room for all patches. `reconstruct` and
     `stack_captures` fit it to the photos; in training it is for the largest number of photos, see
     `training.forward.token_share`."""
-    dtype: ComputeType = knob(
+    dtype: Literal["float32", "bfloat16", "float16"] = knob(
         "float32",
         cost="bfloat16: 1e-2 of relative error; float16: 1e-3, not for training",
         gain="time on accelerators; none on CPUs",
         measured="stability.md",
     )
-    """Of the encoder's products; parameters, norms, softmax statistics and the decoder stay float32
-    at least.
+    """Type of the encoder's products; parameters, norms, softmax statistics and the decoder stay
+    float32 at least.
     """
     attention: Literal["auto"] | AttentionKernel = knob(
         "auto",
@@ -67,7 +66,7 @@ class Runtime:
         gain="chunked: a third of the time on CPUs, memory linear in tokens",
         measured=MEASURED,
     )
-    """See `network.transformer`."""
+    """Implementation of the attention, see `network.transformer`."""
     scan: bool = knob(
         False,
         cost="a copy of the blocks' parameters",
@@ -155,18 +154,18 @@ class Conventions:
     tokens: TokenSelection = "all"
     """Patches that became tokens."""
     pixels: Literal["all", "person"] = "all"
-    """Of "person": where there are masks, only their pixels count. No photo then sees the body
-    where it covers the background, and Gaussians of vertices that lie off the person in all photos
-    are dropped."""
+    """Pixels that count. For "person" only those of the masks do, where there are masks. No photo
+    then sees the body where it covers the background, and Gaussians of vertices that lie off the
+    person in all photos are dropped."""
     position_map: Literal["plain", "gouraud"] = "plain"
-    """Its shading."""
+    """Shading of the position maps."""
     ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
-    """The release divides camera centres by s, and the ray origins taken from them once more, so
-    that the moments of its rays ("twice_normalized") fit no camera."""
+    """Unit of the rays' origins. The release divides camera centres by s, and the ray origins taken
+    from them once more, so that the moments of its rays ("twice_normalized") fit no camera."""
     pool: Literal["visible", "all"] = "visible"
-    """Average over the views that see a vertex (paper) or over all (release)."""
+    """Views that are averaged for a vertex: those that see it (paper) or all (release)."""
     pixel_grid: PixelGrid = "half_pixel"
-    """See `network.maps`."""
+    """How pixels become positions on feature maps, see `network.maps`."""
     skinning: Literal["affine", "rotation"] = "affine"
     """How the Gaussians are posed."""
     rendering: Literal["exact", "inria"] = "exact"

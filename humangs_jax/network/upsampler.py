@@ -25,16 +25,14 @@ MOMENTUM = 0.9
 by one part in v * h * w.
 """
 KAIMING = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
-KAIMING_TRANSPOSED = nn.initializers.variance_scaling(2.0, "fan_in", "normal")
-"""torch counts the fan-out of a transposed convolution over its input channels."""
 
 
 @configuration
 class UpsamplerConfig:
-    """See the module."""
+    """Sizes of the upsampler."""
 
     hidden: Annotated[int, Range(2, 16_384)] = 256
-    """Width."""
+    """H, the hidden width."""
     features: Literal["intermediate", "final"] = "intermediate"
     """All four depths are aggregated ("intermediate"), or the last is upsampled alone ("final", an
     ablation).
@@ -59,7 +57,9 @@ class UpConvolution(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v 2*h 2*w features"]:
         views, height, width, channels = x.shape
-        kernel = self.param("kernel", KAIMING_TRANSPOSED, (4, 4, channels, self.features))
+        # torch counts the fan-out of a transposed convolution over its input channels
+        init = nn.initializers.variance_scaling(2.0, "fan_in", "normal")
+        kernel = self.param("kernel", init, (4, 4, channels, self.features))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         x, kernel, bias = promote_dtype(x, kernel, bias, dtype=self.dtype)
         order = jnp.asarray([3, 1, 2, 0])  # phase, then tap

@@ -30,7 +30,6 @@ from humangs_jax.network.parts import (
 from humangs_jax.network.reader import on_the_person
 from humangs_jax.rendering.gaussians import Gaussians
 
-FREQUENCIES = (1, 2, 4, 8, 16, 32)
 INIT_STD = 0.02
 LAST_STD = 0.001
 INITIAL_OPACITY = -1.0
@@ -50,8 +49,6 @@ OBLIQUE = (0.36, 0.48, 0.8)
 
 Where normals are opposite to it, frames turn quickly between vertices.
 """
-INITIAL_SHELL = 4.0
-"""Logit of the nearest shell, of 0 elsewhere: Gaussians start near the surface."""
 
 
 @part
@@ -63,7 +60,7 @@ class VertexDecoder(Decoder):
     """
 
     hidden: Width = 256
-    """Width."""
+    """Width of the hidden layers."""
     tight: Annotated[int, Range(0, 256)] = 1
     """Gaussians per vertex whose offsets a loss keeps small; K = tight + free."""
     free: Annotated[int, Range(0, 256)] = knob(
@@ -95,7 +92,7 @@ class VertexDecoder(Decoder):
 
     @property
     def gaussians_per_vertex(self) -> int:
-        """K."""
+        """K, the Gaussians of a vertex."""
         return self.tight + self.free
 
     @nn.compact
@@ -143,6 +140,7 @@ class VertexDecoder(Decoder):
         )
 
     def _heads(self, x: Float[Array, "n c"], shells: int) -> "RawGaussians":
+        """Runs the MLP: a trunk, then a head for each kind of output. shells: their number."""
         k = self.gaussians_per_vertex
 
         def hidden_layer(x, name):
@@ -169,7 +167,8 @@ class VertexDecoder(Decoder):
         if self.skinning_joints is not None:
             joints = head(x, "skinning", [0.0] * self.skinning_joints, nn.initializers.zeros)
         if shells:
-            chosen = head(x, "shells", [INITIAL_SHELL] + [0.0] * (shells - 1), small)
+            # the nearest shell has the larger logit: Gaussians start near the surface
+            chosen = head(x, "shells", [4.0] + [0.0] * (shells - 1), small)
         geometry = head(x, "geometry", [0.0] * 3 + list(quaternion.IDENTITY) + scales, small)
         return RawGaussians(
             geometry, head(x, "appearance", [0.0] * 3 + [INITIAL_OPACITY], small), joints, chosen
@@ -208,7 +207,7 @@ class VertexGaussians:
 
 def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
     """Returns x, then sin(f pi x), cos(f pi x) for f = 1, 2, 4, 8, 16, 32."""
-    waves = [wave(f * np.pi * x) for f in FREQUENCIES for wave in (jnp.sin, jnp.cos)]
+    waves = [wave(f * np.pi * x) for f in (1, 2, 4, 8, 16, 32) for wave in (jnp.sin, jnp.cos)]
     return jnp.concatenate([x, *waves], axis=-1)
 
 

@@ -23,16 +23,6 @@ from humangs_jax.rendering.tiling import TileGrid, count_pairs, footprints_by
 
 logger = logging.getLogger(__name__)
 
-PAIRS_PER_GAUSSIAN = 12
-"""Pairs for each Gaussian in the buffers of traced calls. A person of 50,000 Gaussians needs 6
-tiles per Gaussian at 512 x 512 and 15 at 1024 x 1024, where its 16,384 tiles add another 5 each.
-"""
-PAIRS_PER_TILE = 16
-"""Pairs for each tile in these buffers."""
-
-STEPS_PER_OCTAVE = 4
-"""Sizes that `round_up` knows per power of two."""
-
 
 class BufferOverflowError(ValueError):
     """A view needs larger buffers than its configuration has."""
@@ -43,7 +33,7 @@ def round_up(size: int, smallest: int = 64) -> int:
     and at most a fifth is spare.
     """
     size = max(size, smallest)
-    unit = 1 << max(0, (size - 1).bit_length() - STEPS_PER_OCTAVE.bit_length())
+    unit = 1 << max(0, (size - 1).bit_length() - 3)
     return -(-size // unit) * unit
 
 
@@ -53,8 +43,10 @@ def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
 
     g: Gaussians. width, height, tile_size: pixels.
     """
+    # a person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024 x 1024,
+    # where its 16,384 tiles add another 5 each
     tiles = TileGrid(width, height, tile_size).tiles
-    return max(1, min(g * tiles, PAIRS_PER_GAUSSIAN * g + PAIRS_PER_TILE * tiles))
+    return max(1, min(g * tiles, 12 * g + 16 * tiles))
 
 
 def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
@@ -146,6 +138,7 @@ def warn_of_overflow(overflow: Int[Array, "*v"], config: SplatConfig) -> None:
 
 
 def _warn(missing: Array | np.ndarray, max_pairs: int | None, max_rows: int | None) -> None:
+    """Logs how many pairs did not fit."""
     if missing > 0:
         logger.warning(
             "%d (splat, tile) pairs of a view did not fit and were not drawn: max_pairs = %s,"
@@ -159,10 +152,8 @@ def _warn(missing: Array | np.ndarray, max_pairs: int | None, max_rows: int | No
 def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[int]:
     """Counts the most rows and the most pairs that any of the views needs."""
     gaussians, cameras = at_least_float32((gaussians, cameras))
-    config = dataclasses.replace(
-        config, max_pairs=None, max_rows=None
-    )  # not read here: one program for all
-    # one program for images of every size, and for every number of cameras
+    # one program for all buffers, images of every size, and every number of cameras
+    config = dataclasses.replace(config, max_pairs=None, max_rows=None)
     size = np.asarray([cameras.width, cameras.height], np.int32)
     sizeless = replace(cameras, width=1, height=1)
     each = [

@@ -286,10 +286,6 @@ _product = functools.partial(jnp.matmul, precision=EXACT)
 # carries -T, which keeps the final T. Compile with `core.processes.compiler_options`: sharing small
 # kernels out over threads costs more than it gains, and the barriers have to be kept.
 
-LINK = 2
-"""Splats of a chunk whose chain one kernel of the backward pass runs. Its outputs for splat j redo
-the chain from the last stored link on; storing T after every splat costs more than that."""
-
 
 class _Chain(NamedTuple):
     """What a block carries from one chunk of its lists to the next."""
@@ -439,7 +435,9 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
                 # the chain of T front to back, with the decisions of the forward pass
                 weights, slopes = [], []
                 for j in range(k):
-                    if j > 0 and j % LINK == 0:
+                    # a kernel runs the chain of two splats: what it computes for splat j redoes the
+                    # chain from the last stored T on; storing T after every splat costs more
+                    if j > 0 and j % 2 == 0:
                         transmittance, seen = lax.optimization_barrier((transmittance, seen))
                     alpha = _visible_alpha(raw[:, j], config)
                     after = transmittance * (1 - alpha)
@@ -509,10 +507,6 @@ STEP_BYTES = 64 << 20
 STEP_CHUNKS = 2048
 """Largest B: the product over earlier chunks costs 2 B / k flops per pair, half of the triangular
 one at this B.
-"""
-_LOG_ZERO = -1e3
-"""Stands for log 0 where 1 - alpha_max rounds to 0: its exp is 0, and its product with 0 is 0 and
-not NaN.
 """
 
 
@@ -707,7 +701,8 @@ def _slice(chunks: Chunks, i: Array | int, step: int) -> Chunks:
 def _fading(raw: Array, config: SplatConfig) -> tuple[Array, Array]:
     """Returns alpha and log(1 - alpha), which is finite."""
     alpha = _visible_alpha(raw, config)
-    return alpha, jnp.maximum(jnp.log1p(-alpha), _LOG_ZERO)
+    # -1000 stands for log 0 where 1 - alpha_max rounds to 0: its exp is 0, 0 times it is no NaN
+    return alpha, jnp.maximum(jnp.log1p(-alpha), -1e3)
 
 
 def _sums_before(

@@ -22,9 +22,6 @@ from humangs_jax.geometry.quaternion import left_singular_vectors
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.rendering.splat_config import EPS2D, MIP_EPS2D
 
-THINNEST = 1e-5
-"""Metres, a thousandth of a pixel; where a low-pass is taken away, no scale gets smaller."""
-
 
 @pytree_dataclass
 class Gaussians(Batchable):
@@ -78,7 +75,8 @@ def widened(
     if pixel_footprint is None:
         return scales
     added = sign * (EPS2D - MIP_EPS2D) * jnp.square(pixel_footprint)
-    return jnp.sqrt(jnp.maximum(jnp.square(scales) + added[:, None], THINNEST**2))
+    # no scale gets smaller than 10 micrometres, a thousandth of a pixel
+    return jnp.sqrt(jnp.maximum(jnp.square(scales) + added[:, None], 1e-5**2))
 
 
 def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:
@@ -247,15 +245,13 @@ def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
 # the color
 #
 #     max(colors + sum_k Y_k(d) harmonics_k, 0),     colors = 1/2 + Y_00 f_dc in files of 3DGS.
-#  Y_k: by degree l, then by order m from -l to l, normalised over the sphere, with the sign (-1)^m
+#
+# Y_k: by degree l, then by order m from -l to l, normalised over the sphere, with the sign (-1)^m
 # of Condon and Shortley, as in https://github.com/graphdeco-inria/diff-gaussian-rasterization (Y_1
 # = -c y, Y_2 = c z, Y_3 = -c x).
 
 COUNTS = (0, 3, 8, 15)
 """Number of functions of degrees 1 to l, by l."""
-_C1 = math.sqrt(3 / (4 * math.pi))
-_C2 = [math.sqrt(n / (16 * math.pi)) for n in (60, 5, 15)]
-_C3 = [math.sqrt(n / (64 * math.pi)) for n in (70, 1680, 42, 28, 420)]
 POINTS = 32
 """Directions from which functions are found again: more than functions, spread evenly."""
 
@@ -277,10 +273,11 @@ def basis(
     """Returns Y_1 to Y_count of unit vectors, given as planes. Raises: as `check_count`."""
     check_count(count)
     xx, yy, zz = x * x, y * y, z * z
-    first = [-_C1 * y, _C1 * z, -_C1 * x]
-    a, b, c = _C2
+    a = math.sqrt(3 / (4 * math.pi))
+    first = [-a * y, a * z, -a * x]
+    a, b, c = (math.sqrt(n / (16 * math.pi)) for n in (60, 5, 15))
     second = [a * x * y, -a * y * z, b * (2 * zz - xx - yy), -a * x * z, c * (xx - yy)]
-    a, b, c, d, e = _C3
+    a, b, c, d, e = (math.sqrt(n / (64 * math.pi)) for n in (70, 1680, 42, 28, 420))
     ring = 4 * zz - xx - yy
     third = [
         -a * y * (3 * xx - yy),

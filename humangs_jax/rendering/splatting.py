@@ -245,10 +245,12 @@ def _render(
     config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
     features = features_of(features, len(gaussians.opacities))
-    if shifts is None:
-        more = (features,)
-    else:
-        more = (features, _shifts_of(shifts, gaussians))
+    more = (features,)
+    if shifts is not None:
+        more = (features, shifts)
+        expected = (len(gaussians.opacities), 2)
+        if shifts.shape != expected:
+            raise ValueError(f"shifts: expected shape {expected}, got {shifts.shape}")
     # under a transformation values are unknown: buffers come from the configuration
     leaves = jax.tree.leaves((gaussians, cameras, background, more))
     if any(isinstance(leaf, Tracer) for leaf in leaves):
@@ -273,6 +275,7 @@ def _render(
 
 @functools.cache
 def _jitted(draw: Callable[..., Rendering]) -> Callable[..., Rendering]:
+    """Compiles `draw` or `draw_views`, for eager calls."""
     return jax.jit(draw, static_argnums=3, compiler_options=compiler_options())
 
 
@@ -329,15 +332,8 @@ def features_of(features: Float[Array, "g n"] | None, count: int) -> Float[Array
     return at_least_float32(features)
 
 
-def _shifts_of(shifts: Float[Array, "g 2"], gaussians: Gaussians) -> Float[Array, "g 2"]:
-    """Raises: ValueError for those of another number of Gaussians."""
-    expected = (len(gaussians.opacities), 2)
-    if shifts.shape != expected:
-        raise ValueError(f"shifts: expected shape {expected}, got {shifts.shape}")
-    return shifts
-
-
 def _color(background: object, dtype: np.dtype) -> Array:
+    """Returns a background as three numbers. Raises: ValueError for what is no color."""
     if background is None:
         return from_host(np.ones(3), dtype)
     if isinstance(background, str):

@@ -175,7 +175,7 @@ def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
     """
     if counts.shape[0] == 0:
         return Expansion(jnp.zeros(capacity, jnp.int32), counts, jnp.zeros((), jnp.int32))
-    end = materialized(cumsum(counts))
+    end = _materialized(cumsum(counts))
     first = end - counts
     return Expansion(owners(first, capacity), first, end[-1])
 
@@ -191,7 +191,7 @@ def owners(
     2^24 items, see `cumsum`.)
     """
     marks = jnp.zeros(size, jnp.int32).at[jnp.maximum(first - start, 0)].add(1, mode="drop")
-    return materialized(cumsum(marks) - 1)
+    return _materialized(cumsum(marks) - 1)
 
 
 def take(
@@ -201,11 +201,11 @@ def take(
     negative ones.
     """
     return (
-        materialized(table).at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        _materialized(table).at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
     )
 
 
-def materialized(array: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
+def _materialized(array: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
     """Stores numbers before they are used.
 
     XLA's CPU backend would evaluate the expression behind a table anew for each number that a
@@ -215,7 +215,7 @@ def materialized(array: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
     return lax.optimization_barrier(array)
 
 
-def bits_for(count: int) -> int:
+def _bits_for(count: int) -> int:
     """Counts the bits that hold the numbers 0 .. count - 1 (at least one)."""
     return max(1, (count - 1).bit_length())
 
@@ -238,7 +238,7 @@ def sort_into_tiles(
     One sort of one uint32 where the tile number and the item number fit it together (sorting a key
     with a payload costs several times as much); otherwise a sort by two keys.
     """
-    bits = bits_for(item_count)
+    bits = _bits_for(item_count)
     if (tile_count + 1) << bits <= 1 << 32:
         key = tiles.astype(jnp.uint32) << bits | items.astype(jnp.uint32)
         sorted_items = (sort_keys(key) & ((1 << bits) - 1)).astype(jnp.int32)
@@ -254,7 +254,7 @@ def blocks_by_length(counts: Int[Array, " t"], block: int) -> TileBlocks:
     the key, by number.
     """
     t = counts.shape[0]
-    bits = bits_for(t)
+    bits = _bits_for(t)
     longest = (1 << (32 - bits)) - 1
     key = (longest - jnp.minimum(counts.astype(jnp.uint32), longest)) << bits | jnp.arange(
         t, dtype=jnp.uint32
@@ -279,16 +279,6 @@ def tiles_to_image(tiles: Float[Array, "t c p"], grid: TileGrid) -> Float[Array,
 SLACK = 2e-3
 """Pixels by which footprints are widened, against rounding of positions (a float32 at 1000 pixels
 has 6e-5).
-"""
-
-REACH_SLACK = (1.0001, 1e-5)
-"""The squared reach is multiplied by the first and raised by the second, against rounding of alpha
-at its threshold.
-"""
-
-INRIA_MIN_DISCRIMINANT = 0.1
-"""Pixels^4; INRIA's rasterizer raises the squared half difference of a splat's two variances to at
-least this.
 """
 
 
@@ -434,7 +424,7 @@ def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
     g = depths.shape[0]
     if depths.dtype != jnp.float32:
         return jnp.argsort(depths, stable=True).astype(jnp.int32)
-    bits = bits_for(g)
+    bits = _bits_for(g)
     digit = 32 - bits
     value, position = lax.bitcast_convert_type(depths, jnp.uint32), jnp.arange(g, dtype=jnp.uint32)
     order = position.astype(jnp.int32)
@@ -461,13 +451,13 @@ def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Foot
     """Returns ellipses of the visible splats, a little widened against rounding; the others get
     reach 0.
     """
-    factor, more = REACH_SLACK
-    reach = jnp.where(projected.visible & (reach > 0), reach * factor + more, 0.0)
+    # a little more, against rounding of alpha at its threshold
+    reach = jnp.where(projected.visible & (reach > 0), reach * 1.0001 + 1e-5, 0.0)
     p = lax.stop_gradient(projected)
     return Footprints(p.x, p.y, p.xx, p.xy, p.yy, p.determinant, reach)
 
 
-def square_footprints(
+def _square_footprints(
     projected: ProjectedGaussians, reach: Float[Array, " g"], radius_sigma: float
 ) -> Squares:
     """Returns squares of `radius_sigma` times the larger standard deviation, rounded up to pixels,
@@ -475,9 +465,8 @@ def square_footprints(
     """
     p = lax.stop_gradient(projected)
     middle = 0.5 * (p.xx + p.yy)
-    largest = middle + jnp.sqrt(
-        jnp.maximum(middle * middle - p.determinant, INRIA_MIN_DISCRIMINANT)
-    )
+    # INRIA's rasterizer raises the squared half difference of the two variances to at least 0.1
+    largest = middle + jnp.sqrt(jnp.maximum(middle * middle - p.determinant, 0.1))
     radius = jnp.where(p.visible & (reach > 0), jnp.ceil(radius_sigma * jnp.sqrt(largest)), 0.0)
     return Squares(p.x, p.y, radius)
 
@@ -492,7 +481,7 @@ def footprints_by(
     if config.radius_sigma is None:
         return footprints(projected, reach)
     if config.square:
-        return square_footprints(projected, reach, config.radius_sigma)
+        return _square_footprints(projected, reach, config.radius_sigma)
     return footprints(projected, jnp.minimum(reach, config.radius_sigma**2))
 
 

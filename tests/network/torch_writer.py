@@ -12,8 +12,10 @@ from unittest import mock
 
 import numpy as np
 
-from humangs_jax.io.tensors import MAGIC_NUMBER, STORAGE_DTYPES
+from humangs_jax.io.tensors import STORAGE_DTYPES
 
+MAGIC_NUMBER = 0x1950A86A20F9469CFC6C
+"""First value of a stream of torch."""
 KINDS = {dtype: kind for kind, dtype in STORAGE_DTYPES.items() if kind != "BFloat16Storage"}
 
 

@@ -22,15 +22,10 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 Points = Float[np.ndarray, "n 3"]
 Faces = Int[np.ndarray, "f 3"]
 
-NORMAL_FLOOR = 1e-12
-"""Added to lengths before dividing: vertices without area get the zero normal."""
 SIDES = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
 """Directions that charts look towards at first."""
 LEAST_COSINE = 0.45
 """Least cosine between the normal of a face and the side of a chart that it may join."""
-NEIGHBOUR_GAIN = 0.2
-"""Weight of a neighbour in the same chart, as a cosine."""
-SMOOTHING_STEPS = 8
 PEELINGS = 3
 """How often charts that overlap themselves are split; the tests count what still overlaps."""
 GUTTER = 2
@@ -100,21 +95,25 @@ def unwrap(
 
 @dataclasses.dataclass(frozen=True)
 class _Flat:
-    """Charts before packing: points (u, 2) metres from the lower left corner of their chart,
-    heights (u,) above its plane.
-    """
+    """Charts before packing."""
 
     points: np.ndarray
+    """Points of all charts, (u, 2), metres from the lower left corner of their chart."""
     heights: np.ndarray
+    """Their heights above the plane of their chart, (u,), metres."""
     faces: np.ndarray
+    """Points of the corners of each face, (f, 3)."""
     vertices: np.ndarray
+    """Vertex of the mesh that each point is, (u,)."""
     point_charts: np.ndarray
+    """Chart of each point, (u,)."""
     charts: np.ndarray
+    """Chart of each face, (f,)."""
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Divides vectors by their lengths along the last axis."""
-    return vectors / (np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)) + NORMAL_FLOOR)
+    """Divides vectors by their lengths along the last axis; those without length stay."""
+    return vectors / (np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)) + 1e-12)
 
 
 def edges_of(faces: Faces) -> Int[np.ndarray, "e 2"]:
@@ -149,11 +148,11 @@ def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     allowed = cosines >= np.minimum(LEAST_COSINE, cosines.max(1, keepdims=True))
     sides = np.argmax(cosines, axis=1)
     source, target = np.concatenate([pairs, pairs[:, ::-1]]).T
-    for _ in range(SMOOTHING_STEPS):
-        votes = np.bincount(target * len(SIDES) + sides[source], minlength=cosines.size).reshape(
-            cosines.shape
-        )
-        sides = np.argmax(np.where(allowed, cosines + NEIGHBOUR_GAIN * votes, -np.inf), axis=1)
+    for _ in range(8):
+        votes = np.bincount(target * len(SIDES) + sides[source], minlength=cosines.size)
+        # a neighbour counts as much as a cosine of 0.2
+        gains = cosines + 0.2 * votes.reshape(cosines.shape)
+        sides = np.argmax(np.where(allowed, gains, -np.inf), axis=1)
     return sides
 
 
@@ -179,10 +178,12 @@ def _flatten(
     as its density says.
     """
     count = int(charts.max()) + 1
+    # a vertex is a point in each chart that it belongs to
     keys, inverse = np.unique(
         charts.repeat(3) * len(vertices) + faces.reshape(-1), return_inverse=True
     )
     owner, vertex = keys // len(vertices), keys % len(vertices)
+    # the axis of a chart: its mean normal, or its side where that looks away from a face
     axis = unit(
         np.stack([np.bincount(charts, weights=normals[:, i], minlength=count) for i in range(3)], 1)
     )
@@ -191,6 +192,7 @@ def _flatten(
     some_side = np.zeros(count, np.int64)
     some_side[charts] = sides
     axis = np.where((worst < LEAST_COSINE)[:, None], SIDES[some_side], axis)
+    # coordinates in the plane across the axis, turned and moved to the lower left corner
     helper = np.where(np.abs(axis[:, 1:2]) < 0.8, [[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]])
     right = unit(np.cross(helper, axis))
     up = np.cross(axis, right)
@@ -297,9 +299,8 @@ def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s
 
 def _pack(flat: _Flat, size: int) -> Atlas:
     """Puts charts as bitmaps of cells at the first free place, shrunk together until all fit."""
-    scale = size / np.sqrt(
-        np.prod(_sizes(flat), 0).sum()
-    )  # the boxes alone would fill the square: a start that is too large
+    # the boxes alone would fill the square: a start that is too large
+    scale = size / np.sqrt(np.prod(_sizes(flat), 0).sum())
     corners = _place(flat, scale, size)
     while corners is None:
         scale *= SHRINKING

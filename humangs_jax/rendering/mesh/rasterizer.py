@@ -39,13 +39,6 @@ from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera, require_pinhole
 from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, owners
 
-SPAN_SLACK = 16
-"""Spans of pixels are widened by this many roundings of the coordinates; the edge functions decide.
-"""
-
-AREA_ROUNDING = 2
-"""A face whose area is below this many roundings of the area's own computation has none."""
-
 NO_FACE = jnp.iinfo(jnp.int32).max
 """Face number of a pixel without a face: the least number wins, so any face beats it."""
 
@@ -161,9 +154,8 @@ def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3
         R[i, 0] * vertices[:, 0] + R[i, 1] * vertices[:, 1] + R[i, 2] * vertices[:, 2] + t[i]
         for i in range(3)
     )
-    return jnp.stack([K[0, 0] * (x / z) + K[0, 2], K[1, 1] * (y / z) + K[1, 2], z], axis=-1).astype(
-        vertices.dtype
-    )
+    pixels = [K[0, 0] * (x / z) + K[0, 2], K[1, 1] * (y / z) + K[1, 2], z]
+    return jnp.stack(pixels, axis=-1).astype(vertices.dtype)
 
 
 def _first_pixel(low: Array, size: int) -> Array:
@@ -177,6 +169,7 @@ def _last_pixel(high: Array, size: int) -> Array:
 
 
 def _pixel_centers(pixel: Array, width: int, dtype: np.dtype) -> tuple[Array, Array]:
+    """Returns x and y of the centres of pixels, which are numbered row by row."""
     return (pixel % width).astype(dtype) + 0.5, (pixel // width).astype(dtype) + 0.5
 
 
@@ -187,9 +180,8 @@ def _drawn(corners: Float[Array, "f 9"], near: float) -> tuple[Array, Array]:
     z = corners[:, 2::3]
     ab, ac = corners[:, 3:5] - corners[:, 0:2], corners[:, 6:8] - corners[:, 0:2]
     area = jnp.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
-    rounding = (
-        AREA_ROUNDING * jnp.finfo(corners.dtype).eps * jnp.abs(ab).sum(-1) * jnp.abs(ac).sum(-1)
-    )
+    # an area below two roundings of its computation is none
+    rounding = 2 * jnp.finfo(corners.dtype).eps * jnp.abs(ab).sum(-1) * jnp.abs(ac).sum(-1)
     whole = (z > near).all(-1) & jnp.isfinite(area)
     lost = ~whole & ~(z <= near).all(-1)  # also where z is NaN
     return whole & (area > rounding), jnp.sum(lost, dtype=jnp.int32)
@@ -222,7 +214,8 @@ def _spans(corners: Array, row: Array, width: int) -> tuple[Array, Array]:
         left = jnp.minimum(left, jnp.where(crosses, at, jnp.inf))
         right = jnp.maximum(right, jnp.where(crosses, at, -jnp.inf))
     largest = jnp.maximum(jnp.maximum(jnp.abs(x[0]), jnp.abs(x[1])), jnp.abs(x[2]))
-    slack = SPAN_SLACK * jnp.finfo(corners.dtype).eps * (largest + 1.0)
+    # widened by 16 roundings of the coordinates: the edge functions decide
+    slack = 16 * jnp.finfo(corners.dtype).eps * (largest + 1.0)
     first = _first_pixel(left - slack, width)
     return first, jnp.maximum(_last_pixel(right + slack, width) - first + 1, 0)
 
@@ -231,6 +224,7 @@ def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Arra
     """Returns perspective-correct weights (three arrays), the depth, and whether the face covers
     the points (x, y).
     """
+    # edge functions from the points' view, with the two ends of an edge in a fixed order
     corner_x = [corners[..., 3 * i] for i in range(3)]
     corner_y = [corners[..., 3 * i + 1] for i in range(3)]
     edges = []
@@ -245,9 +239,8 @@ def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Arra
         edges.append(jnp.where(swap, -edge, edge))
     smallest = jnp.minimum(jnp.minimum(edges[0], edges[1]), edges[2])
     largest = jnp.maximum(jnp.maximum(edges[0], edges[1]), edges[2])
-    inside = ((smallest >= 0) | (largest <= 0)) & (
-        smallest != largest
-    )  # both windings; equal only if all are 0
+    # both windings; they are equal only if all are 0
+    inside = ((smallest >= 0) | (largest <= 0)) & (smallest != largest)
     areas = [jnp.abs(edge) for edge in edges]
     total = areas[0] + areas[1] + areas[2]
     total = jnp.where(total > 0, total, 1.0)
@@ -371,18 +364,6 @@ BACKGROUND = 1.0
 """Each coordinate of the position beside the body, normalised units."""
 BACKGROUND_DEPTH = -1.0
 """Depth beside the body."""
-LIGHT = (0.0, 1.0, 0.0)
-"""Place of the point light, normalised units; the default of PyTorch3D, whose shader the release
-used.
-"""
-AMBIENT = 0.5
-"""Share of the albedo that is seen without light."""
-DIFFUSE = 0.3
-"""Share of the albedo that full light adds."""
-SPECULAR = 0.2
-"""Brightness of the highlight."""
-SHININESS = 64
-"""Exponent of the highlight: its width."""
 
 
 def plain_position_map(
@@ -432,12 +413,14 @@ def _light(albedo: Array, points: Array, normals: Array, eye: Array) -> Array:
         return jnp.sum(a * b, axis=-1, keepdims=True)
 
     nowhere = jnp.zeros(3)
-    to_light = safe_normalize(jnp.asarray(LIGHT, points.dtype) - points, nowhere)
+    light = jnp.asarray((0.0, 1.0, 0.0), points.dtype)  # its place, normalised units
+    to_light = safe_normalize(light - points, nowhere)
     to_eye = safe_normalize(eye - points, nowhere)
     facing = dot(normals, to_light)
     reflected = 2 * facing * normals - to_light
-    highlight = jnp.where(facing > 0, jnp.maximum(dot(reflected, to_eye), 0), 0) ** SHININESS
-    return albedo * (AMBIENT + DIFFUSE * jnp.maximum(facing, 0)) + SPECULAR * highlight
+    highlight = jnp.where(facing > 0, jnp.maximum(dot(reflected, to_eye), 0), 0) ** 64
+    # shares of the ambient light, the light and the highlight: PyTorch3D's defaults
+    return albedo * (0.5 + 0.3 * jnp.maximum(facing, 0)) + 0.2 * highlight
 
 
 def _map(
