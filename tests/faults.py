@@ -23,7 +23,7 @@ TESTS = {
         "tests/network/test_torch_file.py",
     ],
     TENSORS: ["tests/network/test_torch_file.py"],
-    "body.joints": ["tests/body/test_joints.py"],
+    "body.kinematics": ["tests/body/test_kinematics.py"],
     "motion.clips": ["tests/motion/test_motion_skeletons.py"],
 }
 """Where a fault of a module is looked for."""
@@ -70,7 +70,7 @@ FAULTS = [
     (TENSORS, "(array.astype(np.uint32) << 16)", "(array.astype(np.uint32) << 15)"),
     (TENSORS, "(data)[len(data) - size :]", "(data)[len(data) - size - 1 : -1]"),
     # people stand elsewhere
-    ("body.joints", "above @ turns[..., joint, :, :]", "turns[..., joint, :, :] @ above"),
+    ("body.kinematics", "above @ turns[..., joint, :, :]", "turns[..., joint, :, :] @ above"),
     ("motion.clips", "turns[:, joint], moves[:, joint] = turn, move", "turns[:, joint] = turn"),
 ]
 """(module, text, what stands in its place)."""
