@@ -119,12 +119,12 @@ class Place(NamedTuple):
     base: str
     """The landmark of `body.landmarks` that it is measured from."""
     offset: tuple[float, float, float]
-    """From there to the landmark, metres in T-pose: x to the person's left, y up, z to the
+    """Vector from there to the landmark, metres in T-pose: x to the person's left, y up, z to the
     front.
     """
     joints: tuple[str, ...] = ()
-    """Joints whose turning carries the offset along, by equal shares; none: what carries the base,
-    which then is a vertex.
+    """Joints whose turning carries the offset along, by equal shares. None of them: the base is a
+    vertex, and the offset moves with it.
     """
 
 

@@ -149,9 +149,7 @@ def blend_leg_weights(
 
 @pytree_dataclass
 class SurfacePoints:
-    """p points of a body with j joints; batches and concatenations of them are again such
-    points.
-    """
+    """p points of a body with j joints; concatenations of them are points, too."""
 
     rest: Float[Array, "p 3"]
     """The points of the mean shape in T-pose, (p, 3), metres."""
@@ -221,15 +219,17 @@ class BodyModel:
     """An articulated, shapeable triangle mesh: SMPL-X, or the body that comes with the package."""
 
     template: Float[Array, "n 3"]
-    """Mean T-pose, metres."""
+    """Vertices of the mean T-pose, metres."""
     shape_directions: Float[Array, "n 3 s"]
-    """Metres per unit of a shape coefficient."""
+    """How vertices move per unit of a shape coefficient, metres."""
     pose_directions: Float[Array, "n 3 q"] | None
-    """Metres; q = 9 (j - 1) entries of R_j - I, row-major, joints 1 and up."""
+    """How vertices move with the pose, metres per unit of its features: the q = 9 (j - 1) entries
+    of R_j - I, row-major, joints 1 and up.
+    """
     joint_regressor: Float[Array, "j n"]
-    """Joints from rest vertices; rows sum to 1."""
+    """Weights of the rest vertices in each joint; rows sum to 1."""
     skinning_weights: Float[Array, "n j"]
-    """Non-negative, rows sum to 1."""
+    """Weights of the joints for each vertex, not negative; rows sum to 1."""
     faces: Int[Array, "f 3"]
     """Vertex indices, counter-clockwise seen from outside."""
     uvs: Float[Array, "u 2"] | None = None
@@ -246,7 +246,7 @@ class BodyModel:
     texels: Texels | None = None
     """A map of the surface, for networks that work on one: `network.parts`."""
     expressions: Expressions | None = None
-    """What its face can do; None: nothing."""
+    """The expressions of its face; None: the face is rigid."""
     parents: tuple[int, ...] = static_field(default=())
     """Parent of each joint, -1 for the root."""
     joint_names: tuple[str, ...] = static_field(default=())
@@ -256,7 +256,7 @@ class BodyModel:
     name: str = static_field(default="body")
     """Name of the body in messages."""
     remesh_key: tuple | None = static_field(default=None)
-    """What `data.views.gaussian_body` has made it for; None: a body as it was read."""
+    """The sizes that `data.views.gaussian_body` has made it for; None: a body as it was read."""
 
 
 @pytree_dataclass
@@ -266,7 +266,7 @@ class BodyPose(Batchable):
     rotations: Float[Array, "j 3"]
     """Axis-angle of each joint relative to its parent, radians."""
     translation: Float[Array, "3"]
-    """Metres, applied last."""
+    """Translation, metres, applied last."""
     expression: Float[Array, " e"] | None = None
     """A coefficient for each of the body's expressions, mostly in [0, 1]; None: a face at rest,
     without any work for it.

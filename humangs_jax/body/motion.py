@@ -28,7 +28,7 @@ class Motion:
     rotations: Float[Array, "m j 3"]
     """Axis-angle of each joint relative to its parent, radians."""
     translations: Float[Array, "m 3"]
-    """Metres, applied last."""
+    """Translation in each frame, metres, applied last."""
     fps: float = static_field(default=DEFAULT_FPS)
     """Frames per second."""
     expressions: Float[Array, "m e"] | None = None

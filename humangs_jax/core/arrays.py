@@ -1,5 +1,5 @@
-"""Small work on arrays by numpy. Each operation of `jnp` outside of `jit` is a program of its own,
-for each shape: some ten milliseconds to make, for nothing to compute.
+"""Small work on arrays by numpy. Outside of `jit` each operation of `jnp` is compiled for each
+shape, which takes some ten milliseconds where there is nothing to compute.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,9 @@ import numpy as np
 from jax.core import Tracer
 
 SMALL = 1 << 16
-"""Numbers that cost less to bring from an accelerator and back than a program costs to make."""
+"""Largest count of numbers that are brought from an accelerator and back in less time than a
+program takes to compile.
+"""
 
 
 def from_host(array: Any, dtype: Any = None) -> Any:

@@ -33,9 +33,9 @@ from humangs_jax.core.pytree import shape_fault
 P = ParamSpec("P")
 T = TypeVar("T")
 NUMBERS = (int, float, complex, bool)
-"""Not checked: those of numpy and JAX do as well."""
+"""Classes that are not checked: numbers of numpy and JAX will do, too."""
 SEQUENCES = {list: Sequence, Sequence: Sequence, Iterable: Iterable, os.PathLike: os.PathLike}
-"""What lists and paths of something may be; what is in them is not checked."""
+"""Classes that lists and paths may have; what is in them is not checked."""
 HINTS = {
     ("Gaussians", "Avatar"): "animate(avatar, pose) poses them",
     ("Avatar", "Gaussians"): "an Avatar has what they need to be posed",
@@ -215,12 +215,12 @@ class Values(NamedTuple):
 
 FINITE = Values("finite numbers")
 LARGEST = 1e6
-"""Of avatars and what is written of them, metres or any unit: nobody is larger, and float32 holds
-products of several such numbers."""
+"""Largest number in avatars and in what is written of them, metres or any unit: nobody is larger,
+and float32 holds products of several such numbers."""
 BOUNDED = Values(f"finite numbers of at most {LARGEST:g} in magnitude", -LARGEST, LARGEST)
 ROUNDING = 1e-6
-"""Photos that were resized, and opacities from a sigmoid, may be a few float32 roundings outside of
-[0, 1].
+"""How far numbers may lie outside of [0, 1]: a few float32 roundings, as in photos that were
+resized and in opacities from a sigmoid.
 """
 UNIT = Values("numbers in [0, 1]", -ROUNDING, 1 + ROUNDING)
 SIGNED_UNIT = Values("numbers in [-1, 1]", -1 - ROUNDING, 1 + ROUNDING)

@@ -29,9 +29,9 @@ T = TypeVar("T")
 KIND = "kind"
 """Key of the class of a part."""
 LARGEST = sys.float_info.max
-"""Numbers beyond it have no place in any configuration."""
+"""No configuration has larger numbers."""
 LARGEST_INTEGER = 1 << 63
-"""Integers beyond it have no place in any configuration."""
+"""No configuration has integers of a larger magnitude."""
 
 
 MOST_ITEMS = 256
@@ -60,34 +60,34 @@ def at_least(low: float | int) -> Range:
 
 
 InputSide = Annotated[int, Range(1, 2048)]
-"""Of a photo as a network sees it, pixels."""
+"""Side of a photo as a network sees it, pixels."""
 Side = Annotated[int, Range(1, 4096)]
-"""Of an image or map that is drawn or made, pixels."""
+"""Side of an image or map that is drawn or made, pixels."""
 PhotoSide = Annotated[int, Range(1, 32_768)]
-"""Of a photo as it comes, pixels."""
+"""Side of a photo as it comes, pixels."""
 Width = Annotated[int, Range(1, 16_384)]
 """Features of a layer."""
 Ratio = Annotated[int, Range(1, 64)]
-"""Of one width to another."""
+"""Ratio of one width to another."""
 Patch = Annotated[int, Range(1, 256)]
 """Side of a patch of a photo, pixels."""
 Layers = Annotated[int, Range(1, 256)]
 Count = Annotated[int, Range(1, 1024)]
 """Views, joints, heads, subjects: things of which there are some."""
 Capacity = Annotated[int, Range(1, 1 << 31)]
-"""Of a buffer."""
+"""Slots of a buffer."""
 CapacityOrAuto = Annotated[int, Range(0, 1 << 31)]
 """Slots, or 0 for as many as may be needed."""
 Chunk = Annotated[int, Range(1, 65_536)]
 """What is worked on at once."""
 Iterations = Annotated[int, Range(0, 1000)]
 RefineSteps = Annotated[int, Range(0, 100_000)]
-"""Of refinement: some hours."""
+"""Steps of refinement, which take some hours at most."""
 Steps = Annotated[int, Range(1, 100_000_000)]
 Seed = Annotated[int, Range(0, (1 << 32) - 1)]
 Share = Annotated[float, Range(0, 1)]
 Weight = Annotated[float, Range(0, 1e6)]
-"""Of a term of a sum."""
+"""Weight of a term of a sum."""
 Spread = Annotated[float, Range(0, 100)]
 """A standard deviation, distance or bound in any unit."""
 Length = Annotated[float, Range(1e-6, 100)]
@@ -109,8 +109,8 @@ def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
 
 
 class ArgumentError(ValueError):
-    """An argument of a function that cannot be meant; the command line shows its name as that of an
-    option.
+    """Says what is wrong with an argument of a function; the command line shows its name as that of
+    an option.
     """
 
     def __init__(self, argument: str, problem: str) -> None:
@@ -125,7 +125,7 @@ class ArgumentError(ValueError):
 
 
 class _UnknownPresetError(KeyError):
-    """A `KeyError` whose text is a line, not its repr."""
+    """Is a `KeyError` whose text is a line, not its repr."""
 
     def __str__(self) -> str:
         return str(self.args[0])
@@ -234,8 +234,8 @@ def configuration(cls: type[T]) -> type[T]:
 
 
 class Part:
-    """Base of what a field may hold by its registered name: modules of Linen, whose fields are made
-    frozen here.
+    """Base of what a field may hold by its registered name: modules of Linen, whose fields cannot
+    be assigned.
     """
 
     def __setattr__(self, name: str, val: Any) -> None:  # the names of Linen's

@@ -98,11 +98,10 @@ def undisturbed() -> Generator[None]:
 @contextlib.contextmanager
 def started_deaf() -> Generator[None]:
     """Keeps Ctrl-C, which reaches all processes of a terminal, from processes that are started in
-    the
-    block: this one decides.
+    the block: this one decides.
 
-    Else it ends, with tracebacks, those that are still importing. Windows has no such masks: there
-    it does.
+    Otherwise it would end, with tracebacks, processes that are still importing. On Windows, which
+    has no masks of signals, it does.
     """
     with undisturbed():
         if not hasattr(signal, "pthread_sigmask"):

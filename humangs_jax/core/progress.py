@@ -7,8 +7,8 @@ of it printable.
         ...
 
 No other module prints. The library opens stages where work takes long. Unless a program asked for
-it by `begin`, a stage shows and costs nothing. The seconds of the outermost stages are kept for
-whoever began; stages inside of them only change the line that is shown.
+it by `begin`, a stage shows and costs nothing. The seconds of the outermost stages are kept for the
+program that began; stages inside of them only change the line that is shown.
 """
 
 import contextlib
@@ -87,14 +87,14 @@ class Progress:
     names: list[str] = dataclasses.field(default_factory=list)
     """Names of the stages that run, the outermost first."""
     next: list[str] = dataclasses.field(default_factory=list)
-    """What the user may do next, a line each, for whoever began."""
+    """What the user may do next, a line each, for the program that began."""
     paused: bool = False
     """Whether a bar has the line."""
 
 
 _current = Progress()
 _bars: "weakref.WeakSet[Any]" = weakref.WeakSet()
-"""Those that may not be closed yet."""
+"""Bars that may not be closed yet."""
 
 
 def begin(*, quiet: bool = False, lines: bool = False) -> Progress:

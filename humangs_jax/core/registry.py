@@ -24,7 +24,9 @@ class Format:
     code: str | Callable[..., Any]
     """The function that reads or writes them; as text "package.module:function"."""
     suffixes: tuple[str, ...] = ()
-    """Of its files, in lower case, with the dot; FOLDER for a folder. Empty: names do not tell."""
+    """Suffixes of its files, in lower case, with the dot; FOLDER for a folder. Empty: names do not
+    tell.
+    """
     recognizes: str | Callable[[Path], bool] | None = None
     """Whether a file with such a suffix is of this format, where suffixes are shared; None: it is.
     """
@@ -42,7 +44,7 @@ class Formats(dict[str, F]):
 
     @property
     def suffixes(self) -> tuple[str, ...]:
-        """All of them, each once."""
+        """All suffixes, each once."""
         return tuple(dict.fromkeys(suffix for each in self.values() for suffix in each.suffixes))
 
     def of(self, path: Path) -> "Formats[F]":

@@ -25,14 +25,14 @@ class Encoding(NamedTuple):
     """How a file encodes colors."""
 
     curves: tuple[Curve, ...]
-    """One for each channel, or one for all."""
+    """A curve for each channel, or one for all."""
     matrix: Float[np.ndarray, "3 3"]
-    """From light of the file's primaries to light of sRGB's."""
+    """Matrix from light of the file's primaries to light of sRGB's."""
     bright: bool = False
     """Whether light may be far beyond white."""
     camera: bool = False
-    """Whether light is that before a camera: it is encoded as cameras do (BT.709), not as screens
-    show it.
+    """Whether it stores the light before a camera, which is encoded as cameras do (BT.709), not as
+    screens show it.
     """
 
 
@@ -111,7 +111,7 @@ CURVES: dict[int, Curve] = {
     16: _pq_to_light,
     18: _hlg_to_light,
 }
-"""By their code point (H.273). Files of BT.709 and its kin are shown as sRGB by all programs."""
+"""Curves by their code point (H.273). All programs show files of BT.709 and its kin as sRGB."""
 PQ = 16
 """Number of the transfer function PQ in H.273."""
 HLG = 18
@@ -246,7 +246,7 @@ class Profile(NamedTuple):
     space: str
     """One of the values of `SPACES`."""
     encoding: Encoding | None
-    """None: it is tables, for Little CMS."""
+    """The encoding of its colors; None: it is tables, for Little CMS."""
 
 
 def read_profile(data: bytes) -> Profile:

@@ -15,8 +15,9 @@ import numpy as np
 from humangs_jax.io.reading import InvalidFileError
 
 HEIC_BRANDS = frozenset((b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1"))
-"""Of the box `ftyp` that such a file begins with (ISO/IEC 23008-12)."""
+"""Brands of HEIC in the box `ftyp` that a file begins with (ISO/IEC 23008-12)."""
 AVIF_BRANDS = frozenset((b"avif", b"avis"))
+"""Brands of AVIF in the same box."""
 
 JPEG_START = b"\xff\xd8"
 JPEG_MARKER = re.compile(rb"\xff([^\x00\xff])")

@@ -52,9 +52,9 @@ logger = logging.getLogger(__name__)
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")
 """Suffixes of the photos, masks and images that are read, the likelier original first."""
 FORMATS = ("PNG", "JPEG")
-"""Of textures. Pillow knows some forty more, one of which starts Ghostscript."""
+"""Formats of textures. Pillow knows some forty more, one of which starts Ghostscript."""
 NAMES = {"HEIF": "HEIC", "AVIF": "AVIF", "WEBP": "WebP"}
-"""Of Pillow's formats, as people write them."""
+"""Names of Pillow's formats, as people write them."""
 HEAD = 256
 """Bytes of a file that tell its format."""
 GREY_SLACK = 16 / 255

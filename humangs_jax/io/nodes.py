@@ -18,9 +18,9 @@ PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 
 Nodes = list[dict[str, Any]]
 Track = tuple[Float[np.ndarray, " keys"], Float[np.ndarray, "keys c"], bool]
-"""Times, values, and whether these stay until the next."""
+"""Times, values, and whether a value stays until the next time."""
 Tracks = dict[tuple[int, str], Track]
-"""By node and path."""
+"""Tracks by node and path."""
 
 
 def node_parents(nodes: Nodes) -> list[int]:

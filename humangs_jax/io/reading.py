@@ -59,7 +59,7 @@ class Limits:
     plain_bytes: int = 256 << 20
     """Bytes to which a file of any size may unpack, and of a sparse matrix made dense."""
     ratio: int = 100
-    """Beyond `plain_bytes`: unpacked size over the size of the file."""
+    """Largest unpacked size over the size of the file, for unpacked sizes beyond `plain_bytes`."""
     members: int = 65_536
     """Entries of an archive."""
     opcodes: int = 4_000_000
@@ -149,7 +149,7 @@ def _limits_of_text(text: str) -> Limits:
 
 
 class _Shown(reprlib.Repr):
-    """As `repr`, but short, whatever the value holds and however often, itself included."""
+    """Shows values as `repr` does, but short, also those that hold many others or themselves."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -319,7 +319,7 @@ def walk(
     """
     # what links lead to comes last: a folder is found at its proper place
     seen: set[tuple[int, int]] = set()
-    waiting, links, count, told = [Path(folder)], [], 0, False
+    waiting, links, count, warned = [Path(folder)], [], 0, False
     while waiting or links:
         place = waiting.pop() if waiting else links.pop()
         status = place.stat()
@@ -342,8 +342,8 @@ def walk(
                         Path(folder).resolve()
                     ):
                         links.append(path)
-                    elif not told:
-                        told = True
+                    elif not warned:
+                        warned = True
                         logger.warning(
                             "%s: leads out of %s: not followed (%s)", path, folder, OUTSIDE
                         )

@@ -172,7 +172,7 @@ class Named(NamedTuple):
     """A class of Python that a pickle names as the base of another one; it cannot be called."""
 
     name: str
-    """For error lines."""
+    """Name of the class, for error lines."""
 
 
 class StandIn:

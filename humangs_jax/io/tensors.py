@@ -76,6 +76,7 @@ class _StorageType(NamedTuple):
     """Stands for a `torch.*Storage` class."""
 
     name: str
+    """Name of the class, a key of `STORAGE_DTYPES`."""
 
 
 class _Storage(NamedTuple):
@@ -86,7 +87,7 @@ class _Storage(NamedTuple):
     name: str
     """The name of the storage in its file."""
     count: Any
-    """Of its numbers, as the pickle says."""
+    """How many numbers it has, as the pickle says."""
     read: Callable[[str], Any]
     """Returns the bytes of a storage by its name."""
 
@@ -95,9 +96,13 @@ class _Tensor(NamedTuple):
     """A tensor that is not read yet: a view of a storage, offset and strides in elements."""
 
     storage: _Storage
+    """The storage that holds the numbers."""
     offset: int
+    """Place of the first number in the storage."""
     shape: tuple[int, ...]
+    """Sizes of the axes."""
     strides: tuple[int, ...]
+    """Step along each axis, in elements."""
 
     def to_array(self) -> np.ndarray:
         """Returns the numbers, after a check of bounds. bfloat16 becomes float32.

@@ -114,7 +114,7 @@ class HumanGSConfig:
         return self.forward_context().tokens
 
     def forward_context(self, train: bool = False, axis_name: Any = None) -> ForwardContext:
-        """Returns what the parts are told of one pass of this network: see `ForwardContext`."""
+        """Returns what the parts get from outside in one pass, see `ForwardContext`."""
         return ForwardContext(self.conventions, self.runtime, train, axis_name)
 
     @property

@@ -1,5 +1,5 @@
-"""What an encoder, a reader, a decoder and a driver are, so that each can be exchanged, and what
-passes between them.
+"""Encoder, reader, decoder and driver: what each of them takes and gives, so that it can be
+exchanged.
 
     encoding = encoder(photos)
     features = reader(encoding)
@@ -224,7 +224,7 @@ class Target(NamedTuple):
     vertices: Float[Array, "n 3"]
     """Vertices of the posed body, (n, 3), metres."""
     pixels: Float[Array, "h w 9"] | None = None
-    """Of every pixel the ray (moment, direction) and the canonical position of the body there (1 on
+    """The ray of every pixel (moment, direction) and the canonical position of the body there (1 on
     background), (h, w, 9), normalised units, for drivers that make images; else None.
     """
 
@@ -311,8 +311,7 @@ class TargetDecoder(Part, nn.Module):
         background: float,
     ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
         """Returns images and alpha of the person of one capture in the views of another, for
-        evaluations.
-        variables, config: the network's.
+        evaluations. variables, config: the network's.
         """
         raise NotImplementedError
 

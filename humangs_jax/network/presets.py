@@ -12,7 +12,7 @@ from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
 
 SHELLS = (0.0, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18)
-"""From the skin to the hems of the widest clothes, normalised units."""
+"""Distances of the shells, from the skin to the hems of the widest clothes, normalised units."""
 
 
 def published() -> HumanGSConfig:

@@ -131,7 +131,9 @@ class Runtime:
 
     @property
     def compute_dtype(self) -> Any:
-        """For Linen modules; None promotes inputs and parameters, so that float64 stays float64."""
+        """The dtype of Linen modules; None promotes inputs and parameters, so that float64
+        stays.
+        """
         if self.dtype == "float32":
             return None
         return jnp.dtype(self.dtype)

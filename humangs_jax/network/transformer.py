@@ -35,10 +35,10 @@ NORM_EPSILON = 1e-5
 PRODUCT = "product"
 """Name of the arrays of a block that `Runtime.remat` "dots" may keep for the backward pass."""
 QUERIES = 1024
-"""At once, in "chunked"."""
+"""Queries that "chunked" takes at once."""
 XLA_TOKENS = 8192
-"""Up to here L x L logits of all heads fit beside a model on any accelerator (12 heads, float32: 3
-GB a layer).
+"""Largest number of tokens for "xla": the L x L logits of all heads fit beside a model on any
+accelerator (12 heads, float32: 3 GB a layer).
 """
 
 

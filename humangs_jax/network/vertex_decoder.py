@@ -1,4 +1,4 @@
-"""From features of a body vertex to its K Gaussians.
+"""The decoder: makes K Gaussians of the features of a body vertex.
 
 Input of a vertex: pooled local feature, global token, positional encoding of the canonical
 position, and optionally its photo color, the fraction of views that see it, and what the photos

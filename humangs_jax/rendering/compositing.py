@@ -559,11 +559,11 @@ class _Step(NamedTuple):
     sums: Float[Array, "t n+1 p"]
     """Sums of w f, and behind them that of log(1 - alpha), the final log T."""
     lengths: Int[Array, " t"]
-    """As those of `Composited`."""
+    """How many splats of each list have been read, as in `Composited`."""
     peaks: Float[Array, " g"]
-    """As those of `Composited`."""
+    """The largest w of each splat so far, as in `Composited`."""
     medians: Float[Array, "t p"] | None
-    """As those of `Composited`."""
+    """The smallest z so far behind which T is one half or less, as in `Composited`."""
     tail: _Tail
     """log T of the last list."""
 
@@ -726,5 +726,5 @@ def _tail(tiles: Array, before: Array, through: Array) -> _Tail:
 
 
 def _no_tail(t: int, p: int, dtype: np.dtype | type) -> _Tail:
-    """What the first step gets: no list has this tile."""
+    """Returns the tail that the first step gets: no list has its tile."""
     return _Tail(jnp.asarray(t, jnp.int32), jnp.zeros(p, dtype))

@@ -38,8 +38,8 @@ about the footprint of a pixel, so that images of other sizes show them as wide 
 (Mip-Splatting, https://arxiv.org/abs/2311.16493)."""
 
 LEAST_DIMMING = 1e-4
-"""Of opacities, by the variance that is added: a factor too small to be seen, which keeps gradients
-finite.
+"""Least factor of opacities, by the variance that is added: too small to be seen, it keeps
+gradients finite.
 """
 
 ALPHA_MIN = 1 / 255
@@ -59,6 +59,7 @@ Its square's square would overflow float32.
 """
 
 MEASURED = "performance.md"
+"""Page of docs with times."""
 
 
 @jax.tree_util.register_static

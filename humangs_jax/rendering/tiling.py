@@ -103,13 +103,13 @@ class Expansion(NamedTuple):
     first: Int[Array, " n"]
     """First slot of each item, (n,), so that slot - first[source] counts the slots of one item."""
     needed: Int[Array, ""]
-    """Number of slots that were asked for, whatever the capacity (saturates at `SUM_LIMIT`). Slot s
-    is used if s < needed.
+    """Number of slots that were asked for, even beyond the capacity (saturates at `SUM_LIMIT`).
+    Slot s is used if s < needed.
     """
 
 
 class TileLists(NamedTuple):
-    """For each tile a list of items: items[starts[t] : starts[t] + counts[t]], ascending."""
+    """A list of items for each tile: items[starts[t] : starts[t] + counts[t]], ascending."""
 
     items: Int[Array, " capacity"]
     """The items of all lists, (capacity,)."""
