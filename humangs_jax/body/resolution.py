@@ -48,7 +48,7 @@ in another unit.
 """
 
 
-def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
+def split_long_edges(body: BodyModel, longest: float) -> tuple[BodyModel, sparse.csr_array]:
     """Splits edges until those of the template are at most `longest` metres; the original vertices
     stay first, in their order.
 
@@ -57,17 +57,10 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
     mesh. `relative_vertex_spacing` is the root of the area around a vertex over what it was: 1/2
     where every edge has been halved.
 
+    Also returns the matrix (finer, n) whose product with a linear quantity of the original vertices
+    is that of the result's: a midpoint has the mean of its ends.
+
     Raises: ValueError if `longest` is not positive, or less than 1/64 of the longest edge.
-    """
-    return split_with_weights(body, longest)[0]
-
-
-def split_with_weights(body: BodyModel, longest: float) -> tuple[BodyModel, sparse.csr_array]:
-    """Does what `split_long_edges` does. Also returns the matrix (finer, n) whose product with a
-    linear quantity of the original vertices is that of the result's: a midpoint has the mean of its
-    ends.
-
-    Raises: ValueError, as it.
     """
     if not longest > 0:
         raise ValueError(f"longest edge: expected a positive length in metres, got {longest}")

@@ -248,7 +248,7 @@ def shape_fault(tree: Any) -> str | None:
     cls, sizes = type(tree), dict[str, int]()
     if cls not in _PYTREES:
         return None
-    fields, ranks = _annotated_axes(cls), []
+    fields, ranks = _annotated_fields(cls), []
     # how many axes each array has more than its annotation: a batch has as many as most of them
     for name, field in fields.items():
         shape = getattr(getattr(tree, name), "shape", None)
@@ -336,7 +336,7 @@ def _size_fault(tree: Any) -> str | None:
 
 
 @functools.cache
-def _annotated_axes(cls: Any) -> dict[str, _Field]:
+def _annotated_fields(cls: Any) -> dict[str, _Field]:
     """Returns the fields that are not static, without arrays of any shape."""
     found = {}
     for field in dataclasses.fields(cls):
@@ -348,18 +348,26 @@ def _annotated_axes(cls: Any) -> dict[str, _Field]:
         if not arrays:
             found[field.name] = _Field(None, False, optional)
             continue
-        texts = str(arrays[0].dim_str).split()
-        axes = tuple(int(axis) if axis.isdigit() else axis for axis in texts)
-        if not all(isinstance(axis, int) or axis.strip("_").isidentifier() for axis in axes):
-            continue  # of any shape
-        floating = all(_is_floating(x) for x in arrays)
-        found[field.name] = _Field(axes, floating, optional)
+        axes = annotated_axes(arrays[0])
+        if axes is not None:
+            found[field.name] = _Field(axes, all(map(is_floating, arrays)), optional)
     return found
 
 
-def _is_floating(annotation: Any) -> bool:
+def annotated_axes(array: Any) -> tuple[str | int, ...] | None:
+    """Returns names and sizes of the axes in a jaxtyping annotation; None for arrays of any
+    shape.
+    """
+    texts = str(array.dim_str).split()
+    axes = tuple(int(text) if text.isdigit() else text for text in texts)
+    if all(isinstance(axis, int) or axis.strip("_").isidentifier() for axis in axes):
+        return axes
+    return None
+
+
+def is_floating(array: Any) -> bool:
     """Says whether a jaxtyping annotation stands for floating-point numbers only."""
-    kinds = annotation.dtypes
+    kinds = array.dtypes
     return isinstance(kinds, list | tuple) and all("float" in str(kind) for kind in kinds)
 
 

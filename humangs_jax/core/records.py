@@ -17,7 +17,7 @@ import numpy as np
 from jax.core import Tracer
 
 from humangs_jax.core.checks import FINITE, Values, check_values
-from humangs_jax.core.pytree import types_and_marks
+from humangs_jax.core.pytree import annotated_axes, is_floating, types_and_marks
 
 
 class Part(NamedTuple):
@@ -91,14 +91,11 @@ def array_fields(record: Any) -> dict[str, ArrayField]:
         arrays = [each for each in types_ if hasattr(each, "dim_str")]
         if not arrays or field.metadata.get("static"):
             continue
-        texts = str(arrays[0].dim_str).split()
-        named = all(text.isdigit() or text.isidentifier() for text in texts)
-        axes = tuple(int(text) if text.isdigit() else text for text in texts)
         values = next((mark for mark in marks if isinstance(mark, Values)), None)
-        if values is None and all("float" in str(kind) for kind in arrays[0].dtypes):
+        if values is None and is_floating(arrays[0]):
             values = FINITE
         parts = tuple(mark for mark in marks if isinstance(mark, Part))
-        found[field.name] = ArrayField(axes if named else None, values, parts)
+        found[field.name] = ArrayField(annotated_axes(arrays[0]), values, parts)
     return found
 
 

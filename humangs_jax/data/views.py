@@ -13,7 +13,7 @@ from scipy import sparse
 
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.body.motion import turned_upright
-from humangs_jax.body.resolution import decimate_with_kept, split_with_weights
+from humangs_jax.body.resolution import decimate_with_kept, split_long_edges
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host, taken
 from humangs_jax.core.checks import checked_arguments
@@ -164,20 +164,20 @@ def _remeshed(
         weights = weights[kept]
     whole, of_whole = body, weights
     if edge is not None:
-        body, split = split_with_weights(body, edge)
+        body, split = split_long_edges(body, edge)
         body, weights = replace(body, relative_vertex_spacing=None), split @ weights
     if fewer is not None and fewer < len(whole.template):
         coarse, kept = decimate_with_kept(whole, fewer)
         of_coarse = of_whole[kept]
         if edge is not None:  # edges as much longer as the body has fewer vertices on the same area
             longer = edge * np.sqrt(len(whole.template) / fewer)
-            coarse, split = split_with_weights(coarse, longer)
+            coarse, split = split_long_edges(coarse, longer)
             of_coarse = split @ of_coarse
         wider = np.sqrt(len(body.template) / len(coarse.template))
         spacing = from_host(np.full(len(coarse.template), wider), body.template.dtype)
         body, weights = replace(coarse, relative_vertex_spacing=spacing), of_coarse
     if longest is not None:
-        body, split = split_with_weights(body, longest)
+        body, split = split_long_edges(body, longest)
         weights = split @ weights
     if wanted is not None:
         body = replace(body, texels=wanted.texels(body))

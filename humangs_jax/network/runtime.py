@@ -18,13 +18,6 @@ from humangs_jax.core.configuration import (
 from humangs_jax.network.maps import PixelGrid
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
-MEASURED = "performance.md"
-"""Page of docs with times."""
-TRADE = "tradeoff.md"
-"""Page of docs with time against quality."""
-EVALUATION = "evaluation.md"
-"""Page of docs with scores."""
-
 TokenSelection = Literal["all", "foreground"]
 AttentionKernel = Literal["xla", "cudnn", "chunked"]
 
@@ -37,7 +30,7 @@ class Runtime:
         None,
         cost="no background in the attention: exact only for weights that were trained so",
         gain="5 x in time at a foreground share of 0.2",
-        measured=MEASURED,
+        measured="performance.md",
     )
     """Patches that become tokens: "all", those that the "foreground" touches, or None: as the
     weights were trained.
@@ -46,7 +39,7 @@ class Runtime:
         0,
         cost="tokens beyond it are dropped and counted",
         gain="time and memory",
-        measured=MEASURED,
+        measured="performance.md",
     )
     """Slots for foreground tokens over all views, 0: room for all patches. `reconstruct` and
     `stack_captures` fit it to the photos; in training it is for the largest number of photos, see
@@ -64,21 +57,21 @@ class Runtime:
         "auto",
         cost="none",
         gain="chunked: a third of the time on CPUs, memory linear in tokens",
-        measured=MEASURED,
+        measured="performance.md",
     )
     """Implementation of the attention, see `network.transformer`."""
     scan: bool = knob(
         False,
         cost="a copy of the blocks' parameters",
         gain="compile time on TPU and GPU",
-        measured=MEASURED,
+        measured="performance.md",
     )
     """Run the blocks as one compiled loop.
 
     Their parameters are copied side by side in every call (12 layers of 768: 340 MB).
     """
     remat: Literal["none", "full", "dots"] = knob(
-        "none", cost="a third more arithmetic", gain="memory of training", measured=MEASURED
+        "none", cost="a third more arithmetic", gain="memory of training", measured="performance.md"
     )
     """What a block recomputes in the backward pass instead of keeping it: nothing, all ("full"), or
     all but the results of attention and of products with weights ("dots"). On a CPU only a `scan`
@@ -96,13 +89,16 @@ class Runtime:
         None,
         cost="detail of the body",
         gain="Gaussians and the time of a frame in proportion",
-        measured=TRADE,
+        measured="tradeoff.md",
     )
     """Vertices to which the body is decimated, fewer than the weights were trained with, None for
     no fewer. Gaussians shrink or grow with the distance between vertices, so that they cover as
     much as before."""
     image_size: InputSide | None = knob(
-        None, cost="detail of the photos", gain="tokens grow with its square", measured=TRADE
+        None,
+        cost="detail of the photos",
+        gain="tokens grow with its square",
+        measured="tradeoff.md",
     )
     """Side of the photos in pixels, a multiple of the patch size; None: as the weights were
     trained.
@@ -111,7 +107,7 @@ class Runtime:
         False,
         cost="0.15 dB in the foreground for one of four people",
         gain="pixels of the person in place of background: 0.3 dB in the foreground on average",
-        measured=EVALUATION,
+        measured="evaluation.md",
     )
     """Photos are cut to the square around the person's mask before they are brought to that size.
     """
@@ -150,7 +146,7 @@ class Conventions:
         512,
         cost="detail of the photos",
         gain="tokens grow with its square, attention with its fourth power",
-        measured=MEASURED,
+        measured="performance.md",
     )
     """Side of the photos, pixels (the network takes any multiple of the patch size)."""
     tokens: TokenSelection = "all"
@@ -185,14 +181,14 @@ class Conventions:
         None,
         cost="detail of the body",
         gain="Gaussians, reads and decoding in proportion",
-        measured=EVALUATION,
+        measured="evaluation.md",
     )
     """Number of vertices to which bodies are decimated; None: they are not."""
     max_edge_length: Edge | None = knob(
         None,
         cost="Gaussians grow as it shrinks",
         gain="detail where the body is coarse",
-        measured=EVALUATION,
+        measured="evaluation.md",
     )
     """Metres to which their edges are split afterwards; None: they are not."""
     renamed_fields: ClassVar[dict[str, str]] = {

@@ -21,6 +21,7 @@ from jax import lax
 
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.numerics import safe_sqrt
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.lens import within_reach
@@ -87,7 +88,7 @@ def _reference(
         contained = eps2d * jnp.minimum((gaussians.pixel_footprint * camera.K[0, 0] / away) ** 2, 1)
         opacities = opacities * jnp.sqrt(_determinant(axes, contained) / determinants)
     elif config.antialiased and eps2d > 0:
-        opacities = opacities * _root(_determinant(axes, 0.0) / determinants)
+        opacities = opacities * safe_sqrt(_determinant(axes, 0.0) / determinants)
     order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
     y, x = jnp.mgrid[: camera.height, : camera.width] + 0.5
     pixels = jnp.stack([x, y], axis=-1).astype(centers.dtype)
@@ -258,12 +259,6 @@ def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
             ]
         cosine, sine = x * cosine - y * sine, x * sine + y * cosine
     return jnp.stack([found[n, m] for n in range(1, degree + 1) for m in range(-n, n + 1)], axis=-1)
-
-
-def _root(x: Float[Array, " g"]) -> Float[Array, " g"]:
-    """Returns square roots, with zero gradient at 0."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
 def _determinant(axes: Float[Array, "g 2 3"], eps2d: Array | float) -> Float[Array, " g"]:

@@ -58,9 +58,6 @@ LARGEST_FOOTPRINT = 1e9
 Its square's square would overflow float32.
 """
 
-MEASURED = "performance.md"
-"""Page of docs with times."""
-
 
 @jax.tree_util.register_static
 @configuration
@@ -85,7 +82,7 @@ class SplatConfig:
         TRANSMITTANCE_STOP,
         cost="55 dB at 0.001, 40 dB at 0.01",
         gain="6 % of the time with gradients at 0.001, 10 % at 0.01",
-        measured=MEASURED,
+        measured="performance.md",
     )
     """A pixel ends before its transmittance would fall to this."""
     jacobian_margin: Spread | None = None
@@ -98,7 +95,7 @@ class SplatConfig:
         None,
         cost="61 dB at 2.5, 52 dB at 2, 46 dB at 1.5; splats are cut at tile borders",
         gain="14 %, 27 %, 35 % of the time",
-        measured=MEASURED,
+        measured="performance.md",
     )
     """Standard deviations at which footprints end; a splat is drawn on whole tiles, all that its
     footprint meets. None: where alpha falls below alpha_min, so that nothing is lost. Smaller
@@ -113,7 +110,7 @@ class SplatConfig:
             "`visible_gaussians(threshold=0.03)` with radius_sigma 2.5 and transmittance_stop"
             " 0.001: 0.75 of the time at 53.9 dB"
         ),
-        measured=MEASURED,
+        measured="performance.md",
     )
     """Whether `Rendering.visibility` is computed."""
     means2d: bool = False
@@ -130,14 +127,14 @@ class SplatConfig:
         None,
         cost="pairs beyond it are not drawn, counted and reported",
         gain="memory, one compilation",
-        measured=MEASURED,
+        measured="performance.md",
     )
     """Room for (splat, tile) pairs. None: an eager call measures its need. A traced call (under
     jit, grad or vmap) cannot, and takes `buffers.default_pairs(g, width, height)`; what does not
     fit is counted in `Rendering.overflow`, and `plan_buffers` measures a capacity for such calls.
     """
     max_rows: Capacity | None = knob(
-        None, cost="as max_pairs", gain="a little time", measured=MEASURED
+        None, cost="as max_pairs", gain="a little time", measured="performance.md"
     )
     """Room for (splat, row of tiles) pairs. None: as many as pairs, always enough in practice."""
     warn_overflow: bool = False
@@ -149,7 +146,7 @@ class SplatConfig:
         8,
         cost="none",
         gain="8 is best on CPUs: 4 takes 2.3 x, 16 takes 1.3 x the time",
-        measured=MEASURED,
+        measured="performance.md",
     )
     """Pixels. From here on: the schedule, which changes the time, not the image (but for rounding).
     """

@@ -93,7 +93,7 @@ def test_other_resolutions_keep_the_expressions(shipped):
     kept = np.zeros((4000, 3, 52), np.float32)
     kept[np.asarray(coarse.expressions.vertices)] = coarse.expressions.directions
     np.testing.assert_array_equal(kept, whole[order])
-    fine = split_long_edges(coarse, 0.03)
+    fine = split_long_edges(coarse, 0.03)[0]
     smile = dict(mouthSmileLeft=1.0, jawOpen=0.5)
     rest, posed = face(fine, **smile)
     move = np.asarray(posed.vertices - rest.vertices)

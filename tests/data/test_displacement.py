@@ -172,7 +172,7 @@ def test_a_displacement_of_the_body_itself_stays_as_it_is(body, filled):
 def test_another_displacement_of_a_body_costs_no_decimation(body, monkeypatch):
     config, small = tiny().with_conventions(body_vertices=190), decimate(body, 300)
     gaussian_body(small, config)
-    for name in ("decimate_with_kept", "split_with_weights"):
+    for name in ("decimate_with_kept", "split_long_edges"):
         monkeypatch.setattr(views, name, lambda *_: pytest.fail("made again"))
     for seed in range(2):
         on_gaussian_body(np.random.default_rng(seed).normal(size=(300, 3)), small, config)
