@@ -96,6 +96,7 @@ def _read_face(path: str | Path) -> dict[str, np.ndarray]:
         missing = sorted(set(KEYS) - set(arrays))
         if missing:
             raise InvalidFileError(f"key '{missing[0]}' is missing")
+        # the offsets of all shapes, one shape after the other
         names, count = arrays["names"], len(arrays["vertices"])
         check_indices("counts", arrays["counts"], (len(names),), count + 1)
         check_array("offsets", arrays["offsets"], (3, count), -LARGEST, LARGEST)
@@ -104,11 +105,13 @@ def _read_face(path: str | Path) -> dict[str, np.ndarray]:
         ends = np.cumsum(arrays["counts"].astype(np.int64))
         if not len(names) or ends[-1] != count:
             raise InvalidFileError(f"counts: expected a sum of {count}, the number of offsets")
+        # vertices are stored as steps from the one before, anew for each shape
         steps = arrays["vertices"].astype(np.int64)
         sums = np.cumsum(steps)
         before = np.concatenate([[0], sums[ends[:-1] - 1]])
         shape = np.repeat(np.arange(len(names)), np.diff(ends, prepend=0))
         rows = np.stack([sums - before[shape], shape], axis=1)
+        # parts that photos hardly show
         check_indices("part_faces", arrays["part_faces"], (None, 4), 1 << 16)
         check_indices("lips", arrays["lips"], (4,), 1 << 16)
         check_indices("parts", arrays["parts"], (len(arrays["part_faces"]),), len(PARTS))

@@ -115,6 +115,7 @@ def _sparse_rows(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _dense_rows(
     arrays: dict[str, np.ndarray], rows: str, columns: str, count: int, width: int
 ) -> np.ndarray:
+    """Makes the matrix (count, width) of `_sparse_rows`, with rows of sum 1."""
     check_limit("plain_bytes", 8 * count * width, "bytes of a matrix")
     check_indices(columns, arrays[columns], (count, None), width)
     check_array(
@@ -141,6 +142,7 @@ def save_body(path: str | Path, body: BodyModel) -> None:
         raise ValueError(
             f"body '{body.name}' has pose directions: this format is for bodies without them"
         )
+    # small numbers as integers, matrices by the entries that are not 0
     directions = np.asarray(body.shape_directions, np.float64)
     if np.abs(directions).max(initial=0) < DIRECTION_STEP * 32767:
         directions = np.rint(directions / DIRECTION_STEP).astype(np.int16)
@@ -150,9 +152,8 @@ def save_body(path: str | Path, body: BodyModel) -> None:
         "format": np.asarray(FORMAT),
         "name": np.asarray(body.name),
         "template": np.asarray(body.template, np.float32),
-        "shape_directions": np.ascontiguousarray(
-            np.moveaxis(directions, -1, 0)
-        ),  # compresses better by direction
+        # compresses better by direction
+        "shape_directions": np.ascontiguousarray(np.moveaxis(directions, -1, 0)),
         "regressor_vertices": _indices(regressor_columns),
         "regressor_values": regressor_values.astype(np.float32),
         "weight_joints": _indices(weight_columns),
@@ -162,6 +163,7 @@ def save_body(path: str | Path, body: BodyModel) -> None:
         "joint_names": np.asarray(body.joint_names),
         "shape_names": np.asarray(body.shape_names),
     }
+    # parts that a body may lack
     if body.uvs is not None:
         uvs = np.asarray(body.uvs, np.float64)
         inside = uvs.min() >= 0 and uvs.max() <= 1

@@ -399,16 +399,15 @@ def collapse_sequence(
     Returns: order (n,), 0 for the vertex that stays longest; into (n,), the vertex each one moves
     onto, itself if it never can.
     """
+    # what is hidden costs less, but for a few rings beside what is seen
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     hidden = exposure(vertices, faces) == 0
     for _ in range(RIM):
         hidden[faces[~hidden[faces].all(axis=1)]] = False
-    mesh = _Mesh(
-        vertices,
-        faces,
-        None if uv_faces is None else np.asarray(uv_faces),
-        np.where(hidden, HIDDEN, 1.0),
-    )
+    if uv_faces is not None:
+        uv_faces = np.asarray(uv_faces)
+    mesh = _Mesh(vertices, faces, uv_faces, np.where(hidden, HIDDEN, 1.0))
+    # the cheapest collapse that is allowed; entries of a heap whose vertex has changed are skipped
     heap = [(mesh.cost(u, v), u, v, 0) for u, ring in enumerate(mesh.beside) for v in ring]
     heapq.heapify(heap)
     removed, into = [], np.arange(len(vertices))
@@ -419,6 +418,7 @@ def collapse_sequence(
         if not mesh.allowed(u, v):
             mesh.blocked.setdefault(u, set()).add(v)
             continue
+        # the costs around v are others now
         ring = mesh.beside[u] - mesh.beside[v] - {v}
         mesh.collapse(u, v)
         removed.append(u)
@@ -428,6 +428,7 @@ def collapse_sequence(
             again.update((n, t) for t in mesh.blocked.pop(n, ()) if t in mesh.beside[n])
         for a, b in again:
             heapq.heappush(heap, (mesh.cost(a, b), a, b, mesh.stamp[a]))
+    # the first that is removed comes last; those that never can be come first
     order = np.zeros(len(vertices), np.int64)
     order[removed] = len(vertices) - 1 - np.arange(len(removed))
     kept = np.setdiff1d(np.arange(len(vertices)), removed)
@@ -513,6 +514,7 @@ def decimate_with_kept(
 
     Raises: ValueError, as it.
     """
+    # the collapses, which the body may carry
     total = body.template.shape[0]
     if not 0 < vertex_count <= total:
         raise ValueError(f"vertex_count {vertex_count}: body '{body.name}' has {total} vertices")
@@ -536,14 +538,14 @@ def decimate_with_kept(
     target = np.where(stays, np.arange(total), into)
     while not stays[target].all():
         target = target[target]
+    # faces whose corners are still three vertices
     renumber = np.full(total, -1)
     renumber[kept] = np.arange(vertex_count)
     faces = np.asarray(body.faces)
     ends = target[faces]
     solid = (ends != np.roll(ends, 1, axis=1)).all(axis=1)
-    if body.uvs is None:
-        uvs, uv_faces = None, None
-    else:
+    uvs, uv_faces = None, None
+    if body.uvs is not None:
         uvs, uv_faces = _carry_uvs(body, faces, target, solid)
     dtype = body.template.dtype
 

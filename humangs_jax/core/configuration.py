@@ -342,9 +342,8 @@ def check_range(cls: type, name: str, value: Any, path: str) -> None:
         raise ValueError(f"{path}: expected at most {MOST_ITEMS} numbers, got {len(values)}")
     for allowed in ranges:
         for each in values:
-            if (
-                isinstance(each, numbers.Real) and not allowed.low <= each <= allowed.high
-            ):  # nor NaN
+            within = not isinstance(each, numbers.Real) or allowed.low <= each <= allowed.high
+            if not within:  # nor is NaN
                 raise ValueError(f"{path} {each:.15g}: expected {allowed}")
 
 
@@ -449,9 +448,9 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
 def _find_part(kind: Any, base: Any, path: str) -> type:
     """Finds the class that a "kind" names."""
     known = {name: cls for name, cls in _PARTS.items() if issubclass(cls, base)}
-    name = (
-        kind.rpartition(".")[2] if isinstance(kind, str) else ""
-    )  # the first files say in which module, too
+    name = ""
+    if isinstance(kind, str):
+        name = kind.rpartition(".")[2]  # the first files say in which module, too
     if name not in known:
         raise ValueError(
             f"{path}.{KIND}: expected the name of a registered {base.__name__}, one of"
@@ -461,8 +460,10 @@ def _find_part(kind: Any, base: Any, path: str) -> type:
 
 
 def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
+    """Makes a configuration of an object of JSON."""
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected an object, got {values!r}")
+    # fields have today's names, and none is unknown
     values = dict(values)
     for before, now in getattr(cls, "renamed_fields", {}).items():
         if before in values and now not in values:
@@ -473,6 +474,7 @@ def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
     unknown = sorted(set(values) - set(annotations))
     if unknown:
         raise ValueError(f"{path}.{unknown[0]}: {cls.__name__} has no such field")
+    # each value as its annotation has it; fields without a default have to be there
     fields = {
         name: _build(annotations[name], value, f"{path}.{name}") for name, value in values.items()
     }

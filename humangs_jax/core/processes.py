@@ -226,6 +226,7 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
     Examples:
         >>> hg.enable_compile_cache()
     """
+    # a cache that JAX has already stays
     wish = os.environ.get(VARIABLE, "")
     if wish == "0":
         return None
@@ -235,6 +236,7 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
         given = os.environ.get(OF_JAX)
     if given:
         return Path(given)
+    # a folder for each version of JAX and processor, if it can be written to
     try:
         root = Path(folder or wish or user_cache() / "humangs_jax").expanduser()
         cache = root / f"jax-{version('jax')}-{version('jaxlib')}-{_processor()}"
@@ -243,6 +245,7 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
         _delete_oldest(root, LARGEST)
     except (OSError, RuntimeError):  # RuntimeError: no home
         return None
+    # for programs that this one starts, and for a JAX that is imported already
     os.environ[OF_JAX] = str(cache)
     settings: dict[str, Any] = {"jax_compilation_cache_dir": str(cache)}
     if QUICKEST_OF_JAX not in os.environ:

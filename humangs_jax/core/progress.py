@@ -153,23 +153,23 @@ def say(text: object, *, error: bool = False, lines: bool = True) -> None:
 @contextlib.contextmanager
 def stage(name: str) -> Generator[None]:
     """Shows a part of long work while the block runs, and measures it."""
+    # what is shown around this stage comes back at its end
     current, paused, bars = _current, _current.paused, set(_bars)
     name = printable(name)
     current.names.append(name)
     current.paused = False
+    # a thread counts seconds on a terminal, or names long stages in a log
     started, stop = time.perf_counter(), threading.Event()
     outermost = len(current.names) == 1
-    ticker = threading.Thread(
-        target=_tick if current.ticking else _name, args=(current, stop, started), daemon=True
-    )
+    show = _tick if current.ticking else _name
+    ticker = threading.Thread(target=show, args=(current, stop, started), daemon=True)
     if outermost and (current.ticking or current.naming):
         ticker.start()
     try:
         yield
     except BaseException:
-        _close(
-            set(_bars) - bars
-        )  # else the traceback keeps them open, and the next line is glued to them
+        # else the traceback keeps them open, and the next line is glued to them
+        _close(set(_bars) - bars)
         raise
     finally:
         stop.set()
@@ -178,6 +178,7 @@ def stage(name: str) -> Generator[None]:
         current.names.pop()
         current.paused = paused
         seconds = time.perf_counter() - started
+        # only outermost stages are measured
         if outermost:
             current.seconds[name] = current.seconds.get(name, 0.0) + seconds
             if current.ticking or current.lines:
@@ -258,6 +259,7 @@ def _without_postfix(items: Iterable[Any], made: Any) -> Iterator[Any]:
 
 
 def _close(bars: set[Any]) -> None:
+    """Gives bars their last line."""
     for each in bars:
         each.close()
 
@@ -275,6 +277,7 @@ def watched() -> bool:
 
 
 def _name(current: Progress, stop: threading.Event, _: float) -> None:
+    """Names a stage in a log, if it takes long."""
     if not stop.wait(LONG) and current.names:
         say(f"{_named(current)} ...", error=True)
 
@@ -285,6 +288,7 @@ def _named(current: Progress) -> str:
 
 
 def _tick(current: Progress, stop: threading.Event, started: float) -> None:
+    """Counts the seconds of a stage on a terminal."""
     while not stop.wait(TICK):
         if not current.paused and current.names:
             sys.stderr.write(f"{CLEAR}{_named(current)} ... {time.perf_counter() - started:.0f} s")

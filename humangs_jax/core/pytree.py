@@ -290,6 +290,7 @@ def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, in
     wanted = [sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in axes]
     if value is None and field.optional:
         return None
+    # what is no array
     shape = getattr(value, "shape", None)
     if not isinstance(shape, tuple):
         if not axes and isinstance(value, int | float):
@@ -303,11 +304,8 @@ def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, in
         fits = fits and (isinstance(want, str) or want == size)
     if not fits:
         return f": expected shape {_shown_shape([*shape[:batch], *wanted])}, got {shape}"
-    if (
-        field.floating
-        and not jnp.issubdtype(value.dtype, jnp.inexact)
-        and value.dtype != jax.dtypes.float0
-    ):
+    inexact = jnp.issubdtype(value.dtype, jnp.inexact) or value.dtype == jax.dtypes.float0
+    if field.floating and not inexact:
         advice = "x.astype(float) makes them"
         if value.dtype == np.uint8:
             advice = "colors of 0 to 255 are divided by 255"

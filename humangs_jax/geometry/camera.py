@@ -81,13 +81,14 @@ class Camera(Batchable):
         the rotation not orthonormal and right-handed (to 1e-3), the image empty, its sides no whole
         numbers, or the coefficients not those of the lens.
         """
+        # arrays of the type that is kept: float64 only if JAX has it
         given = K, cam_from_world, distortion
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given))
         array = jnp.asarray if traced else np.asarray
         K, cam_from_world = array(K), array(cam_from_world)
-        kept = jnp.promote_types(
-            jnp.result_type(K, cam_from_world), jnp.float32
-        )  # float64 only if JAX has it
+        kept = jnp.promote_types(jnp.result_type(K, cam_from_world), jnp.float32)
+
+        # shapes, which are known under transformations, too
         if K.shape != (3, 3):
             raise ValueError(f"K: expected shape (3, 3), got {K.shape}")
         if cam_from_world.shape != (4, 4):
@@ -102,6 +103,8 @@ class Camera(Batchable):
         if traced:
             arrays = jnp.asarray(K, kept), jnp.asarray(cam_from_world, kept)
             return cls(*arrays, width, height, coefficients, lens)
+
+        # numbers
         if coefficients is not None and not np.isfinite(coefficients).all():
             raise ValueError("distortion must be finite numbers")
         K, cam_from_world = K.astype(np.float64), cam_from_world.astype(np.float64)
@@ -110,19 +113,18 @@ class Camera(Batchable):
                 raise ValueError(
                     f"{name} must be finite numbers, at most {LARGEST_NUMBER:g} in magnitude"
                 )
+        # K: upper triangular without skew, with positive focal lengths
         if not (K[0, 0] > 0 and K[1, 1] > 0):
             raise ValueError(
                 f"K: focal lengths must be positive, got fx = {K[0, 0]}, fy = {K[1, 1]}"
             )
-        if abs(K[0, 1]) > RIGID_TOLERANCE * K[0, 0] or not np.allclose(
-            K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]
-        ):
+        skewed = abs(K[0, 1]) > RIGID_TOLERANCE * K[0, 0]
+        if skewed or not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
             raise ValueError(f"K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
+        # [R | t]: a rotation and a translation
         rotation = cam_from_world[:3, :3]
-        if (
-            np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID_TOLERANCE
-            or np.linalg.det(rotation) < 0
-        ):
+        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
             raise ValueError(
                 "cam_from_world: the rotation is singular, mirrored or scaled (R R^T must be 1 and"
                 " det R = 1)"
@@ -335,9 +337,8 @@ def orbit(
         >>> cameras = hg.orbit(target, 3.0, azimuths, 0.1, K, 512, 512)
     """
     azimuths = jnp.asarray(azimuths)
-    azimuths = azimuths.astype(
-        jnp.promote_types(azimuths.dtype, jnp.float32)
-    )  # integers, too, are radians
+    # integers, too, are radians
+    azimuths = azimuths.astype(jnp.promote_types(azimuths.dtype, jnp.float32))
     right_angle = np.pi / 2 + 1e-6  # with the rounding of float32
     if not isinstance(elevations, Tracer) and np.any(np.abs(elevations) > right_angle):
         raise ValueError(f"orbit: elevations {elevations}: expected radians between -pi/2 and pi/2")
@@ -369,9 +370,8 @@ def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]
     y = (jnp.arange(camera.height) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
     x, y = jnp.meshgrid(x, y)
     in_camera = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
-    in_camera = in_camera / jnp.linalg.norm(
-        in_camera, axis=-1, keepdims=True
-    )  # z = 1: the norm is at least 1
+    # z = 1: the norm is at least 1
+    in_camera = in_camera / jnp.linalg.norm(in_camera, axis=-1, keepdims=True)
     return camera.center, jnp.matmul(
         in_camera, camera.cam_from_world[:3, :3], precision=transform.EXACT
     )

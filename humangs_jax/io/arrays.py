@@ -54,17 +54,15 @@ def numbers(
 
     Raises: `error` with file, field and what was expected.
     """
+    # an array of numbers, in words for an error
     words = "numbers"
     if shape is not None and None not in shape:
         words = f"{' x '.join(map(str, shape))} numbers".lstrip()
     try:
         array = np.asarray(value)
-        if (
-            nulls
-            and array.dtype.kind == "O"
-            and all(x is None or type(x) in (int, float) for x in array.flat)
-        ):
-            array = array.astype(dtype)
+        if nulls and array.dtype.kind == "O":
+            known = all(x is None or type(x) in (int, float) for x in array.flat)
+            array = array.astype(dtype) if known else array
         if array.dtype.kind not in "fiub":  # numpy would read numbers in words, too
             raise TypeError
         array = array.astype(dtype)
@@ -72,10 +70,12 @@ def numbers(
         if isinstance(value, np.ndarray):
             words = f"real numbers, got {value.dtype}"
         raise error(file, field, f"expected {words}") from None
+    # how many there are
     if some and not array.size:
         raise error(file, field, f"expected at least one number, got shape {array.shape}")
     if shape is not None and not _fits(array, shape):
         raise error(file, field, f"expected shape {_in_words(shape)}, got {array.shape}")
+    # what they are
     with np.errstate(over="ignore"):
         finite = np.isfinite(array.astype(np.float32, copy=False))
     if not nulls and not finite.all():

@@ -210,6 +210,7 @@ def check_replaceable(
     Raises: ValueError for one of these, and for a symbolic link, a file, the working folder or one
     above it, a mount point, or a folder beside which nothing can be written.
     """
+    # the place can be replaced
     folder = Path(folder)
     if folder.is_symlink():
         raise ValueError(f"{folder}: is a symbolic link: expected the folder itself")
@@ -232,6 +233,7 @@ def check_replaceable(
     ):
         if wrong:
             raise ValueError(f"{folder}: {problem}")
+    # nothing that the work reads lies in it
     for path in (Path(path) for path in inputs if path is not None):
         # a loop of links ends `Path.resolve` with a RuntimeError
         if place.exists() and any(
@@ -240,6 +242,7 @@ def check_replaceable(
             raise ValueError(
                 f"{folder}: {path} lies in it and would be deleted: expected another folder"
             )
+    # what is in it is of this kind
     entries = _entries(folder)
     if mark is None or not entries:
         return
@@ -321,9 +324,9 @@ def add_files(
         with undisturbed():
             folder.mkdir(exist_ok=True)
             with _locked(folder, wait=True):
-                new = sorted(
-                    path.relative_to(temporary) for path in temporary.rglob("*") if path.is_file()
-                )
+                # the files in the order in which they are moved
+                files = (path for path in temporary.rglob("*") if path.is_file())
+                new = sorted(path.relative_to(temporary) for path in files)
                 if last is not None:
                     new.sort(key=lambda file: file == Path(last))
                 if first is not None:
@@ -331,6 +334,7 @@ def add_files(
                 if ours is not None:
                     check_ours((folder / file for file in new), ours)
                     without = [file for file in without if ours(folder / file)]
+                # what must not lie beside them goes first, what is out of date last
                 for file in invalid:
                     (folder / file).unlink(missing_ok=True)
                 for file in new:

@@ -125,6 +125,7 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     Raises: as `read_image`; FileError for several labels or colors, for a label 0 that is not
     black, for no black, and for alpha and greys that differ: which is the person?
     """
+    # labels of a palette without transparency
     with open_image(path) as (image, data):
         if image.format == "PNG":
             check_png_chunks(data)
@@ -171,9 +172,11 @@ def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
         background = 0
     else:
         background = black[0] if len(black) == 1 else None
+    # one label besides the background, or none
     others = [label for label in used.tolist() if label != background]
     if background is not None and len(others) <= 1:
         return ((labels != background) & bool(others)).astype(np.float32)
+    # greys of a palette
     colors = palette[used]
     if len(used) > 2 and colors.max() >= 128 and _is_grey(colors / 255):
         return palette[labels].mean(axis=-1, dtype=np.float32) / np.float32(255)

@@ -326,6 +326,7 @@ def walk(
         if (status.st_dev, status.st_ino) in seen:
             continue
         seen.add((status.st_dev, status.st_ino))
+        # files are given at once, folders are looked at later
         with os.scandir(place) as entries:
             for entry in entries:
                 count += 1
@@ -335,18 +336,18 @@ def walk(
                     continue
                 if not path.is_dir():
                     yield path
-                elif not skip(path):
-                    if not entry.is_symlink():
-                        waiting.append(path)
-                    elif limits().photos_outside or path.resolve().is_relative_to(
-                        Path(folder).resolve()
-                    ):
-                        links.append(path)
-                    elif not warned:
-                        warned = True
-                        logger.warning(
-                            "%s: leads out of %s: not followed (%s)", path, folder, OUTSIDE
-                        )
+                    continue
+                if skip(path):
+                    continue
+                if not entry.is_symlink():
+                    waiting.append(path)
+                    continue
+                root = Path(folder).resolve()
+                if limits().photos_outside or path.resolve().is_relative_to(root):
+                    links.append(path)
+                elif not warned:
+                    warned = True
+                    logger.warning("%s: leads out of %s: not followed (%s)", path, folder, OUTSIDE)
 
 
 def visible(paths: Iterable[Path]) -> list[Path]:

@@ -293,18 +293,19 @@ def _state_dict(
     The state dict is what lies under one of the keys, or else the content itself. What tensors take
     together is bounded by the size of the file. Raises: InvalidFileError.
     """
-    label = next(
-        (key for key in keys if isinstance(content, dict) and isinstance(content.get(key), dict)),
-        None,
-    )
-    model = content if label is None else content[label]
-    if not isinstance(model, dict) or (
-        label is None and not any(isinstance(x, _Tensor) for x in model.values())
-    ):
+    # the dict with the tensors
+    model, label = content, None
+    for key in keys:
+        if isinstance(content, dict) and isinstance(content.get(key), dict):
+            model, label = content[key], key
+            break
+    has_tensors = isinstance(model, dict) and any(isinstance(x, _Tensor) for x in model.values())
+    if not isinstance(model, dict) or (label is None and not has_tensors):
         names = " or ".join(map(repr, keys))
         raise InvalidFileError(f"expected a state dict, or a dict with one under {names}")
     if not all(isinstance(key, str) for key in model):
         raise InvalidFileError("the state dict has a key that is no string")
+    # those that are wanted
     chosen = {key: tensor for key, tensor in model.items() if wanted(key)}
     for key, tensor in chosen.items():
         if not isinstance(tensor, _Tensor):

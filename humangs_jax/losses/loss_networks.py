@@ -281,8 +281,9 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
     Raises: ValueError naming the tensor if one is missing, of another shape or not finite, or if
     there are two such networks that differ.
     """
+    # layers by their prefix; the prefix with most of the network
     expected = expected_tensors(network)
-    groups = collections.defaultdict(dict)  # by prefix
+    groups = collections.defaultdict(dict)
     for key in filter(_is_layer, tensors):
         match = LAYER.fullmatch(key)
         if match:
@@ -298,6 +299,7 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
             f"tensor '{before}{missing[0]}' of {network} is missing ({len(missing)} of"
             f" {len(expected)}){hint}"
         )
+    # another one that is whole has to be the same
     for other, names in groups.items():
         if names is found or not expected.keys() <= names.keys():
             continue

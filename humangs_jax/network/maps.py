@@ -125,6 +125,7 @@ def sample_neighborhoods(
     first = jnp.where((corner >= 0) & inside[:, None], 1 - fraction, 0.0)
     second = jnp.where((corner + 1 < size) & inside[:, None], fraction, 0.0)
 
+    # 4 x 4 texels around each position, of the grid with zeros around it
     x0, y0 = jnp.moveaxis(corner.astype(jnp.int32), -1, 0)
     padded = jnp.pad(grid, ((REACH, REACH), (REACH, REACH), (0, 0)))
     row_length = width + 2 * REACH
@@ -136,7 +137,8 @@ def sample_neighborhoods(
         # what lies outside adds nothing to a gradient, instead of zeros to one place
         return rows.at[top_left + i * row_length + j].get(mode="fill", fill_value=0)
 
-    across = []  # of each of the four texel rows, three taps
+    # three taps of each of the four texel rows, then three of these
+    across = []
     for i in range(KERNEL + 1):
         row = [texel(i, j) for j in range(KERNEL + 1)]
         across.append([first[:, :1] * row[b] + second[:, :1] * row[b + 1] for b in range(KERNEL)])

@@ -269,15 +269,16 @@ def sample_shells(
     size = (images.shape[2], images.shape[1])
 
     def view(image, mask, depth_map, camera, vertices, normals):
+        # what the photo shows at each point
         points = (vertices[:, None] + steps[:, None] * normals[:, None]).reshape(-1, 3)
         pixels, depths = project_vertices(camera, points)
         indices = texel_indices(pixels, size, size, grid)
         mask = mask[..., None].astype(image.dtype)  # the color of the background is not used
         read = sample_bilinear(jnp.concatenate([image * mask, mask], axis=-1), indices)
+        # a view counts by how much the surface faces it, unless the body hides the point
         surface = sample_nearest(depth_map, indices)
-        framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (
-            depths > 0
-        )
+        in_image = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1)
+        framed = in_image & (depths > 0)
         visible = framed & ((surface < 0) | (depths < surface + DEPTH_TOLERANCE))
         towards = camera.center - points
         distance = jnp.sqrt(jnp.maximum(jnp.sum(towards**2, axis=-1), 1e-6))
@@ -288,6 +289,7 @@ def sample_shells(
     colors, masks, weights, framed = jax.vmap(view)(
         images, foreground, depth_maps, cameras, vertices, normals
     )
+    # means over the views that are there
     framed, weights = framed & present[:, None], weights * present[:, None]
     total = jnp.sum(weights * masks, axis=0)
     sums = jnp.einsum("vpc,vp->pc", colors, weights, precision=transform.EXACT)

@@ -65,6 +65,7 @@ def chunked_attention(
     """Computes exact attention, head by head and one block of queries after the other; softmax
     statistics are in float32 at least.
     """
+    # queries of each head in blocks of equal length
     length, heads, width = q.shape
     blocks = -(-length // query_chunk)
     block = -(-length // blocks)
@@ -72,6 +73,7 @@ def chunked_attention(
     q = jnp.pad(q, ((0, 0), (0, blocks * block - length), (0, 0))).reshape(
         heads, blocks, block, width
     )
+    # keys beyond `count` are padding
     statistics = jnp.promote_types(q.dtype, jnp.float32)
     absent = None
     if count is not None:
@@ -87,9 +89,8 @@ def chunked_attention(
         out = jnp.einsum(
             "qk,ke->qe", weights.astype(values.dtype), values, preferred_element_type=statistics
         )
-        return (out / total).astype(
-            values.dtype
-        )  # dividing the sum spares a pass over the L x L weights
+        # dividing the sum spares a pass over the L x L weights
+        return (out / total).astype(values.dtype)
 
     def attend_head(head):
         queries, keys, values = head

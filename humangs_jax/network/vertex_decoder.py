@@ -107,14 +107,14 @@ class VertexDecoder(Decoder):
             raise ValueError(
                 'decoder.frame "normal" needs canonical_normals of the inputs, see `prepare_inputs`'
             )
+        # the heads, from what is known of each vertex; normals only where they are the frame
         unit, shells = subject_unit(inputs.canonical_vertices), features.shells
         canonical = inputs.canonical_vertices / unit
         entering = features
         if self.frame != "normal":
             entering = replace(features, normals=None)
-        raw = self._heads(
-            decoder_input(entering, canonical), 0 if shells is None else len(shells.distances)
-        )
+        count = 0 if shells is None else len(shells.distances)
+        raw = self._heads(decoder_input(entering, canonical), count)
         made = activate(raw, self, features)
         if ctx.conventions.pixels == "person" and shells is not None:
             # where the body is wider than the person, all photos show the background
@@ -256,10 +256,12 @@ def activate(
     With shells each Gaussian chooses between them by weights that sum to 1; the mean distance along
     the normal and the mean photo color are what its own offset and color correct.
     """
+    # shape
     offsets, quats, scales = jnp.split(raw.geometry, (3, 7), axis=-1)
     quats = quaternion.normalize(quats)
     if config.offset_scale is not None:
         offsets = config.offset_scale * jnp.tanh(offsets / config.offset_scale)
+    # what the photos show at the vertex, or on its shells
     colors, opacities = raw.appearance[..., :3], raw.appearance[..., 3]
     seen = None
     if features is not None and features.photo_colors is not None:
@@ -269,6 +271,7 @@ def activate(
         shells, chosen = features.shells, jax.nn.softmax(raw.shells, axis=-1)
         offsets = offsets.at[..., 2].add(_mean(chosen, shells.distances))
         seen = jnp.einsum("nks,nsc->nkc", chosen, shells.colors, precision=EXACT)
+    # offsets and rotations are those of the frame of the normal
     if config.frame == "normal":
         assert features is not None and features.normals is not None  # such a network is given them
         frames = normal_frames(features.normals)[:, None]

@@ -78,6 +78,8 @@ def _reference(
     features: Array | None,
     shifts: Array | None,
 ) -> Rendering:
+    """Draws all Gaussians on all pixels, see the module."""
+    # Gaussians on the image: centres, axes, opacities as they are drawn
     centers, axes, depths, visible = _project(gaussians, camera, config)
     if shifts is not None:
         centers = centers + shifts
@@ -89,6 +91,7 @@ def _reference(
         opacities = opacities * jnp.sqrt(_determinant(axes, contained) / determinants)
     elif config.antialiased and eps2d > 0:
         opacities = opacities * safe_sqrt(_determinant(axes, 0.0) / determinants)
+    # the nearest first, and all pixels
     order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
     y, x = jnp.mgrid[: camera.height, : camera.width] + 0.5
     pixels = jnp.stack([x, y], axis=-1).astype(centers.dtype)
@@ -96,11 +99,13 @@ def _reference(
     def draw(state, splat):
         color, (first, second), median, transmittance, ended = state
         center, axis, determinant, depth, is_visible, opacity, rgb = splat
+        # alpha of this Gaussian at each pixel
         d = pixels - center
         squared = jnp.sum(_cross(axis, d[..., None]) ** 2, axis=-1) + eps2d * jnp.sum(d**2, axis=-1)
         raw = opacity * jnp.exp(-0.5 * squared / determinant)
         alpha = jnp.where(raw < config.alpha_max, raw, config.alpha_max)
         alpha = jnp.where(is_visible & (raw >= config.alpha_min), alpha, 0.0)
+        # a pixel ends before the Gaussian that would leave too little
         ended = ended | (transmittance * (1 - alpha) <= config.transmittance_stop)
         alpha = jnp.where(ended, 0.0, alpha)
         weight, after = alpha * transmittance, transmittance * (1 - alpha)
@@ -113,6 +118,7 @@ def _reference(
         )
         return state, None
 
+    # colors along the line of sight
     blank = jnp.zeros((camera.height, camera.width), centers.dtype)
     colors = gaussians.colors
     if gaussians.harmonics is not None:
@@ -128,6 +134,7 @@ def _reference(
         colors = jnp.maximum(colors + added, 0)
     if features is not None:
         colors = jnp.concatenate([colors, features], axis=-1)
+    # the loop over the Gaussians, and the image over the background
     colored = jnp.zeros((*blank.shape, colors.shape[1]), blank.dtype)
     state = colored, (blank, blank), blank, blank + 1, blank > 0
     splats = centers, axes, determinants, depths, visible, opacities, colors
