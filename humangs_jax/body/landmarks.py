@@ -97,7 +97,8 @@ def _mirrored_face(i: int) -> tuple[int, int]:
         if first <= i < end:
             mirrored = total - i
             on_the_right = (i < mirrored) if left_is_later else (i > mirrored)
-            return mirrored, -1 if on_the_right else 1
+            side = -1 if on_the_right else 1
+            return mirrored, side
     if i in _FACE_EYES:
         return _FACE_EYES[i], -1
     right_of_left = {left: right for right, left in _FACE_EYES.items()}
@@ -388,10 +389,9 @@ def _placed(
 
     surface: all vertices, on the host.
     """
-    points = [
-        _rows(surface, [source]) if source >= 0 else _joint_point(body, surface, -1 - source)
-        for source in finder.find(place.base)
-    ]
+    sources = finder.find(place.base)
+    points = [_rows(surface, [vertex]) for vertex in sources if vertex >= 0]
+    points += [_joint_point(body, surface, -1 - source) for source in sources if source < 0]
     mean = jax.tree.map(lambda leaf: leaf.mean(axis=0, keepdims=True), _concatenated(points))
     weights = mean.weights
     if place.joints:

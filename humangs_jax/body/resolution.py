@@ -519,11 +519,9 @@ def decimate_with_kept(
     if not 0 < vertex_count <= total:
         raise ValueError(f"vertex_count {vertex_count}: body '{body.name}' has {total} vertices")
     if body.collapse_order is None or body.collapse_into is None:
-        order, into = collapse_sequence(
-            np.asarray(body.template),
-            np.asarray(body.faces),
-            None if body.uvs is None else np.asarray(body.uv_faces),
-        )
+        seams = None if body.uvs is None else np.asarray(body.uv_faces)
+        template, faces = np.asarray(body.template), np.asarray(body.faces)
+        order, into = collapse_sequence(template, faces, seams)
     else:
         order, into = np.asarray(body.collapse_order), np.asarray(body.collapse_into)
     smallest = int(np.sum(into == np.arange(total)))

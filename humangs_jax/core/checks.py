@@ -98,9 +98,8 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
         for name in arrays.keys() & given.keys():
             fault = _no_array(arrays[name], given[name])
             if fault:
-                raise (ValueError if hasattr(given[name], "shape") else TypeError)(
-                    f"{call}: {name}: {fault}"
-                )
+                error = ValueError if hasattr(given[name], "shape") else TypeError
+                raise error(f"{call}: {name}: {fault}")
         return function(*args, **kwargs)
 
     return checked
@@ -122,7 +121,9 @@ def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
     if value is None and type(None) in options:
         return None
     types_ = [x for x in options if hasattr(x, "dims")]
-    shape = getattr(value, "shape", () if isinstance(value, NUMBERS) else None)
+    shape = getattr(value, "shape", None)
+    if shape is None and isinstance(value, NUMBERS):
+        shape = ()
     ranks = {len(x.dims) for x in types_ if isinstance(x.dims, tuple) and x.index_variadic is None}
     if shape is not None and (len(ranks) < len(types_) or len(shape) in ranks):
         return None

@@ -268,7 +268,9 @@ def user_cache() -> Path:
     folder = os.environ.get("LOCALAPPDATA")
     if sys.platform == "win32" and folder:
         return Path(folder)
-    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+    if sys.platform == "darwin":
+        return Path.home() / "Library/Caches"
+    return Path.home() / ".cache"
 
 
 def _processor() -> str:

@@ -85,7 +85,9 @@ class Formats(dict[str, F]):
 def alternatives(suffixes: tuple[str, ...]) -> str:
     """Lists suffixes as errors name them: ".bvh, .glb or a folder"."""
     words = [suffix for suffix in suffixes if suffix] + ["a folder"] * (FOLDER in suffixes)
-    return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    if len(words) > 1:
+        words = [", ".join(words[:-1]), words[-1]]
+    return " or ".join(words)
 
 
 def imported(code: str | Callable[..., Any]) -> Callable[..., Any]:

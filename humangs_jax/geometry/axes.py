@@ -30,7 +30,8 @@ def upright_matrix(up: str) -> Float[np.ndarray, "3 3"]:
 def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
     """Returns the name of the axis that a vector points along most, and its component there."""
     axis = int(np.argmax(np.abs(direction)))
-    return ("-" if direction[axis] < 0 else "") + "xyz"[axis], float(np.abs(direction[axis]))
+    sign = "-" if direction[axis] < 0 else ""
+    return sign + "xyz"[axis], float(np.abs(direction[axis]))
 
 
 def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:

@@ -97,7 +97,8 @@ class Camera(Batchable):
         coefficients = None
         if distortion is not None:
             coefficients = jnp.asarray(distortion, kept)
-        check_lens(lens, None if coefficients is None else coefficients.size)
+        count = None if coefficients is None else coefficients.size
+        check_lens(lens, count)
         if coefficients is not None and coefficients.ndim != 1:
             raise ValueError(f"distortion: expected shape (n,), got {coefficients.shape}")
         if traced:
@@ -219,9 +220,10 @@ def stack_cameras(cameras: list[Camera]) -> Camera:
     """
     if not cameras:
         raise ValueError("no cameras to stack")
-    if len({(c.width, c.height) for c in cameras}) > 1:
-        raise ValueError(f"image sizes differ: {sorted({(c.width, c.height) for c in cameras})}")
-    if len({(c.lens, None if c.distortion is None else c.distortion.shape) for c in cameras}) > 1:
+    image_sizes = {(camera.width, camera.height) for camera in cameras}
+    if len(image_sizes) > 1:
+        raise ValueError(f"image sizes differ: {sorted(image_sizes)}")
+    if len({(c.lens, getattr(c.distortion, "shape", None)) for c in cameras}) > 1:
         raise ValueError("lenses differ: expected one lens with one number of coefficients")
     return jax.tree.map(lambda *leaves: joined(leaves), *cameras)
 
@@ -236,11 +238,9 @@ def project(
     p = transform.apply(camera.cam_from_world, points)
     depth = p[..., 2]
     if not camera.is_plain:
-        if camera.lens == "orthographic":
-            slopes = p[..., :2]
-        else:
-            slopes = p[..., :2] / depth[..., None]
+        slopes = p[..., :2]
         if camera.lens != "orthographic":
+            slopes = slopes / depth[..., None]
             x, y = distorted(camera.lens, camera.distortion, slopes[..., 0], slopes[..., 1])
             slopes = jnp.stack([x, y], axis=-1)
         focal = jnp.stack([camera.K[0, 0], camera.K[1, 1]])

@@ -52,7 +52,8 @@ def distorted(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> tuple[Array, Array]:
     """Returns where the lens puts points of the plane z = 1. Raises: as `check_lens`."""
-    check_lens(lens, None if coefficients is None else coefficients.shape[-1])
+    count = None if coefficients is None else coefficients.shape[-1]
+    check_lens(lens, count)
     if lens == "fisheye":
         scale = _fisheye_scale(coefficients, u * u + v * v)
         return u * scale, v * scale

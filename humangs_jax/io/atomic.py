@@ -271,7 +271,8 @@ def _described(entry: Path) -> str:
     if entry.is_symlink() or not entry.is_dir():
         return entry.name
     count = sum(len(files) for _, _, files in os.walk(entry))
-    return f"{entry.name} ({count} file{'' if count == 1 else 's'})"
+    files = "file" if count == 1 else "files"
+    return f"{entry.name} ({count} {files})"
 
 
 def _entries(folder: str | os.PathLike[str]) -> list[str]:
@@ -317,7 +318,8 @@ def add_files(
         _sweep(folder.resolve())
     folder.parent.mkdir(parents=True, exist_ok=True)
     _sweep(folder.resolve().parent)  # also of one that was killed after it had made the folder
-    temporary = (folder if inside else folder.parent) / f".{folder.resolve().name}.new-{_tag()}"
+    beside = folder if inside else folder.parent
+    temporary = beside / f".{folder.resolve().name}.new-{_tag()}"
     with _naming(folder, temporary), _unfinished(temporary):
         temporary.mkdir()
         write(temporary)
@@ -410,11 +412,13 @@ def _locked(folder: Path, wait: bool, lock: Path | None = None) -> Generator[Non
     except ImportError:  # Windows
         yield
         return
+    create = os.O_CREAT if lock else 0
     with _naming(folder, lock or folder):
-        descriptor = os.open(lock or folder, os.O_RDONLY | (os.O_CREAT if lock else 0))
+        descriptor = os.open(lock or folder, os.O_RDONLY | create)
     try:
+        at_once = 0 if wait else fcntl.LOCK_NB
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            fcntl.flock(descriptor, fcntl.LOCK_EX | at_once)
         except BlockingIOError:
             raise BlockingIOError(
                 f"{folder}: another process is writing here: expected another folder"

@@ -329,8 +329,10 @@ def _curve(tag: bytes) -> Curve:
         table = np.frombuffer(tag[12 : 12 + 2 * count], ">u2")
         if len(table) != count:
             raise InvalidFileError("it has a curve that is cut off")
-        if count < 2:
-            return _power(float(table[0]) / 256 if count else 1.0)
+        if count == 0:
+            return _power(1.0)
+        if count == 1:
+            return _power(float(table[0]) / 256)
         return lambda levels: np.interp(levels, np.linspace(0, 1, count), table / 65535)
     if tag[:4] != b"para":
         raise InvalidFileError("it has a curve of an unknown kind")

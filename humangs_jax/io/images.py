@@ -498,7 +498,10 @@ def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
     """
     with open_image(path) as (image, data):
         found = image.size, "A" in image.getbands() or "transparency" in image.info
-        check_png_chunks(data) if image.format == "PNG" else image.load()
+        if image.format == "PNG":
+            check_png_chunks(data)
+        else:
+            image.load()
     return found
 
 
@@ -545,7 +548,8 @@ def _levels(image: Any, data: bytes) -> tuple[UInt[np.ndarray, "h w c"], int]:
     if image.mode.startswith("I"):  # 16-bit grey
         return np.asarray(image).astype(np.uint16)[..., None], 65535
     has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-    return np.asarray(image.convert("RGBA" if has_alpha else "RGB")), 255
+    mode = "RGBA" if has_alpha else "RGB"
+    return np.asarray(image.convert(mode)), 255
 
 
 def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:

@@ -146,7 +146,9 @@ class GlbWriter:
         """Adds bytes, which start at a multiple of 4; returns the index of their view."""
         self.data += bytes(-len(self.data) % 4)
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
-        self.views.append(view if target is None else view | {"target": target})
+        if target is not None:
+            view["target"] = target
+        self.views.append(view)
         self.data += data
         return len(self.views) - 1
 
@@ -159,7 +161,8 @@ class GlbWriter:
         Arguments: kind: as in COLUMNS. bounds: also tell the least and the largest of each column,
         as positions and times must.
         """
-        values = np.ascontiguousarray(values, values.dtype if values.dtype.kind == "u" else "<f4")
+        dtype = values.dtype if values.dtype.kind == "u" else "<f4"
+        values = np.ascontiguousarray(values, dtype)
         component = next(
             code for code, name in COMPONENTS.items() if np.dtype(name) == values.dtype
         )
@@ -266,9 +269,9 @@ def read_obj(path: str | Path) -> list[Any]:
                 )
             low, high = int(part.faces.min()), int(part.faces.max())
             if low < 0 or high >= len(part.vertices):
+                wrong = low if low < 0 else high
                 raise InvalidFileError(
-                    f"a face has the corner {low if low < 0 else high}, but there are"
-                    f" {len(part.vertices)}"
+                    f"a face has the corner {wrong}, but there are {len(part.vertices)}"
                 )
         return parts
 
@@ -319,7 +322,7 @@ class _Folder:
                 check_limit("parts", len(self.read) + len(self.faults), "materials and textures")
                 names = _names_in(key.strip())
                 found = [name for name in names if (self.folder / name).exists()]
-                self.read[key] = self._content(found[0] if found else names[0])
+                self.read[key] = self._content([*found, names[0]][0])
             except (ValueError, OSError) as error:
                 self.faults[key] = str(error)
         if key in self.faults:
@@ -363,5 +366,7 @@ def _names_in(text: str) -> list[str]:
     options = r"^(?:-\w+(?:\s+(?:on|off|[lrgbmz]|[-+.\deE]+))+\s+)+"
     plain = re.sub(options, "", text).strip().strip("\"'").replace("\\ ", " ")
     first = re.match(r"\S+\.mtl\b", plain, re.IGNORECASE)
-    names = [text, plain, plain.replace("\\", "/"), *([first[0]] if first else [])]
+    names = [text, plain, plain.replace("\\", "/")]
+    if first:
+        names.append(first[0])
     return list(dict.fromkeys(names))

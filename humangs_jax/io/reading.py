@@ -235,18 +235,17 @@ def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Gen
         raise raises("", "", error) from error
     except FileNotFoundError as error:
         missing = f"{error.filename or path}: no such file"
-        raise (
-            FileNotFoundError(missing) if raises is FileError else raises("", "", missing)
-        ) from error
+        if raises is FileError:
+            raise FileNotFoundError(missing) from error
+        raise raises("", "", missing) from error
     except InvalidFileError as error:
         raise raises(path, "", error) from error
     except PermissionError as error:
         raise raises(error.filename or path, "", "no permission to read it") from error
     except Exception as error:  # readers of damaged files raise some twenty types
-        named = str(path) and str(error).startswith(f"{path}: ")
-        raise raises(
-            "" if named else path, "", str(error) if named else _why(kind, error)
-        ) from error
+        if str(path) and str(error).startswith(f"{path}: "):
+            raise raises("", "", str(error)) from error
+        raise raises(path, "", _why(kind, error)) from error
 
 
 def _why(kind: str, error: Exception) -> str:

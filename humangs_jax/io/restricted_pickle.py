@@ -150,9 +150,11 @@ class _Looked:
             raise InvalidFileError(
                 "a dict with keys other than strings, numbers and short tuples of these"
             )
-        if opcode.stack_after:
+        if name == "MARK":
+            stack.append(None)
+        elif opcode.stack_after:
             made = 1 + sum(part or 0 for part in taken) + sum(part or 0 for part in items)
-            stack.append(None if name == "MARK" else min(made, COUNTED))
+            stack.append(min(made, COUNTED))
 
 
 class Call(NamedTuple):
@@ -192,7 +194,8 @@ class StandIn:
 
     def __setstate__(self, state: Any) -> None:
         """Takes what BUILD hands over: a dict, or a pair of dicts."""
-        for part in state if isinstance(state, tuple) else (state,):
+        parts = state if isinstance(state, tuple) else (state,)
+        for part in parts:
             if isinstance(part, dict):
                 self.state.update(part)
 
@@ -387,8 +390,10 @@ class _Sparse(StandIn):
             or ends[-1] != count
         ):
             raise ValueError("index pointers that do not count the entries")
-        places = [np.repeat(np.arange(len(steps)), steps), _numbers(self.state["indices"])]
-        return places[:: 1 if self.axis == 0 else -1]
+        along, across = np.repeat(np.arange(len(steps)), steps), _numbers(self.state["indices"])
+        if self.axis == 0:
+            return [along, across]
+        return [across, along]
 
     def to_array(self) -> np.ndarray:
         shape, data = self.state["_shape"], _numbers(self.state["data"])

@@ -199,11 +199,10 @@ class _TorchUnpickler(RestrictedUnpickler):
     def __init__(
         self, file: Any, names: Mapping = _NAMES, read: Callable[[str], bytes] | None = None
     ) -> None:
-        super().__init__(
-            file,
-            names,
-            "no part of a state dict" if names is _NAMES else "it is not needed to hold arrays",
-        )
+        purpose = "it is not needed to hold arrays"
+        if names is _NAMES:
+            purpose = "no part of a state dict"
+        super().__init__(file, names, purpose)
         self.kinds: dict[str, str] = {}
         self.read_storage = functools.cache(read or {}.__getitem__)
 

@@ -198,10 +198,12 @@ def load_loss_networks(
         raise ValueError(f"{lpips_heads}: heads of LPIPS, but no file for its backbone")
     if installed and lpips_backbone is None:
         lpips_backbone = installed_lpips().get(lpips_net)
-    return LossNetworks(
-        None if vgg19 is None else load_vgg19(vgg19),
-        None if lpips_backbone is None else load_lpips(lpips_net, lpips_backbone, lpips_heads),
-    )
+    perceptual, lpips = None, None
+    if vgg19 is not None:
+        perceptual = load_vgg19(vgg19)
+    if lpips_backbone is not None:
+        lpips = load_lpips(lpips_net, lpips_backbone, lpips_heads)
+    return LossNetworks(perceptual, lpips)
 
 
 def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:

@@ -139,7 +139,9 @@ def _release_name(path: str) -> tuple[str, Layout]:
         name = f"transformer_blocks.{index}.{name}"
     else:
         name, layout = MODULES[module]
-    return f"{name}.{FIELDS[field]}", layout if field == "kernel" else SAME
+    if field != "kernel":
+        layout = SAME
+    return f"{name}.{FIELDS[field]}", layout
 
 
 def to_release(variables: Variables) -> StateDict:

@@ -86,8 +86,8 @@ class HumanGSInputs:
     @property
     def present(self) -> Bool[Array, " v"]:
         """Which views are not padding."""
-        views = jnp.arange(len(self.images))
-        return views < (len(self.images) if self.view_count is None else self.view_count)
+        count = len(self.images) if self.view_count is None else self.view_count
+        return jnp.arange(len(self.images)) < count
 
 
 def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:

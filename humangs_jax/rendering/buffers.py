@@ -156,10 +156,8 @@ def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[
     config = dataclasses.replace(config, max_pairs=None, max_rows=None)
     size = np.asarray([cameras.width, cameras.height], np.int32)
     sizeless = replace(cameras, width=1, height=1)
-    each = [
-        needed_by(gaussians, camera, size, config)
-        for camera in (sizeless if sizeless.batch_shape else [sizeless])
-    ]
+    each_camera = sizeless if sizeless.batch_shape else [sizeless]
+    each = [needed_by(gaussians, camera, size, config) for camera in each_camera]
     rows, pairs = np.asarray(each, int).reshape(-1, 2).max(axis=0, initial=0)
     return [int(rows), int(pairs)]
 

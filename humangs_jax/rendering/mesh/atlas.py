@@ -228,7 +228,8 @@ def _turned(flat: np.ndarray, owner: np.ndarray, count: int, angles: int = 8) ->
 
 def _extreme(function: np.ufunc, values: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
     """Returns the least or greatest values (u, 2) of each chart, (charts, 2)."""
-    result = np.full((count, 2), np.inf if function is np.minimum else -np.inf)
+    worst = np.inf if function is np.minimum else -np.inf
+    result = np.full((count, 2), worst)
     function.at(result, owner, values)
     return result
 
