@@ -195,8 +195,8 @@ FOOT = {
 
 
 class PlacedLandmark(NamedTuple):
-    """A landmark whose place a fit may move, as one of a group: a left and a right one move alike.
-    A tuple without names, as files of `jax.export` give it back, can be unpacked like it.
+    """A landmark whose place a fit may move, a left and a right one together. It is unpacked like a
+    tuple, as which files of `jax.export` give it back.
     """
 
     landmark: int

@@ -1,4 +1,4 @@
-"""Triangles and directions on the host, by numpy in float64 where they are."""
+"""Triangles and directions on the host, by numpy, in the precision of the arrays."""
 
 import numpy as np
 

@@ -1,5 +1,5 @@
-"""Rigid and affine 4x4 transforms of column vectors, named by their frames: p_a = a_from_b p_b.
-Order of points in space.
+"""Rigid and affine 4x4 transforms of column vectors, named by their frames: p_a = a_from_b p_b; and
+an order of points in space.
 
 Products ask for full precision: accelerators otherwise round float32 factors to 8 or 10 bits, which
 is millimetres.

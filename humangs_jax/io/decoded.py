@@ -14,8 +14,9 @@ WHOLE_LEVELS = np.float32(255)
 
 
 class Decoded:
-    """Pixels by the content of their files, so that a copy of a photo is that photo. What does not
-    fit is not kept, rather than what came first: photos are read in turn, again and again.
+    """Keeps pixels by the content of their files, so that a copy of a photo counts as that photo.
+    Photos are read in turn, again and again: what comes first stays, and what does not fit any more
+    is left out.
     """
 
     def __init__(self, most: int) -> None:

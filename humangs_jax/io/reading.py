@@ -196,9 +196,8 @@ def _one_line(text: object, longest: int = LONGEST_LINE) -> str:
 
 
 class FileError(ValueError):
-    """Something is wrong with a file; the message is one line: file, field, and what was expected.
-
-    Empty parts are left out.
+    """Says what is wrong with a file in one line: file, field, and what was expected. Empty parts
+    are left out.
     """
 
     def __init__(self, file: object, field: str, problem: object):

@@ -416,19 +416,27 @@ class _Sparse(StandIn):
 
 
 class _SparseRows(_Sparse):
+    """A matrix compressed along its rows."""
+
     axis = 0
 
 
 class _SparseColumns(_Sparse):
+    """A matrix compressed along its columns."""
+
     axis = 1
 
 
 class _Chumpy(StandIn):
+    """An array of chumpy."""
+
     def to_array(self) -> np.ndarray:
         return _numbers(self.state["x"])
 
 
 class _ChumpySelection(StandIn):
+    """Some of the numbers of an array of chumpy."""
+
     def to_array(self) -> np.ndarray:
         if isinstance(self.state["a"], _Chumpy):
             source = self.state["a"].to_array()

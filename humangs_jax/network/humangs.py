@@ -37,10 +37,10 @@ from humangs_jax.network.parts import (
 
 
 class HumanGS(nn.Module):
-    """The parts as one module: its variables are theirs, by their names here.
+    """The parts as one module, whose variables are those of the parts under their names here.
 
-    For Linen's own means to look inside, as `intermediates` and interceptors. The driver is no part
-    of the pass.
+    Linen's means to look inside, such as interceptors, work on it. The driver is no part of the
+    pass.
     """
 
     encoder: Encoder

@@ -317,7 +317,7 @@ class TargetDecoder(Part, nn.Module):
 
 
 class Tap(nn.Module):
-    """What `tap` calls."""
+    """The module behind `tap`, which interceptors of Linen see."""
 
     apart: bool = False
     """Whether each entry of the dict that the function returns is a stage by itself."""

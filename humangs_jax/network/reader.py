@@ -56,7 +56,7 @@ WEIGHT_EPSILON = 1e-6
 
 @part
 class PixelAlignedReader(Reader):
-    """What vertices read."""
+    """The paper's reader: each vertex reads the feature maps where the photos show it."""
 
     output_width: Width | None = 768
     """Features of a last 3x3 convolution, evaluated only where vertices read the maps; None: the

@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 
 class BufferOverflowError(ValueError):
-    """A view needs larger buffers than its configuration has."""
+    """Says that a view needs larger buffers than its configuration has."""
 
 
 def round_up(size: int, smallest: int = 64) -> int:
