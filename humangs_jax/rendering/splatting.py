@@ -39,10 +39,11 @@ from humangs_jax.rendering.buffers import (
     warn_of_overflow,
     with_default_buffers,
 )
-from humangs_jax.rendering.compositing import composite, pack_splats
+from humangs_jax.rendering.compositing import composite
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import ProjectedGaussians, project_gaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, DEFAULT_CONFIG, SplatConfig, splat_config
+from humangs_jax.rendering.splat_rows import pack_splats
 from humangs_jax.rendering.tiling import (
     TileGrid,
     depth_order,

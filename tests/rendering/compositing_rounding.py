@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from rounding import SCALE, UNIT
 
-from humangs_jax.rendering.compositing import CHUNK
+from humangs_jax.rendering.compositing_on_accelerators import CHUNK
 
 EXP = LOG = 4
 """Roundings of an exponential or a logarithm: XLA's are good to two units in the last place."""

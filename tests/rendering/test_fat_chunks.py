@@ -13,7 +13,8 @@ from compositing_rounding import analyse
 from hypothesis import given
 from hypothesis import strategies as st
 
-from humangs_jax.rendering import compositing
+from humangs_jax.rendering import compositing_on_accelerators as accelerators
+from humangs_jax.rendering import compositing_on_cpu as cpu
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import TileGrid, TileLists
 
@@ -23,12 +24,12 @@ EXACT = 1e-10
 In float32 each entry has its own bound, see compositing_rounding.py.
 """
 
-K = compositing.CHUNK
+K = accelerators.CHUNK
 GRID = TileGrid(21, 13, 8)  # six tiles
 LENGTHS = (0, 3 * K + 5, K, K + 1, 2 * K - 1, 1)
 SPLATS, CAPACITY = 4 * K, 6 * 4 * K
-THIN = compositing.forward_by_blocks, compositing.backward_by_blocks
-FAT = compositing.forward_by_chunks, compositing.backward_by_chunks
+THIN = cpu.forward_by_blocks, cpu.backward_by_blocks
+FAT = accelerators.forward_by_chunks, accelerators.backward_by_chunks
 PER_STEP = 3
 """Chunks per step, so that lists run on from step to step and the last step has padding."""
 
@@ -62,7 +63,7 @@ def schedule(functions, splats, lists, grid=GRID, config=None, per_step=1024):
     """Everything a schedule computes, for a random cotangent."""
     config = config or SplatConfig(tile_size=grid.tile_size, block=4, chunk=4, visibility=True)
     forward, backward = functions
-    with mock.patch.object(compositing, "STEP_CHUNKS", per_step):
+    with mock.patch.object(accelerators, "STEP_CHUNKS", per_step):
         features, transmittance, lengths, peaks, _ = forward(grid, config)(splats, *lists)
         g, g_transmittance = cotangents(grid, splats.dtype)
         total = jnp.sum(g * features, axis=1) + g_transmittance * transmittance
@@ -218,16 +219,16 @@ def test_chunks_cover_the_lists(counts, gap):
     assert (chunks.tiles[n:] == 5).all() and not chunks.counts[n:].any()
 
 
-cut = jax.jit(compositing.cut, static_argnums=(2, 3))
+cut = jax.jit(accelerators.cut, static_argnums=(2, 3))
 
 
 def test_steps_are_bounded_in_memory():
     for tile_size, dtype in ((8, np.float32), (16, np.float32), (32, np.float32), (16, np.float64)):
-        b = compositing._chunks_per_step(TileGrid(512, 512, tile_size), dtype, 1 << 20, 1024)
-        assert 1 <= b <= compositing.STEP_CHUNKS
-        assert b * K * tile_size**2 * np.dtype(dtype).itemsize <= compositing.STEP_BYTES
+        b = accelerators._chunks_per_step(TileGrid(512, 512, tile_size), dtype, 1 << 20, 1024)
+        assert 1 <= b <= accelerators.STEP_CHUNKS
+        assert b * K * tile_size**2 * np.dtype(dtype).itemsize <= accelerators.STEP_BYTES
     assert (
-        compositing._chunks_per_step(GRID, np.float32, 2 * K, 6) == 8
+        accelerators._chunks_per_step(GRID, np.float32, 2 * K, 6) == 8
     )  # no more than there can be
 
 

@@ -1,0 +1,222 @@
+"""Compositing for CPUs: small blocks of tiles, see `rendering.compositing`.
+
+Tiles come by falling list length in blocks of `config.block`; a block takes its lists in chunks
+until the longest list ends or all its pixels have. A chunk's arrays (block, chunk, pixels) stay
+in the cache. Its chain of splats is unrolled, once for each array that the loop carries: XLA
+makes ONE kernel of each, which runs the chain in registers. Once a pixel has stopped, the loop
+carries -T, which keeps the final T. Compile with `core.processes.compiler_options`: sharing small
+kernels out over threads costs more than it gains, and the barriers have to be kept.
+"""
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.rendering.splat_rows import (
+    FEATURES,
+    HALF,
+    Composited,
+    Z,
+    joined_over_batch,
+    largest_weights,
+    moments_about_splat,
+    monomials,
+    product,
+    take_chunk,
+    visible_alpha,
+)
+from humangs_jax.rendering.tiling import TileGrid, blocks_by_length
+
+
+class _Chain(NamedTuple):
+    """What a block carries from one chunk of its lists to the next."""
+
+    chunk: Array | int
+    """Number of the chunk."""
+    transmittance: Float[Array, "block p"]
+    """T in front of the chunk; -T once a pixel has ended."""
+    features: Float[Array, "block n p"]
+    """Sum of w f so far."""
+    lengths: Int[Array, " block"]
+    """How many splats of each list have been read."""
+    live: Bool[Array, " block"]
+    """Whether a list has splats left and some pixel of its tile has not ended."""
+    peaks: Float[Array, " g"]
+    """The largest w of each splat so far, in all blocks."""
+    medians: Float[Array, "block p"] | None
+    """The smallest z so far behind which T is one half or less."""
+
+
+@functools.lru_cache
+def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Composited]:
+    """Makes the function (splats, items, starts, counts) -> `Composited`."""
+    block, k, stop = config.block, config.chunk, config.transmittance_stop
+
+    @joined_over_batch
+    def forward(splats, items, starts, counts):
+        dtype, t = splats.dtype, counts.shape[0]
+        blocks = blocks_by_length(counts, block)
+
+        def draw(b, drawn):
+            tile = lax.dynamic_slice_in_dim(blocks.tiles, b * block, block)
+            start, count = _lists_of(tile, starts, counts)
+
+            def body(chain):
+                i, transmittance, features, lengths, live, peaks, medians = chain
+                item, row, _, raw = take_chunk(
+                    splats, items, start + i * k, count - i * k, tile, grid, k
+                )
+                # one exp a pair: without the barrier each kernel that uses it computes it again
+                raw = lax.optimization_barrier(raw)
+                alpha = lax.optimization_barrier(visible_alpha(raw, config))
+                # features, weights and medians in one chain: `before` is T in front of splat j
+                before, weights = transmittance[:, None], []
+                for j in range(k):
+                    after = before * (1 - alpha[:, None, j])
+                    weight = jnp.where(after > stop, alpha[:, None, j] * before, 0.0)
+                    features = features + weight * row[:, j, FEATURES, None]
+                    weights.append(weight)
+                    before = after
+                    if medians is not None:
+                        reached = (weight[:, 0] > 0) & (after[:, 0] <= HALF)
+                        nearer = jnp.minimum(medians, row[:, j, Z, None])
+                        medians = jnp.where(reached, nearer, medians)
+                # the largest weight of each splat on the pixels of this block
+                if config.visibility:
+                    highest = largest_weights(jnp.concatenate(weights, axis=1), tile, grid)
+                    peaks = peaks.at[item].max(highest, mode="drop")
+                # T itself in a second chain; from the stop on its sign is negative
+                for j in range(k):
+                    after = transmittance * (1 - alpha[:, j])
+                    transmittance = jnp.where(
+                        after > stop, after, jnp.minimum(transmittance, -transmittance)
+                    )
+                # a list is alive while it has items left and some pixel of its tile has not ended
+                lengths = jnp.where(live, jnp.minimum((i + 1) * k, count), lengths)
+                live = (jnp.max(transmittance, axis=1) > 0) & ((i + 1) * k < count)
+                return _Chain(i + 1, transmittance, features, lengths, live, peaks, medians)
+
+            # every pixel of the block starts with T = 1 and no features
+            ones = jnp.ones((block, grid.pixels), dtype)
+            zeros = jnp.zeros((block, splats.shape[1] - FEATURES.start, grid.pixels), dtype)
+            medians = None
+            if config.depth_median:
+                medians = jnp.full_like(ones, jnp.inf)
+            chain = _Chain(0, ones, zeros, jnp.zeros_like(count), count > 0, drawn.peaks, medians)
+            chain = lax.while_loop(lambda chain: jnp.any(chain.live), body, chain)
+
+            final = jnp.abs(chain.transmittance)  # the sign marked pixels that had ended
+
+            def placed(of_all, of_block):
+                """Puts the block's tiles at their places among all tiles; padding is dropped."""
+                return of_all.at[tile].set(of_block, mode="drop", unique_indices=True)
+
+            medians = None
+            if config.depth_median:
+                medians = placed(drawn.medians, chain.medians)
+            features = placed(drawn.features, chain.features)
+            transmittance = placed(drawn.transmittance, final)
+            lengths = placed(drawn.lengths, chain.lengths)
+            return Composited(features, transmittance, lengths, chain.peaks, medians)
+
+        empty = Composited(
+            features=jnp.zeros((t, splats.shape[1] - FEATURES.start, grid.pixels), dtype),
+            transmittance=jnp.ones((t, grid.pixels), dtype),
+            lengths=jnp.zeros(t, jnp.int32),
+            peaks=jnp.zeros(splats.shape[0], dtype),
+            medians=jnp.full((t, grid.pixels), jnp.inf, dtype) if config.depth_median else None,
+        )
+        return lax.fori_loop(0, blocks.used, draw, empty)
+
+    return forward
+
+
+class _BackwardChain(NamedTuple):
+    """What a block carries from one chunk of its lists to the next, in the backward pass."""
+
+    chunk: Array | int
+    """Number of the chunk."""
+    transmittance: Float[Array, "block p"]
+    """T in front of the chunk."""
+    seen: Float[Array, "block p"]
+    """Sum of w g . f so far."""
+    sums: Float[Array, "g width"]
+    """What is returned, of all splats so far."""
+
+
+@functools.lru_cache
+def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Array]:
+    """Makes the function (splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums over
+    pixels for each splat, (g, 6 + n).
+
+    Columns: the moments of e = dL/d log alpha about the splat's centre (1, dx, dy, dx^2, dx dy,
+    dy^2), then the gradient of the features, the sums of w g.
+    """
+    block, k, stop = config.block, config.chunk, config.transmittance_stop
+
+    @joined_over_batch
+    def backward(splats, items, starts, lengths, cotangents, totals):
+        dtype = splats.dtype
+        powers = jnp.asarray(monomials(grid, dtype))
+        blocks = blocks_by_length(lengths, block)
+
+        def draw(b, sums):
+            tile = lax.dynamic_slice_in_dim(blocks.tiles, b * block, block)
+            start, count = _lists_of(tile, starts, lengths)
+            g, total = (v.at[tile].get(mode="fill", fill_value=0) for v in (cotangents, totals))
+            trips = (jnp.max(count) + k - 1) // k
+
+            def body(chain):
+                i, transmittance, seen, sums = chain
+                item, row, offset, raw = take_chunk(
+                    splats, items, start + i * k, count - i * k, tile, grid, k
+                )
+                # one exp a pair: without the barrier each kernel that uses it computes it again
+                raw = lax.optimization_barrier(raw)
+                # the chain of T front to back, with the decisions of the forward pass
+                weights, slopes = [], []
+                for j in range(k):
+                    # a kernel runs the chain of two splats: what it computes for splat j redoes the
+                    # chain from the last stored T on; storing T after every splat costs more
+                    if j > 0 and j % 2 == 0:
+                        transmittance, seen = lax.optimization_barrier((transmittance, seen))
+                    alpha = visible_alpha(raw[:, j], config)
+                    after = transmittance * (1 - alpha)
+                    weight = jnp.where(after > stop, alpha * transmittance, 0.0)
+                    along = sum(
+                        row[:, j, 6 + c, None] * g[:, c]
+                        for c in range(splats.shape[1] - FEATURES.start)
+                    )
+                    seen = seen + weight * along
+                    slope = (along * transmittance - (total - seen) / (1 - alpha)) * raw[:, j]
+                    slopes.append(
+                        jnp.where((weight > 0) & (raw[:, j] < config.alpha_max), slope, 0.0)
+                    )
+                    weights.append(weight)
+                    transmittance = after
+                weights, slopes = jnp.stack(weights, axis=1), jnp.stack(slopes, axis=1)
+                # matrix products: XLA's row reductions are slow on CPUs
+                moments = product(slopes.reshape(block * k, -1), powers).reshape(block, k, 6)
+                features = product(weights, jnp.moveaxis(g, 1, 2))
+                rows = jnp.concatenate([moments_about_splat(moments, *offset), features], axis=-1)
+                following = i + 1
+                sums = sums.at[item].add(rows, mode="drop")
+                return _BackwardChain(following, transmittance, seen, sums)
+
+            ones = jnp.ones((block, grid.pixels), dtype)
+            chain = _BackwardChain(0, ones, jnp.zeros_like(ones), sums)
+            return lax.while_loop(lambda chain: chain.chunk < trips, body, chain).sums
+
+        return lax.fori_loop(0, blocks.used, draw, jnp.zeros(splats.shape, dtype))
+
+    return backward
+
+
+def _lists_of(tile: Array, starts: Array, counts: Array) -> Iterator[Array]:
+    """Gives starts and lengths of the lists of some tiles; padding has empty lists."""
+    return (v.at[tile].get(mode="fill", fill_value=0) for v in (starts, counts))

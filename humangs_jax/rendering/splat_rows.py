@@ -1,0 +1,184 @@
+"""Splats as rows of numbers: packed, taken in chunks from their lists, and their moments. Both
+schedules of compositing work with them.
+
+The formulas and the symbols are those of `rendering.compositing`.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from humangs_jax.core.array_types import Array, Float, Int, PyTree
+from humangs_jax.geometry.transform import EXACT
+from humangs_jax.rendering.projection import ProjectedGaussians
+from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.rendering.tiling import TileGrid
+
+X = 0
+"""Column of a splat's row with the x of its centre, pixels."""
+Y = 1
+"""Column with the y of the centre, pixels."""
+R00 = 2
+"""Column with the entry 00 of r, 1 / pixels."""
+R01 = 3
+"""Column with the entry 01 of r, 1 / pixels."""
+R11 = 4
+"""Column with the entry 11 of r, 1 / pixels."""
+LOG_OPACITY = 5
+"""Column with the logarithm of the opacity."""
+FEATURES = slice(6, None)
+"""Columns of red, green, blue, z, and any others: their number is static, XLA unrolls them."""
+Z = 9
+"""The column of z."""
+HALF = 0.5
+"""The transmittance at the median depth."""
+
+
+def pack_splats(
+    projected: ProjectedGaussians,
+    opacities: Float[Array, " g"],
+    features: Float[Array, "g n"],
+    alpha_min: float,
+) -> Float[Array, "g width"]:
+    """Packs splats into rows: x, y (pixels), r00, r01, r11 (1 / pixels), log opacity, features. All
+    numbers are finite, also those of splats that are not drawn.
+    """
+    p = projected
+    drawn = p.visible & (opacities >= alpha_min)
+    log_opacity = jnp.log(jnp.where(drawn, opacities, 1.0))
+    return jnp.stack([p.x, p.y, p.r00, p.r01, p.r11, log_opacity, *features.T], axis=-1)
+
+
+class Composited(NamedTuple):
+    """What lists of splats look like: p pixels of each of t tiles, and what is known of each of g
+    splats.
+    """
+
+    features: Float[Array, "t n p"]
+    """Sum of w f, (t, n, p); 0 where lists are empty."""
+    transmittance: Float[Array, "t p"]
+    """The final T, (t, p); 1 where lists are empty."""
+    lengths: Int[Array, " t"]
+    """How many splats of each list were read until all pixels of its tile had ended, (t,)."""
+    peaks: Float[Array, " g"]
+    """The largest w of each splat, (g,); 0 unless `config.visibility`."""
+    medians: Float[Array, "t p"] | None
+    """The z of the splat at which T falls to one half, (t, p), metres; infinite where it never
+    does. Lists run front to back, so it is the smallest z behind which T is one half or less. None
+    unless `config.depth_median`."""
+
+
+def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """Under `vmap`, calls a function of (splats, items, starts, more per tile...) once, with the
+    tiles of all images.
+
+    It must return arrays per tile or per splat: they are cut into those of the images.
+    """
+    function = jax.custom_batching.custom_vmap(function)
+
+    @function.def_vmap
+    def rule(size, batched, *args):
+        args = [
+            a if b else jnp.broadcast_to(a, (size, *a.shape))
+            for a, b in zip(args, batched, strict=True)
+        ]
+        splats, items, starts, *rest = args
+        image = jnp.arange(size, dtype=jnp.int32)[:, None]
+        args = [splats, items + image * splats.shape[1], starts + image * items.shape[1], *rest]
+        out = function(*(a.reshape(-1, *a.shape[2:]) for a in args))
+        out = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return function
+
+
+def take_chunk(
+    splats: Float[Array, "g width"],
+    items: Int[Array, " capacity"],
+    starts: Int[Array, " b"],
+    counts: Int[Array, " b"],
+    tiles: Int[Array, " b"],
+    grid: TileGrid,
+    k: int,
+) -> tuple[
+    Int[Array, "b k"], Float[Array, "b k width"], Float[Array, "2 b k"], Float[Array, "b k p"]
+]:
+    """Takes the first k splats of each of b lists, `items[starts : starts + counts]`, which lie on
+    `tiles`.
+
+    Returns their numbers (g past the end of a list), rows, centres from that of the tile, and raw
+    alphas (0 past the end).
+    """
+    # numbers and rows of the splats
+    slot = jnp.arange(k, dtype=jnp.int32)
+    item = items.at[starts[:, None] + slot].get(mode="clip")
+    item = jnp.where(slot < counts[:, None], item, splats.shape[0])
+    row = lax.optimization_barrier(splats.at[item].get(mode="clip"))
+    # their centres, measured from that of the tile (of its image, if several were joined)
+    place = tiles % grid.tiles
+    cx, cy = (
+        (axis * grid.tile_size).astype(row.dtype)[:, None] + 0.5 * grid.tile_size
+        for axis in (place % grid.columns, place // grid.columns)
+    )
+    centre = jnp.stack([row[..., X] - cx, row[..., Y] - cy])
+    inside = jnp.arange(k, dtype=jnp.int32) < counts[:, None]
+    # raw alpha at the pixels, with the exponent as a sum of squares
+    x, y = centre
+    r00, r01, r11 = row[..., R00], row[..., R01], row[..., R11]
+    offsets = jnp.asarray(grid.offsets(row.dtype))
+    u = (r00 * x + r01 * y)[..., None] - r00[..., None] * offsets[0] - r01[..., None] * offsets[1]
+    v = (r11 * y)[..., None] - r11[..., None] * offsets[1]
+    raw = jnp.where(inside[..., None], jnp.exp(row[..., LOG_OPACITY, None] - u * u - v * v), 0.0)
+    return item, row, centre, raw
+
+
+def largest_weights(
+    weights: Float[Array, "b k p"], tiles: Int[Array, " b"], grid: TileGrid
+) -> Float[Array, "b k"]:
+    """Returns the largest weight of each splat on those pixels of its tile that lie inside the
+    image.
+    """
+    place = tiles % grid.tiles
+    x, y = (0.5 * grid.tile_size + offset for offset in grid.offsets())
+    left = jnp.minimum(grid.width - place % grid.columns * grid.tile_size, grid.tile_size)
+    above = jnp.minimum(grid.height - place // grid.columns * grid.tile_size, grid.tile_size)
+    inside = (x < left[:, None]) & (y < above[:, None])
+    return jnp.max(jnp.where(inside[:, None], weights, 0.0), axis=2)
+
+
+def visible_alpha(raw: Float[Array, "*b"], config: SplatConfig) -> Float[Array, "*b"]:
+    """Returns alpha for its raw value: clamped above, 0 if it is skipped."""
+    return jnp.where(raw < config.alpha_min, 0.0, jnp.minimum(raw, config.alpha_max))
+
+
+def monomials(grid: TileGrid, dtype: np.dtype | type) -> np.ndarray:
+    """Returns 1, x, y, x^2, xy, y^2 of a tile's pixels, (p, 6), measured from its centre."""
+    x, y = grid.offsets(dtype)
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+def moments_about_splat(
+    moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y: Float[Array, "*b"]
+) -> Float[Array, "*b 6"]:
+    """Returns the moments of (pixel - splat) for those of (pixel - centre of the tile).
+
+    x, y: (splat - centre of the tile), pixels.
+    """
+    m, mx, my, mxx, mxy, myy = (moments[..., i] for i in range(6))
+    about = [
+        m,
+        mx - x * m,
+        my - y * m,
+        mxx - 2 * x * mx + x * x * m,
+        mxy - x * my - y * mx + x * y * m,
+    ]
+    return jnp.stack([*about, myy - 2 * y * my + y * y * m], axis=-1)
+
+
+product = functools.partial(jnp.matmul, precision=EXACT)
+"""Sums over pixels, as a matrix product."""
