@@ -120,9 +120,6 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from tests.data.test_loading import CountingSource, same
 from humangs_jax.data.loading import Loader
 
-TRAIN = SPLITS["train"]
-
-
 mesh = jax.make_mesh((2, 2), ("data", "model"), axis_types=(AxisType.Auto,) * 2)
 plain = Loader(CountingSource(), 4, seed=1)
 for spec in (PartitionSpec("data"), PartitionSpec(("data", "model")), PartitionSpec()):
@@ -203,7 +200,7 @@ def toy_person(key, input_count):
 
 def test_people_of_keys_look_like_any_source():
     source = GeneratedSource(jax.jit(toy_person, static_argnums=1), "train", input_counts=(1, 2))
-    assert isinstance(source, Source) and len(source) == len(TRAIN)
+    assert isinstance(source, Source) and len(source) == len(SPLITS["train"])
     loader = Loader(source, 2, seed=3)
     batches = dict(loader.batches(0, 4))
     assert all(same(batches[step], loader.batch_at(step)) for step in batches)
