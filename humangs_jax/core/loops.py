@@ -20,17 +20,19 @@ PIXELS_AT_ONCE = 1 << 22
 
 
 def one_after_the_other() -> bool:
-    """Whether the default backend is better off with loops: it is a CPU."""
+    """Says whether loops are the faster way on the default backend: it is a CPU."""
     return jax.default_backend() == "cpu"
 
 
 def over(function: Callable[[PyTree], T], xs: PyTree, pixels: int = 1) -> T:
-    """`function` of each element along the first axis of `xs`, as `jax.lax.map` stacks them.
+    """Calls `function` for each element along the first axis of `xs`; results are stacked, as
+    `jax.lax.map` does.
 
     Args:
-        function: of one element; pure.
+        function: a pure function of one element.
         xs: arrays with one leading axis.
-        pixels: of an element's image. No more than `PIXELS_AT_ONCE` are worked on side by side.
+        pixels: pixels of an element's image. No more than `PIXELS_AT_ONCE` are worked on side by
+            side.
     """
     if one_after_the_other():
         return jax.lax.map(function, xs)

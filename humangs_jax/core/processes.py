@@ -367,7 +367,8 @@ class Ahead:
             ahead.add(calls_of_fit(body, kind, views))
             ...
 
-    A call that nobody makes costs time alone. At the end of the block no further ones are begun.
+    A program that is never called has cost time, nothing else. At the end of the block no further
+    ones are begun.
     """
 
     def __init__(self) -> None:
@@ -381,19 +382,21 @@ class Ahead:
         self._over.set()
 
     def add(self, calls: Iterable[Call]) -> None:
-        """Begins with these, one after the other in their order; what is wrong with one of them
-        ends it, and says nothing.
+        """Compiles these, one after the other. A fault in one of them ends that in silence: it is
+        an error where the program is called.
         """
-        # threads that do not keep the process alive: whoever ends it waits for no program
+        # threads that do not keep the process alive: its end waits for no program
         threading.Thread(target=self._begin, args=(calls,), daemon=True).start()
 
     def _begin(self, calls: Iterable[Call]) -> None:
+        """Starts a thread for each program, `AT_ONCE` at a time."""
         with contextlib.suppress(Exception):
             for call in calls:
                 self._free.acquire()
                 threading.Thread(target=self._compile, args=call, daemon=True).start()
 
     def _compile(self, program: Any, arguments: tuple[Any, ...]) -> None:
+        """Compiles one program, unless the block is over."""
         with contextlib.suppress(Exception):
             if not self._over.is_set():
                 program.lower(*arguments).compile()

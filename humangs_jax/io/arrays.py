@@ -46,7 +46,7 @@ def numbers(
     dtype: type[np.floating] = np.float64,
     error: type[FileError] = FileError,
 ) -> np.ndarray:
-    """Real numbers of a file that are finite in float32, as an array.
+    """Makes an array of real numbers of a file, which are finite in float32.
 
     Arguments:
         shape: None in it is any size, None for it any shape. some: there has to be one at least.
@@ -257,7 +257,7 @@ class ArrayFile:
     def numbers(
         self, key: str, shape: tuple[int | None, ...] | None, largest: float = np.inf
     ) -> Float[np.ndarray, "..."]:
-        """Finite float64 numbers under a key, at least one, see `numbers`."""
+        """Returns finite float64 numbers under a key, at least one, see `numbers`."""
         return numbers(
             self.array(key), self.path, key, shape, some=True, largest=largest, error=self.error
         )

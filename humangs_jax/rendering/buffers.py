@@ -101,8 +101,8 @@ _PLANNED: dict[tuple[SplatConfig, int, int], list[tuple[int, int]]] = {}
 
 
 def plan_near(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
-    """`plan_buffers` for one camera, or buffers that were planned before, in which all fits too and
-    that are not much larger: an image costs less than another program.
+    """Plans buffers for one camera, or returns ones that were planned before, if all fits in them
+    and they are not much larger: an image costs less than another program.
     """
     rows, pairs = _needed(gaussians, camera, config)
     known = _PLANNED.setdefault((config, camera.width, camera.height), [])
