@@ -31,7 +31,7 @@ from humangs_jax.capture.fitting.residuals.keypoints import make_observations
 from humangs_jax.capture.keypoints.formats import SeenPerson, columns_of
 from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, MEDIAPIPE_69
 from humangs_jax.geometry.camera import look_at
-from humangs_jax.io.exif import DIAGONAL_35MM
+from humangs_jax.io.images import DIAGONAL_35MM
 from humangs_jax.synthetic.subject import SPLITS, expressed_subject, make_subject, render_view
 from humangs_jax.synthetic.writer import sample_pose, stand
 

@@ -62,8 +62,17 @@ from humangs_jax.data.photos import (
     unknown_in_capture,
 )
 from humangs_jax.io.atomic import MOVE_AWAY, add_files, check_ours
-from humangs_jax.io.exif import orientation, oriented
-from humangs_jax.io.images import MASK, mark_of, read_grey, read_image, resized, to_uint8, write_png
+from humangs_jax.io.images import (
+    MASK,
+    mark_of,
+    orientation,
+    oriented,
+    read_grey,
+    read_image,
+    resized,
+    to_uint8,
+    write_png,
+)
 from humangs_jax.io.reading import write_json
 
 KEYPOINTS_FILE = "keypoints.json"

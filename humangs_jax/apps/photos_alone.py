@@ -29,8 +29,14 @@ from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.cameras import CalibratedCamera, Calibration
 from humangs_jax.data.capture_checks import few
 from humangs_jax.data.photos import on_white_background, read_description
-from humangs_jax.io.exif import DIAGONAL_35MM, cropped_from, focal_length
-from humangs_jax.io.images import image_size, resized, write_png
+from humangs_jax.io.images import (
+    DIAGONAL_35MM,
+    cropped_from,
+    focal_length,
+    image_size,
+    resized,
+    write_png,
+)
 
 LONGEST = 2048
 """Pixels: longest side to which photos are reduced."""

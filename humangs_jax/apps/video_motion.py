@@ -45,7 +45,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum, read_npz, write_npz
-from humangs_jax.io.exif import DIAGONAL_35MM
+from humangs_jax.io.images import DIAGONAL_35MM
 from humangs_jax.io.reading import InvalidFileError, check_limit, reading
 from humangs_jax.motion import made_from_of, save_motion
 

@@ -32,8 +32,7 @@ from humangs_jax.data.capture_checks import (
 from humangs_jax.data.formats import START_MARK
 from humangs_jax.data.masks import clean_rims, masks_at_edges
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.io.exif import orientation
-from humangs_jax.io.images import image_size, read_grey, read_image
+from humangs_jax.io.images import image_size, orientation, read_grey, read_image
 from humangs_jax.io.reading import (
     FileError,
     check_limit,

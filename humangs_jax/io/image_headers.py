@@ -1,5 +1,5 @@
 """What a photo says before it is decoded: a JPEG's scans, a WebP's size, an ISO file's kind, a
-PNG's chunks.
+PNG's chunks, EXIF's frame.
 
 Phones put more behind a JPEG (a video, a map of gains, depth) and inside of its segments
 (thumbnails, EXIF, C2PA). Only the marks of the picture itself count.
@@ -8,6 +8,9 @@ Phones put more behind a JPEG (a video, a map of gains, depth) and inside of its
 import re
 import struct
 import zlib
+from typing import Any
+
+import numpy as np
 
 from humangs_jax.io.reading import InvalidFileError
 
@@ -136,3 +139,28 @@ def check_png_chunks(data: bytes) -> None:
         raise InvalidFileError(
             "not a readable image: its pixels are numbers of a palette, and it has none"
         )
+
+
+def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] | None:
+    """Returns the width and height in EXIF's tags if a photo of this size was cut out of such a
+    frame, else None.
+    """
+    # EXIF's width and height of the photo as it was taken
+    width, height = tags.get(0xA002), tags.get(0xA003)
+    if not isinstance(width, int) or not isinstance(height, int):
+        return None
+    frame, turned = (width, height), (height, width)
+    if not 0 < min(frame) <= max(frame) < 1 << 24 or _same_shape(size, frame):
+        return None
+    # 3 : 4 of a frame of 4 : 3 may be turned, or cut out of it at its full height
+    cut_upright = size != turned and (size[0] == frame[0] or size[1] == frame[1])
+    if _same_shape(size, turned) and not cut_upright:
+        return None
+    return frame
+
+
+def _same_shape(size: tuple[int, int], frame: tuple[int, int]) -> bool:
+    """Says whether two sizes have the same shape, but for a pixel and a hundredth, by rounding."""
+    scale = np.hypot(*size) / np.hypot(*frame)
+    off = np.abs(scale * np.asarray(frame) - size)
+    return bool((off <= 1 + 0.01 * np.asarray(size)).all())

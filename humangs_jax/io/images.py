@@ -5,9 +5,8 @@ Photos say how their colors are encoded (an ICC profile, or numbers in their hea
 converted to sRGB; those of files that say nothing, or sRGB, are values as stored. Masks are values
 as stored, too. With the extra `heic`, HEIC photos of phones too (libheif, by pi-heif). The content
 decides, not the name: no other format is looked at. Pixels come as stored, whatever the orientation
-flag says that phones write into JPEG files (EXIF): `io.exif.orientation` reads it,
-`io.exif.oriented` obeys it, and the importing of photos decides. HEIC photos come upright: their
-format turns them, not the flag.
+flag says that phones write into JPEG files (EXIF): `orientation` reads it, `oriented` obeys it, and
+who imports photos decides. HEIC photos come upright: their format turns them, not the flag.
 """
 
 import contextlib
@@ -16,6 +15,7 @@ import importlib
 import io
 import logging
 import struct
+import warnings
 from collections.abc import Generator, Iterable
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ from humangs_jax.io.image_headers import (
     iso_kind,
     jpeg_scans,
     nclx_colors,
+    other_frame,
     png_chunks,
     webp_size,
 )
@@ -59,6 +60,25 @@ HEAD = 256
 GREY_SLACK = 16 / 255
 """Channels of a grey image that was compressed differ by less."""
 GREY_MASK = "grey from 0 (background) to 255 (person)"
+EXIF_TAGS = 0x8769
+"""Number of the table of EXIF tags in the first table."""
+DIAGONAL_35MM = 43.27
+"""Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle
+along the diagonal.
+"""
+EXIF_MARKS = (
+    b"Exif",
+    b"eXIf",
+    b"EXIF",
+    b"ftypavi",
+    b"Raw profile type",
+    b"adobe.com/xap",
+    b"com.adobe.xmp",
+)
+"""A file without any of these has no EXIF; looking further would decode a PNG.
+
+An AVIF may be turned without it.
+"""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOR_TYPES = {2: "RGB", 4: "LA", 6: "RGBA"}
 """Color types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it
@@ -180,6 +200,73 @@ def _mask_of_alpha(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     raise InvalidFileError(
         "the image has an alpha channel besides its greys: which is the mask? expected one of them"
     )
+
+
+def orientation(path: str | Path) -> int:
+    """Returns the EXIF flag of a photo, 1 (none) to 8: how programs that obey it show it, see
+    `oriented`.
+
+    Raises: as `open_image`.
+    """
+    with open_image(path) as (image, data):
+        flag = _exif(image, data).get(0x0112, 1)
+        return flag if flag in range(2, 9) else 1
+
+
+def focal_length(path: str | Path) -> float | None:
+    """Returns the focal length in pixels, from EXIF's 35-mm equivalent and the diagonal of the
+    photo; None where that is missing or 0.
+
+    equivalent / 43.27 mm = focal length / diagonal, as EXIF defines it. Of a photo that was cut out
+    of what EXIF describes, see `cropped_from`, it is not known. Raises: as `open_image`.
+    """
+    with open_image(path) as (image, data):
+        tags = _exif(image, data, EXIF_TAGS)
+        equivalent = tags.get(0xA405)
+        if (
+            not isinstance(equivalent, int)
+            or equivalent <= 0
+            or other_frame(tags, image.size) is not None
+        ):
+            return None
+        return equivalent / DIAGONAL_35MM * float(np.hypot(*image.size))
+
+
+def cropped_from(path: str | Path) -> tuple[int, int] | None:
+    """Returns the width and height that EXIF says if the photo has another shape, because it was
+    cut out of that; else None.
+
+    Photos that were made smaller or turned have the shape that EXIF says. Raises: as `open_image`.
+    """
+    with open_image(path) as (image, data):
+        return other_frame(_exif(image, data, EXIF_TAGS), image.size)
+
+
+def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
+    """Returns the EXIF tags of the photo, or of a folder in them; none where they are damaged:
+    nobody obeys these.
+    """
+    if any(mark in data for mark in EXIF_MARKS):
+        with warnings.catch_warnings(), contextlib.suppress(Exception):
+            warnings.simplefilter("ignore")
+            tags = image.getexif()
+            if folder is None:
+                return dict(tags)
+            return dict(tags.get_ifd(folder))
+    return {}
+
+
+def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
+    """Turns pixels (h, w, ...) as an EXIF orientation from 1 to 8 wants them shown; from 5 on
+    height and width are exchanged.
+    """
+    if flag >= 5:
+        pixels = np.swapaxes(pixels, 0, 1)
+    if flag in (3, 4, 7, 8):
+        pixels = pixels[::-1]
+    if flag in (2, 3, 6, 7):
+        pixels = pixels[:, ::-1]
+    return pixels
 
 
 def write_png(

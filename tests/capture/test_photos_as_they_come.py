@@ -16,8 +16,7 @@ from humangs_jax.capture.keypoints.reading import read_keypoints
 from humangs_jax.data.cameras import distort
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import load_photos, unknown_in_capture
-from humangs_jax.io.exif import orientation, oriented
-from humangs_jax.io.images import read_image
+from humangs_jax.io.images import orientation, oriented, read_image
 from humangs_jax.io.reading import Limits, set_limits
 from tests.capture import calibration_files as written
 

@@ -45,8 +45,15 @@ from humangs_jax.data.photos import load_photos
 from humangs_jax.data.preprocess.run import PreprocessConfig, preprocess, scan_content
 from humangs_jax.data.sets import SYNTHETIC, begin_set
 from humangs_jax.io.arrays import read_npz
-from humangs_jax.io.exif import cropped_from, focal_length, orientation
-from humangs_jax.io.images import check_image, image_size, read_grey, read_image
+from humangs_jax.io.images import (
+    check_image,
+    cropped_from,
+    focal_length,
+    image_size,
+    orientation,
+    read_grey,
+    read_image,
+)
 from humangs_jax.io.mesh import read_obj
 from humangs_jax.io.reading import read_json, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from humangs_jax.io.exif import focal_length, orientation
 from humangs_jax.io.image_headers import iso_kind, jpeg_scans, webp_size
-from humangs_jax.io.images import image_size, read_image
+from humangs_jax.io.images import focal_length, image_size, orientation, read_image
 from humangs_jax.io.reading import FileError, Limits, set_limits
 
 PHOTO = Image.fromarray(np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)).resize(

@@ -14,12 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from humangs_jax.io.exif import cropped_from, focal_length, orientation, oriented
 from humangs_jax.io.images import (
     FORMATS,
+    cropped_from,
+    focal_length,
     image_size,
     is_heic,
     open_image,
+    orientation,
+    oriented,
     read_grey,
     read_image,
     resized,

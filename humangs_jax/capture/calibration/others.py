@@ -24,8 +24,7 @@ from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.cameras import CalibratedCamera, undistort
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import read_checked
-from humangs_jax.io.exif import orientation
-from humangs_jax.io.images import PHOTO_SUFFIXES, read_grey
+from humangs_jax.io.images import PHOTO_SUFFIXES, orientation, read_grey
 
 TOUCHES = 3
 """Pixels: a mask that ends so near to what the camera has not seen is cut off there."""

@@ -29,8 +29,15 @@ from humangs_jax.data.folders import (
     scan_folder,
 )
 from humangs_jax.data.photos import read_checked, read_mask
-from humangs_jax.io.exif import orientation, oriented
-from humangs_jax.io.images import PHOTO_SUFFIXES, image_size, open_image, read_grey, read_image
+from humangs_jax.io.images import (
+    PHOTO_SUFFIXES,
+    image_size,
+    open_image,
+    orientation,
+    oriented,
+    read_grey,
+    read_image,
+)
 
 SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in PHOTO_SUFFIXES)
 """File types of photos that are looked for by a name without one; with one, any mix of cases will

@@ -30,7 +30,7 @@ from humangs_jax.capture.fitting.residuals.keypoints import NOISE, OUTER, in_cam
 from humangs_jax.capture.keypoints.keypoints import mirrored_name
 from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.core.progress import bar, watched
-from humangs_jax.io.exif import DIAGONAL_35MM
+from humangs_jax.io.images import DIAGONAL_35MM
 
 USUAL_FOCAL = 29.0
 """Focal length of a telephone's main camera, mm, 35-mm equivalent."""
