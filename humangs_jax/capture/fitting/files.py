@@ -219,7 +219,7 @@ def _with_cameras(description: dict[str, Any], capture: Capture) -> dict[str, An
     views = []
     for i, view in enumerate(description["views"]):
         new = {
-            name: np.asarray(getattr(capture.cameras, name)[i], float)
+            name: np.asarray(getattr(capture.cameras, name), float)[i]
             for name in ("K", "cam_from_world")
         }
         same = {
