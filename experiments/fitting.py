@@ -16,7 +16,7 @@ from experiments.results import markdown_table
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
-from humangs_jax.capture.detection.people import Networks, detect_people
+from humangs_jax.capture.detection.people import Networks, find_people
 from humangs_jax.capture.fitting.landmark_fit import fit_landmarks
 from humangs_jax.capture.fitting.residuals.keypoints import Observations, expected_noise
 from humangs_jax.capture.fitting.triangulation import triangulate, triangulate_robustly
@@ -470,7 +470,7 @@ def landmark_rows(networks, folder):
         for row in jnp.eye(3)
     ]
     for view in range(capture.view_count):
-        people = detect_people(networks, np.asarray(capture.images[view], np.float32))
+        people = find_people(networks, np.asarray(capture.images[view], np.float32))
         if not people:
             continue
         pose, camera = capture.pose(int(capture.frames[view])), capture.cameras[view]
@@ -481,7 +481,7 @@ def landmark_rows(networks, folder):
             for x in jax.vmap(functools.partial(project, camera))(jnp.stack(points))
         )
         changes = np.moveaxis(pixels[1:] - pixels[0], 0, -1) / STEP
-        errors = people[0].pixels - pixels[0]
+        errors = people[0].pixels + 0.5 - pixels[0]
         if np.median(np.linalg.norm(errors, axis=-1)) > WRONG * np.ptp(pixels[0], axis=0).max():
             continue
         scale = float(camera.K[0, 0]) / depths[0]

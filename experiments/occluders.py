@@ -14,7 +14,7 @@ from experiments.subjects import People, Start
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.model import BodyModel
-from humangs_jax.capture.fitting.refine import posed_vertices
+from humangs_jax.capture.fitting.silhouette_fit import posed_vertices
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.hidden import with_hidden_parts

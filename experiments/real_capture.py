@@ -17,10 +17,11 @@ from scipy import ndimage
 
 from humangs_jax.capture.detection.people import (
     LANDMARK_SIZE,
-    DetectedPerson,
+    Landmarks,
     Networks,
     bilinear,
-    detect_people,
+    find_people,
+    mask_in_photo,
 )
 from humangs_jax.capture.detection.sharpening import sharpened
 from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
@@ -283,10 +284,17 @@ def _cut(picture, camera, corner, side):
     return to_uint8(resized(bilinear(picture, grid, 0.0), SIZE, SIZE))
 
 
-def largest_person(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> DetectedPerson:
-    """The man fills a photo, bystanders do not. With the mask as the package sharpens it."""
-    person = max(detect_people(networks, photo), key=lambda person: float(person.mask.sum()))
-    return person._replace(mask=sharpened(person.mask, photo, person.side / LANDMARK_SIZE))
+def largest_person(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> Landmarks:
+    """The man fills a photo, bystanders do not. With the mask as the package sharpens it, at the
+    size of the photo, and the centre of the first pixel at one half.
+    """
+    height, width = photo.shape[:2]
+    people = find_people(networks, photo)
+    masks = [mask_in_photo(person, width, height) for person in people]
+    largest = int(np.argmax([float(mask.sum()) for mask in masks]))
+    person = people[largest]
+    mask = sharpened(masks[largest], photo, person.crop.side / LANDMARK_SIZE)
+    return person._replace(mask=mask, pixels=person.pixels + 0.5)
 
 
 def background(

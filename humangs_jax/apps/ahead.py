@@ -19,7 +19,11 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, without_expression
 from humangs_jax.capture.fitting.fit_capture import calls_of_fit
 from humangs_jax.capture.fitting.own_poses import CONFIG, with_own_poses
-from humangs_jax.capture.fitting.refine import Scene, cameras_are_unseen, usual_config
+from humangs_jax.capture.fitting.silhouette_fit import (
+    SilhouetteFit,
+    cameras_are_unseen,
+    usual_config,
+)
 from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_69, Keypoints
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.processes import Call
@@ -48,9 +52,9 @@ def calls_after_fit(photos: Photos, keypoints: Keypoints) -> Iterator[Call]:
     )
     fixed = cameras_are_unseen(capture) or capture.calibrated
     config = usual_config(fitted=True, fixed_cameras=fixed, calibrated=capture.calibrated)
-    yield from Scene(capture, keypoints, config).calls()
+    yield from SilhouetteFit.of(capture, keypoints, config).calls()
     if capture.frame_count == 1 < capture.view_count:
-        yield from Scene(with_own_poses(capture), keypoints, CONFIG).calls()
+        yield from SilhouetteFit.of(with_own_poses(capture), keypoints, CONFIG).calls()
     masked = dataclasses.replace(capture, masks=photos.masks, unknown=photos.unknown)
     read = masked.select(np.arange(min(masked.view_count, READ)))
     yield from calls_of_exposure(masked.select([0]))

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from humangs_jax.apps.crops import around_person
-from humangs_jax.apps.quick_check import faults
+from humangs_jax.apps.quick_check import Faults, faults
 from humangs_jax.avatar.attach_face import shipped_network
 from humangs_jax.avatar.video import contact_sheet
 from humangs_jax.body.joints import FINGERS
@@ -49,32 +49,35 @@ from humangs_jax.rendering.mesh.rasterizer import (
     vertex_normals,
 )
 
-LONGEST_SIDE = 512
+_LONGEST_SIDE = 512
 """Larger photos are shrunk to this for the check, pixels."""
-MOST_OUTSIDE = 0.05
-"""Share of the body's pixels: those outside of the mask take the background's color."""
-WIDER = (
-    "{:.0%} of the body is outside the mask: it is wider than the person, or the pose is off; "
-    "`humangs fit CAPTURE --to-masks{}` fits {}shape and pose to the masks"
-)
-FIXED = (" --fixed-cameras", "")
-"""What `WIDER` says where cameras are right."""
-FREE = ("", "cameras, ")
-"""What `WIDER` says where cameras may be off."""
-LEFT = (0.15, 0.45, 1.0)
-"""Color of the person's left side."""
-RIGHT = (1.0, 0.35, 0.15)
-"""Color of the right side."""
-MIDDLE = (0.85, 0.85, 0.85)
-"""Color of the middle."""
-BOUNDARY = (0.1, 0.85, 0.2)
-"""Color of the body's outline."""
-DISPLACED = (1.0, 0.85, 0.0)
-"""Color of the displaced body's outline."""
-AMBIENT = 0.35
+
+
+@dataclasses.dataclass(frozen=True)
+class _Tints:
+    """How the body is shown on the sheet; colors are red, green and blue in [0, 1]."""
+
+    left: tuple[float, float, float] = (0.15, 0.45, 1.0)
+    """Color of the person's left side."""
+    right: tuple[float, float, float] = (1.0, 0.35, 0.15)
+    """Color of the right side."""
+    middle: tuple[float, float, float] = (0.85, 0.85, 0.85)
+    """Color of the middle."""
+    boundary: tuple[float, float, float] = (0.1, 0.85, 0.2)
+    """Color of the body's outline."""
+    displaced: tuple[float, float, float] = (1.0, 0.85, 0.0)
+    """Color of the displaced body's outline."""
+    opacity: float = 0.55
+    """Opacity of the body over the photo."""
+    cross: tuple[int, int, int] = (255, 0, 230)
+    """Color of crosses where the body has a keypoint, of 255."""
+
+
+TINTS = _Tints()
+
+
+_AMBIENT = 0.35
 """Share of the light that comes from everywhere."""
-OPACITY = 0.55
-"""Opacity of the body over the photo."""
 
 
 @pytree_dataclass
@@ -183,8 +186,8 @@ def check_capture(
     # faults look at the photos as they are, the sheet at smaller ones
     found = faults(capture)
     whole, vertices = capture, _posed_frames(capture)
-    if max(capture.images.shape[1:3]) > LONGEST_SIDE:
-        capture = capture.resized(LONGEST_SIDE)
+    if max(capture.images.shape[1:3]) > _LONGEST_SIDE:
+        capture = capture.resized(_LONGEST_SIDE)
     shown, tints = _shown(whole, capture, vertices), side_tints(capture.body)
     # the body as `reconstruct` will use it, moved to the masks and with a skirt, is drawn in yellow
     body, moves = capture.body, None
@@ -195,34 +198,18 @@ def check_capture(
     if moves is not None:
         displaced = _posed_frames(dataclasses.replace(capture, body=body), moves)
     moved_tints = side_tints(body)
-    # compare each silhouette with its mask, and draw it
+    # compare each silhouette with its mask, and draw it; the sheet shows the person close, the
+    # comparison is of the whole photo
     overlays, views = [], []
-    for i, (name, warning, inside) in enumerate(
-        zip(capture.names, found.views, found.inside, strict=True)
-    ):
-        drawn = body_image(
-            vertices[int(capture.frames[i])], capture.body.faces, tints, capture.cameras[i]
-        )
-        iou = outside = None
-        if capture.masks is not None:
-            covered = np.asarray(drawn.covered)
-            if capture.unknown is not None:
-                covered = covered & ~capture.unknown[i]
-            iou, outside = _agreement(covered, capture.masks[i] > MASK_THRESHOLD)
-            if warning is None and outside > MOST_OUTSIDE:
-                warning = WIDER.format(outside, *(FIXED if right else FREE))
-        # the sheet shows the person close, the comparison is of the whole photo
+    for i, frame in enumerate(capture.frames.tolist()):
+        drawn = body_image(vertices[frame], capture.body.faces, tints, capture.cameras[i])
+        views.append(_compared(capture, i, np.asarray(drawn.covered), found, right))
         if shown is not capture:
-            drawn = body_image(
-                vertices[int(capture.frames[i])], capture.body.faces, tints, shown.cameras[i]
-            )
+            drawn = body_image(vertices[frame], capture.body.faces, tints, shown.cameras[i])
         overlays.append(overlay(shown.images[i], drawn))
         if displaced is not None:
-            moved = body_image(
-                displaced[int(capture.frames[i])], body.faces, moved_tints, shown.cameras[i]
-            )
-            overlays[-1][_boundary(np.asarray(moved.covered))] = DISPLACED
-        views.append(ViewCheck(name, iou, outside, inside, warning))
+            moved = body_image(displaced[frame], body.faces, moved_tints, shown.cameras[i])
+            overlays[-1][_boundary(np.asarray(moved.covered))] = TINTS.displaced
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
     skirt = prepared is not None and prepared.skirt
     farthest = 0.0
@@ -236,9 +223,34 @@ def check_capture(
     return CheckReport(tuple(views), found.whole, farthest, registered, skirt)
 
 
+def _compared(
+    capture: Capture,
+    view: int,
+    covered: Bool[np.ndarray, "h w"],
+    found: Faults,
+    cameras_are_right: bool,
+) -> ViewCheck:
+    """How well the pixels that the body covers agree with the mask of a view."""
+    name, warning, inside = capture.names[view], found.views[view], found.inside[view]
+    if capture.masks is None:
+        return ViewCheck(name, None, None, inside, warning)
+    if capture.unknown is not None:
+        covered = covered & ~capture.unknown[view]
+    iou, outside = _agreement(covered, capture.masks[view] > MASK_THRESHOLD)
+    # pixels of the body outside of the mask take the background's color
+    if warning is None and outside > 0.05:
+        remedy = "`humangs fit CAPTURE --to-masks` fits cameras, shape and pose to the masks"
+        if cameras_are_right:
+            option = "--to-masks --fixed-cameras"
+            remedy = f"`humangs fit CAPTURE {option}` fits shape and pose to the masks"
+        wide = "it is wider than the person, or the pose is off"
+        warning = f"{outside:.0%} of the body is outside the mask: {wide}; {remedy}"
+    return ViewCheck(name, iou, outside, inside, warning)
+
+
 def calls_of_check(capture: Capture, config: HumanGSConfig) -> Iterator[Call]:
     """The programs that draw the body over photos, and that of the network over it."""
-    small = capture.select([0]).resized(min(LONGEST_SIDE, max(capture.images.shape[1:3])))
+    small = capture.select([0]).resized(min(_LONGEST_SIDE, max(capture.images.shape[1:3])))
     for body in (capture.body, gaussian_body(capture.body, config)):
         vertices = np.zeros(body.template.shape, np.float32)
         yield body_image, (vertices, body.faces, vertices, small.cameras[0])
@@ -261,8 +273,8 @@ def _shown(whole: Capture, small: Capture, vertices: dict[int, Float[Array, "n 3
     close, _ = around_person(whole, vertices)
     if close is whole:
         return small
-    if max(close.images.shape[1:3]) > LONGEST_SIDE:
-        return close.resized(LONGEST_SIDE)
+    if max(close.images.shape[1:3]) > _LONGEST_SIDE:
+        return close.resized(_LONGEST_SIDE)
     return close
 
 
@@ -283,8 +295,8 @@ def draw_body(
 def overlay(photo: Float[np.ndarray, "h w 3"], drawn: BodyImage) -> Float[np.ndarray, "h w 3"]:
     """Half-transparent body over a photo, with its silhouette."""
     covered = np.asarray(drawn.covered)
-    blended = photo + OPACITY * covered[..., None] * (np.asarray(drawn.shaded) - photo)
-    return np.where(_boundary(covered)[..., None], np.asarray(BOUNDARY), blended)
+    blended = photo + TINTS.opacity * covered[..., None] * (np.asarray(drawn.shaded) - photo)
+    return np.where(_boundary(covered)[..., None], np.asarray(TINTS.boundary), blended)
 
 
 def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
@@ -299,7 +311,7 @@ def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
     if not (left.any() and right.any()):
         left, right = (np.asarray(body.template)[:, 0] * sign > 0 for sign in (1, -1))
     left, right = left.astype(np.float32)[:, None], right.astype(np.float32)[:, None]
-    colors = np.asarray([LEFT, RIGHT, MIDDLE], np.float32)
+    colors = np.asarray([TINTS.left, TINTS.right, TINTS.middle], np.float32)
     tints = left * colors[0] + right * colors[1] + (1 - left - right) * colors[2]
     return tints.astype(np.float32)
 
@@ -315,7 +327,7 @@ def body_image(
     rays = points / jnp.linalg.norm(points, axis=-1, keepdims=True)
     rotation = camera.cam_from_world[:3, :3]
     normals = jnp.matmul(vertex_normals(vertices, faces), rotation.T, precision=transform.EXACT)
-    light = AMBIENT + (1 - AMBIENT) * jnp.abs(jnp.sum(normals * rays, axis=-1, keepdims=True))
+    light = _AMBIENT + (1 - _AMBIENT) * jnp.abs(jnp.sum(normals * rays, axis=-1, keepdims=True))
     fragments = rasterize_mesh(vertices, faces, camera)
     shaded = interpolate_attributes(fragments, faces, tints * light, jnp.zeros(3))
     return BodyImage(shaded, fragments.face_ids >= 0)
@@ -361,18 +373,8 @@ def _label(view: ViewCheck) -> str:
 
 VIEWS = 24
 """Most views on a sheet."""
-FINE = 2
+_FINE = 2
 """Factor by which sheets are drawn larger and then shrunk, for smooth lines."""
-RADIUS = 4
-"""Radius of discs on the body, pixels of a tile."""
-SMALL = 2
-"""Radius of discs on hands and face, pixels of a tile."""
-WHITE = (255, 255, 255)
-"""Color of points of the middle, of 255."""
-BLACK = (0, 0, 0)
-"""Color of outlines, of 255."""
-CROSS = (255, 0, 230)
-"""Color of crosses where the body has a point, of 255."""
 
 
 def fit_sheet(
@@ -396,7 +398,7 @@ def fit_sheet(
 
 
 def _overlay(capture: Capture, view: int) -> Float[np.ndarray, "h w 3"]:
-    shown = capture.select([view]).resized(LONGEST_SIDE)
+    shown = capture.select([view]).resized(_LONGEST_SIDE)
     pose = capture.pose(int(capture.frames[view]))
     return draw_body(
         capture.body, jnp.asarray(capture.betas), pose, shown.cameras[0], shown.images[0]
@@ -419,17 +421,18 @@ def _with_keypoints(
     height, width = image.shape[:2]
     # drawn larger and shrunk at the end, for smooth lines
     canvas = Image.fromarray(to_uint8(image)).resize(
-        (FINE * width, FINE * height), Image.Resampling.BILINEAR
+        (_FINE * width, _FINE * height), Image.Resampling.BILINEAR
     )
     pen = ImageDraw.Draw(canvas)
-    scale = FINE * np.asarray([width / capture.images.shape[2], height / capture.images.shape[1]])
+    scale = _FINE * np.asarray([width / capture.images.shape[2], height / capture.images.shape[1]])
 
     def within(points):
-        return np.clip((points - corner) * scale, -FINE * width, 2 * FINE * width)
+        return np.clip((points - corner) * scale, -_FINE * width, 2 * _FINE * width)
 
     discs, crosses = within(keypoints.points[view]), within(examination.landmarks[view])
     shown = np.flatnonzero(examination.compared[view])
-    radii = [FINE * (SMALL if _is_small(name) else RADIUS) for name in keypoints.set.names]
+    # pixels of a tile: hands and face have small discs
+    radii = [_FINE * (2 if _is_small(name) else 4) for name in keypoints.set.names]
     # lines and crosses first, so that discs lie over them
     for k in shown:
         (x, y), arm = crosses[k], 1.5 * radii[k]
@@ -438,19 +441,19 @@ def _with_keypoints(
             [(x - arm, y - arm), (x + arm, y + arm)],
             [(x - arm, y + arm), (x + arm, y - arm)],
         ):
-            pen.line(line, fill=CROSS, width=FINE)
+            pen.line(line, fill=TINTS.cross, width=_FINE)
     for k in shown:
         # outliers are hollow: body and photo disagree there
         color, outlier = _color(keypoints.set.names[k]), examination.outliers[view, k]
         pen.circle(
             tuple(discs[k]),
-            radii[k] + FINE,
+            radii[k] + _FINE,
             fill=None if outlier else color,
-            outline=BLACK,
-            width=FINE,
+            outline=(0, 0, 0),
+            width=_FINE,
         )
         if outlier:
-            pen.circle(tuple(discs[k]), radii[k], outline=color, width=FINE)
+            pen.circle(tuple(discs[k]), radii[k], outline=color, width=_FINE)
     return np.asarray(canvas.resize((width, height), Image.Resampling.BOX)) / 255
 
 
@@ -461,9 +464,9 @@ def _is_small(name: str) -> bool:
 
 
 def _color(name: str) -> tuple[int, ...]:
-    side = {"left": LEFT, "right": RIGHT}.get(name.split("_")[0])
+    side = {"left": TINTS.left, "right": TINTS.right}.get(name.split("_")[0])
     if side is None:
-        return WHITE
+        return (255, 255, 255)
     return tuple(to_uint8(np.asarray(side)).tolist())
 
 

@@ -11,8 +11,6 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import Capture
 
-MARGIN = 0.15
-"""Share of the person's longer side that is left free around the person, on each side."""
 LARGEST_SHARE = 0.7
 """Share of the photo's area above which a window is not cut: the photo is shown whole."""
 
@@ -40,7 +38,8 @@ def around_person(
     if not sizes:
         return whole
     size = np.max(sizes, axis=0)
-    size = np.minimum(np.ceil(size + 2 * MARGIN * size.max()), photo).astype(int)
+    # share of the person's longer side that is left free around the person, on each side
+    size = np.minimum(np.ceil(size + 2 * 0.15 * size.max()), photo).astype(int)
     if size.prod() > LARGEST_SHARE * photo.prod():
         return whole
     # where the person is not seen, the middle of the photo is shown

@@ -43,11 +43,11 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.refine import calls_of_refine, refine_with_report
+from humangs_jax.refinement.refine import Refinement, calls_of_refine, refine_with_report
 from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.viewer.page import write_page
 
-PICTURES = (
+_PICTURES = (
     "inputs.png",
     "novel_views.png",
     "refined.png",
@@ -55,7 +55,7 @@ PICTURES = (
     "animation.gif",
     "novel_views.exr",
 )
-FILES = ("report.json", *PICTURES, "avatar.npz", "avatar.ply", "avatar.html")
+FILES = ("report.json", *_PICTURES, "avatar.npz", "avatar.ply", "avatar.html")
 """What the demonstration writes; the first tells that a folder is of it."""
 REPORTED = frozenset(("psnr", "views", "baseline_psnr"))
 """Keys of the first."""
@@ -134,6 +134,7 @@ def _write_demo(
     settings: Settings,
     ahead: Ahead,
 ) -> dict[str, Any]:
+    """Write the files of the demo into a folder, and return what report.json has."""
     began, timings = time.perf_counter(), dict[str, Any]()
     with stage("loading"):
         inputs = _timed(timings, "load_capture", lambda: load_capture(DEMO_CAPTURE))
@@ -159,6 +160,7 @@ def _write_demo(
     with stage("rendering"):
         ours = _images(_timed(timings, "render_held_out", lambda: held_out(avatar), twice=True))
         baseline = score(draw_painted_body(painted_body(inputs), truth), truth)
+    # pictures of the photos, and of held-out views beside the truth
     contact_sheet(
         inputs.images,
         folder / "inputs.png",
@@ -178,16 +180,11 @@ def _write_demo(
         "timings": timings,
     }
     if refine is not None:
-        with stage("refining"):
-            run = refine_with_report(avatar, inputs, refine, progress=True)
-            if run.interrupted:
-                raise KeyboardInterrupt
-            avatar, refined = run.avatar, _images(held_out(run.avatar))
-        rows = np.clip(
-            np.stack([truth.images, ours, refined], axis=1).reshape(-1, *ours.shape[1:]), 0, 1
-        )
+        run = _refined(avatar, inputs, refine)
+        avatar, refined = run.avatar, _images(held_out(run.avatar))
+        rows = np.stack([truth.images, ours, refined], axis=1).reshape(-1, *ours.shape[1:])
         contact_sheet(
-            rows,
+            np.clip(rows, 0, 1),
             folder / "refined.png",
             headers=("truth", "feed-forward", "refined") * 2,
             columns=6,
@@ -206,14 +203,21 @@ def _write_demo(
             write_video(folder / name, frames, motion.fps)
     with stage("writing"):
         avatar.save(folder / "avatar.npz")
-        export(
-            folder / "avatar.ply", avatar
-        )  # in the world of its viewers, as `humangs export` writes it
+        export(folder / "avatar.ply", avatar)  # in the world of its viewers, as `humangs export`
         write_page(folder / "avatar.html", avatar, motion)
         write_renderings_exr(folder / "novel_views.exr", *held_out(avatar, background=0.0))
     report["total_seconds"] = round(time.perf_counter() - began, 3)
     write_json(folder / "report.json", report, indent=2)
     return report
+
+
+def _refined(avatar: Avatar, photos: Capture, refine: RefineConfig) -> Refinement:
+    """The avatar after refinement. Raises: KeyboardInterrupt if it was interrupted."""
+    with stage("refining"):
+        run = refine_with_report(avatar, photos, refine, progress=True)
+        if run.interrupted:
+            raise KeyboardInterrupt
+    return run
 
 
 def _images(views: tuple[Any, list[Rendering]]) -> np.ndarray:

@@ -81,23 +81,30 @@ SHEET_FILE = "people.png"
 """Picture of all photos with their people."""
 MASKS = "masks"
 """Folder of the masks."""
-UNKNOWN = "unknown"
-"""Folder of what the masks leave open."""
-THUMBNAIL = 480
-"""Pixels of the longest side of a photo on the sheet."""
-COLORS = ((46, 160, 67), (31, 111, 235), (219, 109, 40), (163, 113, 247), (207, 34, 46))
-"""Colors of the people on the sheet, by number."""
-FAINT = 0.45
-"""Share of the color over a person's pixels."""
-BEYOND = 0.03
-"""Share of a person's size that a landmark outside of the photo is beyond its border."""
-AREA_OF_CROP = 0.1
-"""Pixels of a person over those of the detector's crop: a usual value of people who stand free."""
-LEAST_AGREEMENT = 0.6
-"""Intersection over union of a mask that is given and of the person found there below which
-somebody else may have been found.
-"""
-PLAINLY = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sheet:
+    """How the sheet of people looks."""
+
+    thumbnail: int = 480
+    """Pixels of the longest side of a photo on the sheet."""
+    colors: tuple[tuple[int, int, int], ...] = (
+        (46, 160, 67),
+        (31, 111, 235),
+        (219, 109, 40),
+        (163, 113, 247),
+        (207, 34, 46),
+    )
+    """Colors of the people on the sheet, by number."""
+    faint: float = 0.45
+    """Share of the color over a person's pixels."""
+
+
+_SHEET = _Sheet()
+
+
+_PLAINLY = 0.5
 """Masks or keypoints on somebody else have to leave the person less than this share of what they
 give the other one.
 """
@@ -214,11 +221,12 @@ def with_masked(
 
     Arguments: on_white: the photos with nothing but the masks' pixels.
     """
+    # where a given mask and the person found there overlap less, somebody else may have been found
     lost = [
         v
         for v, (photo, mask) in enumerate(zip(found, masks, strict=True))
         if (mask > SEEN).any()
-        and max((_overlap(each, mask) for each in photo.people), default=0.0) < LEAST_AGREEMENT
+        and max((_overlap(each, mask) for each in photo.people), default=0.0) < 0.6
     ]
     if not lost:
         return found
@@ -226,7 +234,7 @@ def with_masked(
     result = list(found)
     for v, cut in zip(lost, alone, strict=True):
         own = max(cut.people, key=lambda each: _overlap(each, masks[v]), default=None)
-        if own is None or own.area < PLAINLY * float((masks[v] > SEEN).sum()):
+        if own is None or own.area < _PLAINLY * float((masks[v] > SEEN).sum()):
             continue
         # whoever had most of the mask before was this person, badly, or somebody in front
         others = [each for each in found[v].people if not _mostly(each, own, found[v].size)]
@@ -256,7 +264,7 @@ def _mostly(found: PersonInPhoto | None, other: PersonInPhoto, size: tuple[int, 
     (top, left), (height, width) = found.corner, found.mask.shape
     own = found.mask > 255 * SEEN
     shared = np.count_nonzero(own & whole[top : top + height, left : left + width])
-    return bool(shared > PLAINLY * max(np.count_nonzero(own), 1))
+    return bool(shared > _PLAINLY * max(np.count_nonzero(own), 1))
 
 
 def person_in_capture(
@@ -317,7 +325,7 @@ def person_of(
     number, settled = int(np.argmax(sums)), []
     for photo, row in zip(photos, scores, strict=True):
         people, best = list(photo.people), int(np.argmax(row))
-        if row[number] < PLAINLY * row[best]:
+        if row[number] < _PLAINLY * row[best]:
             # the matching put somebody else there, or nobody
             people[number], people[best] = people[best], people[number]
         settled.append(
@@ -391,7 +399,7 @@ def detect_photos(
             key=lambda one: -one.area,
         )
         height, width = photo.shape[:2]
-        shrink = min(1.0, THUMBNAIL / max(height, width))
+        shrink = min(1.0, _SHEET.thumbnail / max(height, width))
         small = resized(photo, max(1, round(width * shrink)), max(1, round(height * shrink)))
         found.append(PhotoPeople(name, (width, height), small, tuple(people)))
     return found
@@ -425,7 +433,8 @@ def _found(
         hands[hands[:, 2] > 0, :2] += 0.5
     area = float((cut > 255 * SEEN).sum())
     if person.covered:
-        area = max(area, AREA_OF_CROP * person.crop.side**2)
+        # people who stand free have a tenth of the pixels of the detector's crop
+        area = max(area, 0.1 * person.crop.side**2)
     return PersonInPhoto(
         SeenPerson(points, person.world, person.presence, hands),
         cut,
@@ -465,7 +474,7 @@ def _write_refused(sheet: Path, photos: Sequence[PhotoPeople]) -> None:
         _is_ours,
         "several people may be meant, and their numbers belong there: move it away",
     )
-    write_sheet(sheet, photos)
+    _write_sheet(sheet, photos)
 
 
 def _refused(message: str, photos: Sequence[PhotoPeople], sheet: Path) -> ValueError:
@@ -514,7 +523,8 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
     for photo, each in found:
         points = each.person.points[:, :2]
         beyond = np.maximum(-points, points - np.asarray(photo.size))
-        if (beyond > BEYOND * np.ptp(points, axis=0).max()).any():
+        # outside of the photo means that a landmark is 3 % of the person's size beyond its border
+        if (beyond > 0.03 * np.ptp(points, axis=0).max()).any():
             told.append(f"{photo.name}: a part of the person is outside of the photo")
     apart = [photo.name for photo, each in found if each.apart]
     if apart:
@@ -536,7 +546,7 @@ def check_found_place(
 
     Raises: ValueError, see `io.atomic.check_ours`.
     """
-    files = [KEYPOINTS_FILE, SHEET_FILE, *(map(mask_name, names) if masks else ())]
+    files = [KEYPOINTS_FILE, SHEET_FILE, *(map(_mask_name, names) if masks else ())]
     check_ours((folder / file for file in files), _is_ours, advice)
 
 
@@ -548,7 +558,7 @@ def names_in(folder: Path) -> list[str]:
     return [file.relative_to(images).as_posix() for file in files]
 
 
-def mask_name(photo: str) -> str:
+def _mask_name(photo: str) -> str:
     """The path of the mask of a photo in the folder that is written."""
     return f"{MASKS}/{Path(photo).with_suffix('.png').as_posix()}"
 
@@ -582,7 +592,7 @@ def write_found(
     see `check_found_place`.
     """
     # photos that differ in their suffix only would share a mask
-    files = [mask_name(photo.name) for photo in photos]
+    files = [_mask_name(photo.name) for photo in photos]
     owners: dict[str, str] = {}
     for photo, file in zip(photos, files, strict=True):
         other = owners.setdefault(file, photo.name)
@@ -597,7 +607,7 @@ def write_found(
         ]
         # the chosen person alone: `humangs fit` need not choose again
         write_people(temporary / KEYPOINTS_FILE, images)
-        write_sheet(temporary / SHEET_FILE, photos, person)
+        _write_sheet(temporary / SHEET_FILE, photos, person)
         with_mask = ()
         if masks:
             with_mask = zip(photos, files, strict=True)
@@ -622,7 +632,7 @@ def write_found(
                     else:
                         hidden = None
                 if hidden is not None:
-                    named["unknown"] = f"{UNKNOWN}/{Path(file).relative_to(MASKS).as_posix()}"
+                    named["unknown"] = f"unknown/{Path(file).relative_to(MASKS).as_posix()}"
                     (temporary / named["unknown"]).parent.mkdir(parents=True, exist_ok=True)
                     write_png(temporary / named["unknown"], hidden.astype(np.float32), mark=MASK)
                 views.append(view | named)
@@ -666,7 +676,7 @@ def hidden_by_others(
     return hidden if hidden.any() else None
 
 
-def write_sheet(path: Path, photos: Sequence[PhotoPeople], person: int | None = None) -> None:
+def _write_sheet(path: Path, photos: Sequence[PhotoPeople], person: int | None = None) -> None:
     """The photos side by side, everybody in a color and with a number. person: the one who was
     chosen.
     """
@@ -690,8 +700,8 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
     for i, found in enumerate(photo.people):
         if found is None:
             continue
-        color = np.asarray(COLORS[i % len(COLORS)]) / 255
-        opacity = FAINT if chosen in (None, i) else FAINT / 2
+        color = np.asarray(_SHEET.colors[i % len(_SHEET.colors)]) / 255
+        opacity = _SHEET.faint if chosen in (None, i) else _SHEET.faint / 2
         mask = opacity * resized(person_mask(photo, i), width, height)[..., None]
         picture = picture * (1 - mask) + color * mask
         # the number stands above the nose, inside the picture
@@ -707,7 +717,7 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
             number,
             fill="white",
             stroke_width=3,
-            stroke_fill=COLORS[i % len(COLORS)],
+            stroke_fill=_SHEET.colors[i % len(_SHEET.colors)],
             font=font,
         )
     return np.asarray(canvas) / 255

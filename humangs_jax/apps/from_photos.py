@@ -29,7 +29,7 @@ from humangs_jax.capture.fitting.own_poses import (
     record_of_photos,
 )
 from humangs_jax.capture.fitting.person_cameras import scaled_to_height
-from humangs_jax.capture.fitting.refine import (
+from humangs_jax.capture.fitting.silhouette_fit import (
     RefinedCapture,
     cameras_are_unseen,
     refine_capture,
@@ -59,7 +59,7 @@ from humangs_jax.refinement.config import ITERATIONS_ALONE, RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
 from humangs_jax.viewer.page import write_page
 
-IGNORE = "ignore"
+_IGNORE = "ignore"
 """As `cameras`: the calibration in the folder of photos is not used."""
 BEGIN_ANEW = "--overwrite (in Python overwrite=True) begins anew"
 """What to do about a body of an earlier run."""
@@ -91,6 +91,24 @@ class Step:
         if self.file is None:
             return self.text
         return f"{self.file}: {self.text}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """What is known about the photos of a capture when its body is fitted."""
+
+    folder: Path
+    """Folder that the photos were imported from."""
+    cameras: Path | None
+    """The calibration; None: the cameras were found from the person."""
+    keypoints: Path
+    """File or folder of the keypoints."""
+    keypoints_by_detector: bool
+    """Whether they were found here: then they are of the person who was chosen, and of nobody
+    else.
+    """
+    masks_by_detector: bool
+    """Whether masks were found here: then they are at the photos' edges already."""
 
 
 def avatar_from_photos(
@@ -173,7 +191,7 @@ class FromPhotos:
     out: Path
     """The capture folder to write."""
     cameras: Path | None = None
-    """The calibration, or `IGNORE`; None: what the folder has."""
+    """The calibration, or `_IGNORE`; None: what the folder has."""
     masks: Path | None = None
     """Folder of masks; None: what the folder has."""
     others: Path | None = None
@@ -203,7 +221,7 @@ class FromPhotos:
             raise ArgumentError("masks", f"{self.masks}: does not go with without_masks")
         self.resumes()  # what is wrong with the folder is reported before the work
         folder = yield from self._folder()
-        ignored = self.cameras == Path(IGNORE)
+        ignored = self.cameras == Path(_IGNORE)
         material = material_of.inspect_folder(
             folder,
             cameras=None if ignored else self.cameras,
@@ -291,28 +309,26 @@ class FromPhotos:
         # without cameras the person gives them
         if material.cameras is None and detection.available():
             ahead.add(calls_of_found_people(material.photos))
-            material = yield from self._photos_alone(material)
+            known = yield from self._photos_alone(material)
         else:
-            material = yield from self._with_cameras(material)
-        capture, estimate = yield from self._fit(material, ahead)
+            known = yield from self._with_cameras(material)
+        capture, estimate = yield from self._fit(known, ahead)
         yield from self._finish(capture, estimate)
 
-    def _with_cameras(self, material: PhotoFolder) -> Generator[Step, None, PhotoFolder]:
+    def _with_cameras(self, material: PhotoFolder) -> Generator[Step, None, Known]:
         """Import photos and cameras, find keypoints and masks that are missing, and name what else
         is to be made.
 
         Raises: MissingError.
         """
-        report = None
+        photos, masked = None, self.without_masks
         if material.cameras is not None:
             report = yield from self._import(material)
-        changed = report is not None and (report.undistorted or report.turned or report.heic)
-        masked = self.without_masks or (report is not None and report.masks)
-        needed = [
-            each
-            for each in missing(material, self.out / "images" if changed else None)
-            if not (masked and each.name == "masks")
-        ]
+            masked = masked or report.masks
+            # keypoints have to be of the photos that the import wrote, where it changed them
+            if report.undistorted or report.turned or report.heic:
+                photos = self.out / "images"
+        needed = [each for each in missing(material, photos) if each.name != "masks" or not masked]
         # what the detector finds is not asked for
         findable = ()
         if detection.available():
@@ -329,10 +345,10 @@ class FromPhotos:
                 f"{self.photos}: {names} missing: make them as above and run the same command again"
             )
         if detected:
-            material = yield from self._detect(material, detected)
-        return material
+            yield from self._detect(material, detected)
+        return self._known(material, masks_by_detector="masks" in detected)
 
-    def _photos_alone(self, material: PhotoFolder) -> Generator[Step, None, PhotoFolder]:
+    def _photos_alone(self, material: PhotoFolder) -> Generator[Step, None, Known]:
         """Find the person and the cameras in the photos."""
         with stage("finding the person and the cameras"):
             given = (material.keypoints, material.masks, material.alpha, material.others)
@@ -353,15 +369,15 @@ class FromPhotos:
         for remark in (*detect.remarks(found.people, found.person), *found.warnings):
             yield Step(remark, warning=True)
         yield Step("who was found in the photos", file=self.out / detect.SHEET_FILE)
-        return self._with_found(material, own_masks)
+        return self._known(material, masks_by_detector=own_masks)
 
-    def _detect(
-        self, material: PhotoFolder, wanted: list[str]
-    ) -> Generator[Step, None, PhotoFolder]:
+    def _detect(self, material: PhotoFolder, wanted: list[str]) -> Iterator[Step]:
         """Find keypoints or masks in the photos of the capture."""
         with stage("finding the person"):
             photos = load_photos(self.out)
-            given = _keypoints(photos, material.keypoints, self.person)
+            given = None
+            if material.keypoints is not None:
+                given = _keypoints(photos, material.keypoints, self.person)
             people, person = detect.person_in_capture(self.out, photos, given, self.person)
         with stage("writing what was found"):
             detect.write_found(self.out, people, person, masks="masks" in wanted, to_capture=True)
@@ -369,15 +385,18 @@ class FromPhotos:
             yield Step(remark, warning=True)
         sheet = self.out / detect.SHEET_FILE
         yield Step(f"{' and '.join(wanted)} found in the photos: {sheet} shows them")
-        return self._with_found(material, "masks" in wanted)
 
-    def _with_found(self, material: PhotoFolder, masks: bool) -> PhotoFolder:
-        """The material with what was found in the photos: keypoints where there are none, and
-        perhaps masks.
+    def _known(self, material: PhotoFolder, *, masks_by_detector: bool) -> Known:
+        """What the fit may count on: keypoints are those of the detector where the folder has
+        none.
         """
-        keypoints = material.keypoints or self.out / detect.KEYPOINTS_FILE
-        found = self.out / detect.MASKS if masks else material.masks
-        return dataclasses.replace(material, keypoints=keypoints, masks=found)
+        return Known(
+            folder=material.folder,
+            cameras=material.cameras,
+            keypoints=material.keypoints or self.out / detect.KEYPOINTS_FILE,
+            keypoints_by_detector=material.keypoints is None,
+            masks_by_detector=masks_by_detector,
+        )
 
     def _folder(self) -> Generator[Step, None, Path]:
         """The folder of photos; that of a video is beside `out`."""
@@ -403,7 +422,7 @@ class FromPhotos:
         begun = ours and not (self.out / "body.npz").exists()
         finished = begun or self.overwrite or (self.out / "avatar.html").exists()
         fitted = ours and (self.out / "fit.json").exists() and not finished
-        cameras = None if self.cameras == Path(IGNORE) else self.cameras
+        cameras = None if self.cameras == Path(_IGNORE) else self.cameras
         inputs = (self.photos, cameras, self.masks, self.others, self.keypoints)
         replaced = self.overwrite or begun or fitted
         if self.out.exists() and not self.out.is_dir():
@@ -446,25 +465,21 @@ class FromPhotos:
         return report
 
     def _fit(
-        self, material: PhotoFolder, ahead: Ahead
+        self, known: Known, ahead: Ahead
     ) -> Generator[Step, None, tuple[Capture, HeldOut | None]]:
         """Fit the body to keypoints and masks, and write it into the capture."""
         with stage("fitting the body"):
-            assert material.keypoints is not None
-            # the detector's own masks are at the photos' edges already
-            own_masks = material.masks == self.out / detect.MASKS
-            photos = load_photos(self.out, fit_masks=self.fit_masks and not own_masks)
-            found_here = material.keypoints.parent == self.out  # of the one person who was chosen
-            person = None if found_here else self.person
-            keypoints = _keypoints(photos, material.keypoints, person)
-            assert keypoints is not None
+            fit_masks = self.fit_masks and not known.masks_by_detector
+            photos = load_photos(self.out, fit_masks=fit_masks)
+            person = None if known.keypoints_by_detector else self.person
+            keypoints = _keypoints(photos, known.keypoints, person)
             against = None
             if photos.calibrated:
                 against = find_contradiction(photos, keypoints)
             if against:
                 raise ArgumentError(
                     "cameras",
-                    f"{material.cameras}: {against}: correct it, or go on without it by {IGNORE!r}",
+                    f"{known.cameras}: {against}: correct it, or go on without it by {_IGNORE!r}",
                 )
             if photos.masks is not None:
                 ahead.add(calls_after_fit(photos, keypoints))
@@ -477,7 +492,7 @@ class FromPhotos:
         if capture.masks is not None and (capture.masks > 0.5).any():
             with stage("refining the body by the masks"):
                 bodies = _bodies_to_masks(fitted)
-            bodies, record = yield from self._with_own_poses(material.folder, bodies, record)
+            bodies, record = yield from self._with_own_poses(known.folder, bodies, record)
             with stage("comparing bodies by a held-out photo"):
                 loose, tight = bodies
                 capture, estimate = material_of.better_body(
@@ -582,9 +597,7 @@ def _bodies_to_masks(fitted: FittedCapture) -> list[RefinedCapture]:
     return found
 
 
-def _keypoints(photos: Photos, file: Path | None, person: int | None) -> Keypoints | None:
-    """The keypoints of some photos; None if there is no file."""
-    if file is None:
-        return None
+def _keypoints(photos: Photos, file: Path, person: int | None) -> Keypoints:
+    """The keypoints of some photos, of the person with that number where several are in them."""
     height, width = photos.images.shape[1:3]
     return read_keypoints(file, photos.names, width, height, person=person)

@@ -40,8 +40,6 @@ from humangs_jax.io.images import (
 
 LONGEST = 2048
 """Pixels: longest side to which photos are reduced."""
-LEAST_PERSON = 700
-"""Pixels: size of the person there below which photos stay as they are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +95,8 @@ def import_photos(
             smaller = _reduced(images, files, Path(place))
         if smaller:
             found = _look(Path(place), files, smaller, choice)
-            if np.ptp(found.seen.points, axis=1).max(axis=-1).min() >= LEAST_PERSON:
+            # where the person has fewer pixels photos stay as they are
+            if np.ptp(found.seen.points, axis=1).max(axis=-1).min() >= 700:
                 with named_after(Path(place), images):
                     return _written(found, Path(place), out, height, None, own_masks, also)
     return _written(

@@ -7,6 +7,7 @@ explains it is named. `humangs reconstruct` and `refine` look first; `humangs ch
 draw a sheet as well (`apps.check`).
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -24,34 +25,38 @@ from humangs_jax.data.cameras import (
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
 
-LEAST_IOU = 0.5
-"""Clothes and hair cover about a fifth of a silhouette that the body does not; half means another
-pose or camera.
-"""
-SURELY_IOU = 0.6
-"""Intersection over union above which a mistake that was undone explains a view."""
-LEAST_INSIDE = 0.5
-"""Share of the points in the frame below which there is a warning."""
-SURELY_INSIDE = 0.9
-"""Share of the points in the frame that is asked of an explanation."""
-LEAST_HEIGHT = 0.05
-"""Share of the image's height: a body smaller than this has its lengths in another unit."""
-GRID = 64
-"""Cells of a silhouette along the longer side of the image."""
-POINTS = 6000
-"""Points on the surface of the body: several for each cell that it covers."""
+
+@dataclasses.dataclass(frozen=True)
+class _Limits:
+    """When body and photo do not agree."""
+
+    iou: float = 0.5
+    """Clothes and hair cover about a fifth of a silhouette that the body does not; half means
+    another pose or camera."""
+    sure_iou: float = 0.6
+    """Intersection over union above which a mistake that was undone explains a view."""
+    inside: float = 0.5
+    """Share of the points in the frame below which there is a warning."""
+    sure_inside: float = 0.9
+    """Share of the points in the frame that is asked of an explanation."""
+    height: float = 0.05
+    """Share of the image's height: a body smaller than this has its lengths in another unit."""
+    turn: float = 2 * math.pi + 0.5
+    """Radians: rotation vectors are at most half a turn, and a whole one where someone counted on;
+    degrees are far beyond."""
+    better: float = 0.1
+    """IoU by which an exchange has to explain each view better than the capture does."""
+    dark: float = 0.12
+    """A photo is too dark if 98 % of the person's values are below this."""
+    burnt: float = 0.98
+    """A photo is burnt out if 60 % of the person's values are above this."""
+
+
+_LIMITS = _Limits()
+
+
 VIEWS = 24
 """Most views that are looked at before a reconstruction, evenly chosen."""
-LONGEST_TURN = 2 * math.pi + 0.5
-"""Radians: rotation vectors are at most half a turn, and a whole one where someone counted on;
-degrees are far beyond.
-"""
-BETTER = 0.1
-"""IoU by which an exchange has to explain each view better than the capture does."""
-DARKEST = 0.12
-"""A photo is too dark if 98 % of the person's values are below this."""
-BURNT = 0.98
-"""A photo is burnt out if 60 % of the person's values are above this."""
 
 Matrix = Float[np.ndarray, "4 4"]
 Cells = Bool[np.ndarray, "rows columns"]
@@ -118,7 +123,7 @@ def faults(capture: Capture) -> Faults:
     views = _coarse_views(capture)
     problems, inside = zip(*map(_fault, views), strict=True)
     largest = float(np.linalg.norm(np.asarray(capture.poses.rotations, float), axis=-1).max())
-    if largest > LONGEST_TURN:
+    if largest > _LIMITS.turn:
         degrees = (
             f"the poses seem to be in degrees: rotations up to {largest:.0f}, expected radians"
         )
@@ -157,7 +162,8 @@ class _View(NamedTuple):
 
 
 def _coarse_views(capture: Capture) -> list[_View]:
-    points = surface_points(capture.body, capture.betas, capture.poses, capture.frames, POINTS)
+    # points on the surface of the body: several for each cell that it covers
+    points = surface_points(capture.body, capture.betas, capture.poses, capture.frames, 6000)
     translations = np.asarray(capture.poses.translation, float)
     K = np.asarray(capture.cameras.K, float)
     matrices = np.asarray(capture.cameras.cam_from_world, float)
@@ -186,11 +192,11 @@ def _fault(view: _View) -> tuple[str | None, float]:
     body, inside, height = _silhouette(view)
     if view.cells is not None and not view.cells.any():
         return "the mask is empty", inside
-    if inside < LEAST_INSIDE:
+    if inside < _LIMITS.inside:
         problem = "most of the body is outside the frame, or behind the camera"
-    elif height < LEAST_HEIGHT:
+    elif height < _LIMITS.height:
         problem = "the body is tiny, in metres it would not be"
-    elif view.cells is not None and _overlap(body, view.cells) < LEAST_IOU:
+    elif view.cells is not None and _overlap(body, view.cells) < _LIMITS.iou:
         problem = "body and mask do not agree"
     else:
         return _wrong_exposure(view), inside
@@ -203,12 +209,12 @@ def _wrong_exposure(view: _View) -> str | None:
     person = (
         view.image if view.mask is None else view.image[view.mask > 0.99]
     )  # without its blended edge
-    if person.size and np.quantile(person, 0.98) < DARKEST:
+    if person.size and np.quantile(person, 0.98) < _LIMITS.dark:
         return (
             "the person is nearly black; is the photo underexposed, or were its values divided by"
             " 255 twice"
         )
-    if person.size and view.mask is not None and np.quantile(person, 0.4) > BURNT:
+    if person.size and view.mask is not None and np.quantile(person, 0.4) > _LIMITS.burnt:
         return "most of the person is white; is the photo overexposed"
     return None
 
@@ -227,13 +233,13 @@ def _cause(view: _View, body: Cells) -> str | None:
         drawn, inside, height = _silhouette(
             view._replace(matrix=undo(view.matrix, view.translation))
         )
-        if inside > SURELY_INSIDE and height > LEAST_HEIGHT:
+        if inside > _LIMITS.sure_inside and height > _LIMITS.height:
             if view.cells is None:
                 tried[mistake] = 1.0
             else:
                 tried[mistake] = _overlap(drawn, view.cells)
     best = max(tried, key=lambda mistake: tried[mistake], default=None)
-    if best is None or tried[best] <= SURELY_IOU or (view.cells is None and len(tried) > 1):
+    if best is None or tried[best] <= _LIMITS.sure_iou or (view.cells is None and len(tried) > 1):
         return None
     return best
 
@@ -249,7 +255,7 @@ def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
 
     masks = {i: view.cells for i, view in enumerate(views) if view.cells is not None}
     own = {i: _overlap(drawn(i, i), mask) for i, mask in masks.items()}
-    off = [i for i, overlap in own.items() if overlap < SURELY_IOU]
+    off = [i for i, overlap in own.items() if overlap < _LIMITS.sure_iou]
     if len(off) < 2:
         return {}
     from scipy.optimize import (
@@ -263,7 +269,8 @@ def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
         for row, column in enumerate(chosen)
         if row != column
     }
-    explains = all(overlap > max(SURELY_IOU, own[i] + BETTER) for i, (_, overlap) in found.items())
+    least = {i: max(_LIMITS.sure_iou, own[i] + _LIMITS.better) for i in found}
+    explains = all(overlap > least[i] for i, (_, overlap) in found.items())
     # a mirrored photo explains views around a person as well
     mirrored = sum(_overlap(drawn(i, i)[:, ::-1], masks[i]) for i in found)
     if not explains or mirrored >= sum(overlap for _, overlap in found.values()):
@@ -305,7 +312,8 @@ def _mask_cells(mask: Float[np.ndarray, "h w"]) -> Cells:
 
 
 def _grid(width: int, height: int) -> tuple[tuple[int, int], float]:
-    cell = max(width, height) / GRID
+    # cells of a silhouette along the longer side of the image
+    cell = max(width, height) / 64
     return (max(1, round(height / cell)), max(1, round(width / cell))), cell
 
 

@@ -24,7 +24,7 @@ from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33
 from humangs_jax.core.array_types import Bool, Float, Int, UInt
 from humangs_jax.geometry.camera import Camera
 
-RIVAL = 0.35
+_RIVAL = 0.35
 """Somebody with this share of the pixels of the largest person could be the intended person too."""
 
 
@@ -116,7 +116,7 @@ def _large(people: Sequence[PersonInPhoto | None]) -> list[int]:
     """Gives the people of a photo who could be the intended person as well as its largest."""
     areas = [0.0 if each is None else each.area for each in people]
     return [
-        i for i, each in enumerate(people) if each is not None and areas[i] > RIVAL * max(areas)
+        i for i, each in enumerate(people) if each is not None and areas[i] > _RIVAL * max(areas)
     ]
 
 
@@ -175,7 +175,7 @@ def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]
             if row[i] is not None:
                 row[first], row[i], source[v] = row[i], None, i
         totals[first], totals[i] = totals[first] + totals[i], 0.0
-    if any(total > RIVAL * totals[first] for i, total in enumerate(totals) if i != first):
+    if any(total > _RIVAL * totals[first] for i, total in enumerate(totals) if i != first):
         return rows
     return _with_those_apart(joined, first, np.asarray(source), frames)
 
@@ -221,7 +221,7 @@ def exchanged(found: PersonInPhoto) -> PersonInPhoto:
 def rivals(photos: Sequence[PhotoPeople]) -> list[int]:
     """Gives the numbers of people who could be the intended person as well as the first."""
     areas = _areas(photos)
-    return [i for i in range(1, len(areas)) if areas[i] > RIVAL * areas[0]]
+    return [i for i in range(1, len(areas)) if areas[i] > _RIVAL * areas[0]]
 
 
 def is_unclear(photos: Sequence[PhotoPeople], photo: int, person: int) -> bool:

@@ -43,7 +43,7 @@ from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import Refinement, refine_with_report
 
 MEASURED = "tradeoff.md"
-KIND = "humangs_jax settings"
+_KIND = "humangs_jax settings"
 """The field "kind" of a file of settings."""
 
 
@@ -189,7 +189,7 @@ def reconstruct_with(
 
 def save_settings(path: str | os.PathLike[str], settings: Settings, **about: Any) -> None:
     """Write settings as JSON, with what else is to be known about them. Raises: OSError."""
-    write_json(path, {"kind": KIND, "settings": parse_json(config_to_json(settings)), **about})
+    write_json(path, {"kind": _KIND, "settings": parse_json(config_to_json(settings)), **about})
 
 
 def load_settings(path: str | os.PathLike[str]) -> Settings:
@@ -199,8 +199,8 @@ def load_settings(path: str | os.PathLike[str]) -> Settings:
     """
     with reading(path, "settings file"):
         content = parse_json(read_text(path))
-        if not isinstance(content, dict) or content.get("kind") != KIND:
-            raise InvalidFileError(f'no settings of `humangs tune`: expected "kind": "{KIND}"')
+        if not isinstance(content, dict) or content.get("kind") != _KIND:
+            raise InvalidFileError(f'no settings of `humangs tune`: expected "kind": "{_KIND}"')
         try:
             return config_from_json(Settings, json.dumps(content.get("settings")))
         except ValueError as error:
@@ -210,10 +210,8 @@ def load_settings(path: str | os.PathLike[str]) -> Settings:
 # Settings for a budget
 # --------------------------------------------------------------------------------------------------
 
-HEADROOM = 1.25
+_HEADROOM = 1.25
 """Measured times times this have to be within the budget: a busy machine is slower later."""
-MAKES = 2
-"""Avatars that are made and timed for each preset; the slowest counts."""
 FRAMES = 16
 """Frames that are timed for each preset; the 90th percentile counts."""
 
@@ -300,8 +298,8 @@ def tune(
         if memory_mb is not None and cost.memory_mb is None:
             raise ValueError("memory_mb: how much memory is used cannot be measured on this system")
         exceeded = (
-            reconstruct_ms is not None and HEADROOM * cost.reconstruct_ms > reconstruct_ms,
-            frame_ms is not None and HEADROOM * cost.frame_ms > frame_ms,
+            reconstruct_ms is not None and _HEADROOM * cost.reconstruct_ms > reconstruct_ms,
+            frame_ms is not None and _HEADROOM * cost.frame_ms > frame_ms,
             memory_mb is not None and (cost.memory_mb or 0) > memory_mb,
         )
         if any(exceeded):
@@ -312,7 +310,7 @@ def tune(
         name, cost = next(iter(measured.items()))
         raise ValueError(
             f"no preset is within the budget: {name!r}, the fastest, takes {_shown(cost)} of {size}"
-            f" pixels, and {HEADROOM - 1:.0%} of room is kept for a busy machine"
+            f" pixels, and {_HEADROOM - 1:.0%} of room is kept for a busy machine"
         )
     return Tuned(best, measured)
 
@@ -344,7 +342,8 @@ def measure(
 
     frame()
     with peak_memory() as peak:
-        reconstruct_ms = max(_milliseconds(make) for _ in range(MAKES))
+        # two avatars are timed for each preset; the slower one counts
+        reconstruct_ms = max(_milliseconds(make) for _ in range(2))
         frame_ms = float(np.quantile([_milliseconds(frame) for _ in range(FRAMES)], 0.9))
     # The process's own memory says nothing about that of a GPU or TPU.
     on_host = jax.default_backend() == "cpu"

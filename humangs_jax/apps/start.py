@@ -46,12 +46,8 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import calls_of_refine, refine
 
-PHOTO_FOLDERS = ("images", "photos", "imgs", "rgb")
-CAMERA_PLACES = (".", "cameras", "calibration", "calib", "colmap", "colmap/sparse/0")
-"""Names that are looked for in the folder of photos, in this order; those of files: `data.formats`.
-"""
-KEYPOINT_FOLDER = "keypoints"
-OWN_DETECTOR = (
+_KEYPOINT_FOLDER = "keypoints"
+_OWN_DETECTOR = (
     "pip install 'humangs_jax[photos]', and the same command finds them; or with another program:"
 )
 """Advice for masks and keypoints where LiteRT is not installed."""
@@ -145,8 +141,8 @@ def inspect_folder(
     mask_folders = [folder / name for name in MASK_FOLDERS if has_photos(folder / name)]
     in_front = [folder / name for name in OTHERS_FOLDERS if has_photos(folder / name)]
     named = []
-    if (folder / KEYPOINT_FOLDER).exists():
-        named = [folder / KEYPOINT_FOLDER]
+    if (folder / _KEYPOINT_FOLDER).exists():
+        named = [folder / _KEYPOINT_FOLDER]
     found = KEYPOINTS.found(folder)
     if found:
         named.append(found[1])
@@ -154,7 +150,8 @@ def inspect_folder(
     further = sorted(
         path for path in visible(folder.glob("*keypoint*")) if path.suffix in ("", ".json", ".npz")
     )
-    places = [folder / name for name in CAMERA_PLACES]
+    names = ".", "cameras", "calibration", "calib", "colmap", "colmap/sparse/0"
+    places = [folder / name for name in names]
     return PhotoFolder(
         folder=folder,
         images=images,
@@ -185,7 +182,7 @@ def scan_photos(folder: Path) -> FolderScan:
     Raises: CaptureError, one line, if there is no photo.
     """
     _expect_folder(folder)
-    places = (folder / name for name in PHOTO_FOLDERS)
+    places = (folder / name for name in ("images", "photos", "imgs", "rgb"))
     images = next((place for place in places if has_photos(place)), folder)
     whole = _scan(folder)
     if images == folder:
@@ -250,7 +247,7 @@ def missing(material: PhotoFolder, images: Path | None = None) -> tuple[Missing,
     # a photo with an alpha channel has its mask already
     if material.masks is None and not material.alpha:
         how = (
-            OWN_DETECTOR,
+            _OWN_DETECTOR,
             'rembg: pip install "rembg[cpu,cli]"',
             f"  rembg p -m u2net_human_seg -om {material.images} {folder / 'masks'}",
             (
@@ -264,7 +261,7 @@ def missing(material: PhotoFolder, images: Path | None = None) -> tuple[Missing,
     if material.keypoints is None:
         source, target = images or material.images, folder / "keypoints"
         how = (
-            OWN_DETECTOR,
+            _OWN_DETECTOR,
             "RTMPose, in a checkout of MMPose (https://github.com/open-mmlab/mmpose):",
             f"  python demo/inferencer_demo.py {source} --pose2d wholebody --pred-out-dir {target}",
             "or OpenPose (https://github.com/CMU-Perceptual-Computing-Lab/openpose):",
@@ -288,7 +285,7 @@ def _scan(folder: Path) -> FolderScan:
     """Scan a folder without masks and without what other programs have made of photos."""
     others = (
         *NO_PHOTOS,
-        KEYPOINT_FOLDER,
+        _KEYPOINT_FOLDER,
         *(name for each in KEYPOINTS.values() for name in each.files),
         "colmap",
     )
@@ -302,14 +299,10 @@ def _scan(folder: Path) -> FolderScan:
 READ = 8
 """Photos that the network reads where cameras were found from the person: more are no sharper, and
 take their time. All serve poses and refinement."""
-LEAST_PHOTOS = 4
-"""Photos below which none is held out to compare bodies."""
 SIZE = 512
 """Pixels a side of the crop in which bodies are compared."""
 LONGEST = 1024
 """Pixels: larger photos are reduced, whose crops around the person would be all the same."""
-CLEARLY = 0.1
-"""Decibels by which a second body has to be better in the photos that are asked."""
 
 
 class HeldOut(NamedTuple):
@@ -349,7 +342,8 @@ def held_out_psnr(
     """
     photos = _photos_to_hold_out(capture)
     capture = photos.capture
-    if capture.masks is None or capture.view_count < LEAST_PHOTOS:
+    # of fewer than four photos none is held out
+    if capture.masks is None or capture.view_count < 4:
         return None
     views = np.arange(capture.view_count)
     apart = _distances(capture)
@@ -452,7 +446,8 @@ def better_body(
             yield two.aligned - one.aligned
 
     chosen, shown = first, photos
-    if photos_agree(gains(), CLEARLY):
+    # the second body has to be better by a tenth of a decibel in the photos that are asked
+    if photos_agree(gains(), 0.1):
         chosen, shown = second, others
     if refinement is None and chosen is first:
         return first, begun

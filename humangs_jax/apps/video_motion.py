@@ -27,7 +27,7 @@ from humangs_jax.body.motion import Motion
 from humangs_jax.capture.calibration.videos import color_frames, frame_rate, frame_times
 from humangs_jax.capture.detection.face_and_hands import SHAPE_NAMES, FaceAndHands, hand_columns
 from humangs_jax.capture.detection.people import (
-    LEAST_PRESENCE,
+    BELIEVED,
     Detection,
     Landmarks,
     Networks,
@@ -52,27 +52,34 @@ from humangs_jax.motion import made_from_of, save_motion
 logger = logging.getLogger(__name__)
 LONGER_SIDE = 1920
 """Pixels of the longer side of the frames that are looked at, at most."""
-SHOWN = 720
-"""Pixels of the longer side of a check video."""
-PATIENCE = 8
-"""Frames without the person, in a row, that are all searched. A search takes ten times as long as
-following the person from the frame before."""
-RARELY = 8
-"""After these frames, one of this many is searched."""
-FARTHEST = 0.6
-"""Between two frames the hips of a person move by less than this share of the crop's side."""
-LARGEST_CHANGE = 1.6
-"""Between two frames the crop's side changes by less than this factor."""
-ALIKE = 0.6
-"""If a second person's crop has at least this share of the largest side, the user has to choose."""
-SAVED = 15.0
-"""Seconds of work after which what was seen is kept."""
-KEYPOINTS = len(MEDIAPIPE_69.names)
-NO_FACE = np.full(len(SHAPE_NAMES), np.nan, np.float32)
-FACE_SECONDS, LEAST_FACES = 0.025, 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class _Following:
+    """How one person is followed from frame to frame."""
+
+    patience: int = 8
+    """Frames without the person, in a row, that are all searched. A search takes ten times as long
+    as following the person from the frame before."""
+    rarely: int = 8
+    """After these frames, one of this many is searched."""
+    farthest: float = 0.6
+    """Between two frames the hips of a person move by less than this share of the crop's side."""
+    change: float = 1.6
+    """Between two frames the crop's side changes by less than this factor."""
+    alike: float = 0.6
+    """If a second person's crop has at least this share of the largest side, the user has to
+    choose."""
+
+
+_FOLLOWING = _Following()
+
+
+_NO_FACE = np.full(len(SHAPE_NAMES), np.nan, np.float32)
+_FACE_SECONDS, _LEAST_FACES = 0.025, 0.1
 """Standard deviation of the smoothing of faces, seconds: a blink takes a tenth of a second; and the
 share of the frames that have to show a face."""
-TALLEST, SMALLEST = 2.5, 0.4
+_TALLEST, _SMALLEST = 2.5, 0.4
 """Metres: heights of people."""
 
 
@@ -142,8 +149,8 @@ def fit_video(
 
     Arguments: rest_joints: of the avatar. kept: a file for what was seen, while the work goes on.
     """
-    if height is not None and not SMALLEST <= height <= TALLEST:
-        raise ArgumentError("height", f"{height:g}: expected metres, {SMALLEST:g} to {TALLEST:g}")
+    if height is not None and not _SMALLEST <= height <= _TALLEST:
+        raise ArgumentError("height", f"{height:g}: expected metres, {_SMALLEST:g} to {_TALLEST:g}")
     if height is not None and rest_joints is not None:
         raise ArgumentError("height", f"{height:g}: expected no avatar with it, which has a height")
     if focal_mm is not None and not 5 <= focal_mm <= 2000:
@@ -188,11 +195,11 @@ def smooth_faces(
     others. None if hardly any frame shows a face.
     """
     known = np.flatnonzero(np.isfinite(faces).all(1))
-    if len(known) < LEAST_FACES * len(faces):
+    if len(known) < _LEAST_FACES * len(faces):
         return None
     frames = np.arange(len(faces))
     filled = np.stack([np.interp(frames, known, column[known]) for column in faces.T], axis=1)
-    smooth = gaussian_filter1d(filled, max(FACE_SECONDS * rate, 1e-3), axis=0, mode="nearest")
+    smooth = gaussian_filter1d(filled, max(_FACE_SECONDS * rate, 1e-3), axis=0, mode="nearest")
     return smooth.clip(0, 1).astype(np.float32)
 
 
@@ -247,7 +254,8 @@ def look_at_video(
             photo = frame.astype(np.float32) / 255
             found = follower.look(photo)
             rows.append(_row(photo, found, parts))
-            if kept is not None and time.monotonic() - saved > SAVED:
+            # what was seen is kept every 15 seconds
+            if kept is not None and time.monotonic() - saved > 15.0:
                 _keep(kept, about, rows)
                 saved = time.monotonic()
     except BaseException:  # Ctrl-C, too: the next run goes on from here
@@ -279,9 +287,11 @@ class _Follower:
         found = None
         if self.last is not None and not self.missed:
             found = self.networks.landmarks(photo, self.last.crop())
-            if found.presence < LEAST_PRESENCE or not self._same(found.again):
+            if found.presence < BELIEVED.presence or not self._same(found.again):
                 found = None
-        if found is None and (self.missed < PATIENCE or self.missed % RARELY == 0):
+        if found is None and (
+            self.missed < _FOLLOWING.patience or self.missed % _FOLLOWING.rarely == 0
+        ):
             found = self._searched(photo)
         self.missed = self.missed + 1 if found is None else 0
         if found is not None:
@@ -295,7 +305,7 @@ class _Follower:
             number = self.person or 0
             if number >= len(people):
                 return None
-            alike = [p for p in people if p.crop.side >= ALIKE * people[0].crop.side]
+            alike = [p for p in people if p.crop.side >= _FOLLOWING.alike * people[0].crop.side]
             if self.person is None and len(alike) > 1:
                 self.lines.append(
                     f"{len(alike)} people: the largest is followed; --person 1 is the next"
@@ -314,7 +324,7 @@ class _Follower:
         before, after = self.last.crop(), now.crop()
         ratio = max(before.side, after.side) / max(min(before.side, after.side), 1e-6)
         away = float(np.hypot(*(after.center - before.center)))
-        return away < patience * FARTHEST * before.side and ratio < LARGEST_CHANGE
+        return away < patience * _FOLLOWING.farthest * before.side and ratio < _FOLLOWING.change
 
     def told(self) -> str:
         """Why nobody was followed, in a line."""
@@ -329,8 +339,9 @@ def _row(
     """What is kept of a frame: zeros where nobody was found; a face that is not seen is NaN."""
     if found is None:
         shapes = {"points": (2,), "confidences": (), "world": (3,)}
-        row = {key: np.zeros((KEYPOINTS, *shape), np.float32) for key, shape in shapes.items()}
-        return row | {"again": np.zeros((2, 2), np.float32), "face": NO_FACE}
+        count = len(MEDIAPIPE_69.names)
+        row = {key: np.zeros((count, *shape), np.float32) for key, shape in shapes.items()}
+        return row | {"again": np.zeros((2, 2), np.float32), "face": _NO_FACE}
     hands = hand_columns(parts.hands(photo, found.pixels, found.visibility), found.world)
     face = parts.face(photo, found.pixels)
     points = np.column_stack([found.pixels, found.visibility])
@@ -340,7 +351,7 @@ def _row(
         "confidences": columns[:, 2],
         "world": columns[:, 3:],
         "again": np.stack([found.again.hips, found.again.head]),
-        "face": NO_FACE if face is None else face,
+        "face": _NO_FACE if face is None else face,
     }
     return {key: np.asarray(value, np.float32) for key, value in values.items()}
 
@@ -379,7 +390,8 @@ def _earlier(kept: Path | None, about: str) -> list[dict[str, np.ndarray]]:
 
 def write_check_video(out: Path, video: Path, found: VideoFit) -> int:
     """Write the video with the body drawn over it; returns the number of frames."""
-    frames = color_frames(video, SHOWN, None)
+    # pixels of the longer side of a check video
+    frames = color_frames(video, 720, None)
     poses = found.fit.motion
     drawn = bar(
         _drawn(frames, found), desc="drawing the body", unit="frame", total=len(poses.translations)

@@ -32,7 +32,7 @@ from humangs_jax.capture.calibration.videos import (
     write_frames,
 )
 from humangs_jax.capture.detection.people import (
-    LEAST_PRESENCE,
+    BELIEVED,
     Landmarks,
     Networks,
     available,
@@ -48,15 +48,9 @@ from humangs_jax.io.reading import read_json, reading, write_json
 
 MARK = "video.json"
 """File in the folder of photos that names the video that they are of, and which frames."""
-FOLLOWED = 640
-"""Pixels of the longer side of frames in which the person is followed: twice what the landmark
-network looks at.
-"""
 PATIENCE = 8
 """Frames in a row without anybody after which nobody is looked for: to search a whole frame takes
 ten times as long as to follow somebody."""
-LEAST_FOUND = 0.5
-"""Share of the offered frames in which the person has to be found for directions to choose."""
 
 
 def video_of(place: Path) -> Path | None:
@@ -160,9 +154,11 @@ def _by_direction(video: Path, sharpness: Float[np.ndarray, " n"]) -> list[int]:
     person; none if it does not turn.
     """
     offered, worth = offered_frames(sharpness)
-    people = list(followed(color_frames(video, FOLLOWED, offered.tolist()), len(offered)))
+    # the person is followed in frames of 640 pixels: twice what the landmark network looks at
+    people = list(followed(color_frames(video, 640, offered.tolist()), len(offered)))
     found = np.asarray([person is not None for person in people])
-    if len(people) != len(offered) or found.mean() < LEAST_FOUND:
+    # directions choose if the person is found in half of the offered frames
+    if len(people) != len(offered) or found.mean() < 0.5:
         return []
     seen = [person for person in people if person is not None]
     world = np.stack([person.world for person in seen])
@@ -183,7 +179,7 @@ def followed(frames: Iterable[UInt[np.ndarray, "h w 3"]], count: int) -> Iterabl
         found = None
         if last is not None:
             found = networks.landmarks(photo, last.again.crop())
-        if found is None or found.presence < LEAST_PRESENCE:
+        if found is None or found.presence < BELIEVED.presence:
             found = next(iter(find_people(networks, photo)), None)
         last = found
         missed = missed + 1 if found is None else 0

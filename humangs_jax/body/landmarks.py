@@ -10,7 +10,7 @@ other 65 points of the face follow expressions, which bodies without a face rig 
 
 Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres):
 fits give them less weight. Where it is known at which places a detector sees its landmarks, they
-are moved there: `Place`.
+are moved there: `LandmarkDefinition`.
 """
 
 from collections.abc import Callable, Sequence
@@ -112,7 +112,7 @@ def _mirrored_face(i: int) -> tuple[int, int]:
 Millimetres = tuple[float | int, float | int, float | int]
 
 
-class Place(NamedTuple):
+class LandmarkDefinition(NamedTuple):
     """Where a detector sees one of its landmarks."""
 
     name: str
@@ -129,10 +129,12 @@ class Place(NamedTuple):
     """
 
 
-def place(name: str, base: str, joints: tuple[str, ...], millimetres: Millimetres) -> Place:
+def place(
+    name: str, base: str, joints: tuple[str, ...], millimetres: Millimetres
+) -> LandmarkDefinition:
     """Makes a landmark whose offset is in millimetres."""
     x, y, z = millimetres
-    return Place(name, base, (x / 1000, y / 1000, z / 1000), joints)
+    return LandmarkDefinition(name, base, (x / 1000, y / 1000, z / 1000), joints)
 
 
 CARRIERS = {
@@ -148,7 +150,7 @@ CARRIERS = {
 """The joints whose turning carries what lies beside a landmark; none: what carries its vertex."""
 
 
-def plain_places(names: tuple[str, ...]) -> tuple[Place, ...]:
+def plain_places(names: tuple[str, ...]) -> tuple[LandmarkDefinition, ...]:
     """Makes a place for each landmark that has `CARRIERS`, where this module has it: fits may find
     it elsewhere.
     """
@@ -158,13 +160,13 @@ def plain_places(names: tuple[str, ...]) -> tuple[Place, ...]:
         if part in CARRIERS:
             side = name.removesuffix(f"_{part}")
             joints = tuple(joint.format(side=side) for joint in CARRIERS[part])
-            places.append(Place(name, name, (0.0, 0.0, 0.0), joints))
+            places.append(LandmarkDefinition(name, name, (0.0, 0.0, 0.0), joints))
     return tuple(places)
 
 
 def both_sides(
     names: tuple[str, str], base: str, joints: tuple[str, ...], millimetres: Millimetres
-) -> tuple[Place, Place]:
+) -> tuple[LandmarkDefinition, LandmarkDefinition]:
     """Makes a landmark of the left side and its mirror image.
 
     Arguments: names: names of the left and the right one. base, joints: with {side} for the side.
@@ -172,7 +174,7 @@ def both_sides(
     """
     x, y, z = millimetres
 
-    def one(name: str, side: str, offset: Millimetres) -> Place:
+    def one(name: str, side: str, offset: Millimetres) -> LandmarkDefinition:
         carriers = tuple(joint.format(side=side) for joint in joints)
         return place(name, base.format(side=side), carriers, offset)
 
@@ -279,7 +281,7 @@ def kind_of(name: str) -> str:
 def landmark_model(
     body: BodyModel,
     names: tuple[str, ...],
-    places: tuple[Place, ...] = (),
+    places: tuple[LandmarkDefinition, ...] = (),
     certainty: tuple[float, ...] = (),
 ) -> LandmarkModel:
     """Prepares the landmarks of a body by name; those that it lacks get rows of zeros. Without
@@ -382,7 +384,7 @@ def _joint_point(body: BodyModel, surface: SurfacePoints, joint: int) -> Surface
 
 
 def _placed(
-    body: BodyModel, surface: SurfacePoints, finder: "_Finder", place: Place
+    body: BodyModel, surface: SurfacePoints, finder: "_Finder", place: LandmarkDefinition
 ) -> SurfacePoints:
     """Makes a point beside the sources of a landmark: it grows with them, and turns with the joints
     of the place.

@@ -215,7 +215,7 @@ class Fit:
     def _fit_to_masks(self) -> None:
         with stage("starting"):
             from humangs_jax.capture.fitting.files import check_place, write_fitted
-            from humangs_jax.capture.fitting.refine import (
+            from humangs_jax.capture.fitting.silhouette_fit import (
                 cameras_are_unseen,
                 refine_capture,
                 usual_config,

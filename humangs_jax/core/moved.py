@@ -9,6 +9,8 @@ from typing import Any
 
 MOVED = {
     "humangs_jax.avatar.shot": "humangs_jax.avatar.frame_settings",
+    "humangs_jax.capture.fitting.refine": "humangs_jax.capture.fitting.silhouette_fit",
+    "humangs_jax.fitting.refine": "humangs_jax.capture.fitting.silhouette_fit",
     "humangs_jax.data.calibration.calibration": "humangs_jax.data.cameras",
     "humangs_jax.data.calibration": "humangs_jax.capture.calibration",
     "humangs_jax.data.keypoints": "humangs_jax.capture.keypoints",

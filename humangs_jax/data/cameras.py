@@ -169,7 +169,7 @@ class Calibration:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Source:
+class CalibrationFile:
     """What a reader of a format gets."""
 
     path: Path
@@ -213,8 +213,8 @@ def read_calibration(
 ) -> Calibration:
     """The calibration in a file or folder of one of the `CAMERAS`; its content decides which one.
 
-    photo_size: as in `Source`. any_lens: also one whose photos are not undistorted here, else
-    refused.
+    photo_size: as in `CalibrationFile`. any_lens: also one whose photos are not undistorted here,
+    else refused.
 
     Raises: CaptureError, one line that names the file and what was expected.
     """
@@ -237,8 +237,8 @@ def _read(path: Path, photo_size: Callable[[str], tuple[int, int]]) -> Calibrati
         if file is None:
             raise CaptureError(path, "", f"no cameras found: expected {CAMERAS.listed()}")
         if format is not None and format.folder:
-            return format(Source(file.parent, photo_size), format)
-        source = Source(file, photo_size)
+            return format(CalibrationFile(file.parent, photo_size), format)
+        source = CalibrationFile(file, photo_size)
         found = binary_kind(file)
         format = None
         if found is None or file.suffix.lower() in CAMERAS.suffixes:

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.apps import check as module
 from humangs_jax.apps.check import (
-    BOUNDARY,
+    TINTS,
     CheckReport,
     ViewCheck,
     check_capture,
@@ -98,7 +97,7 @@ def test_a_right_capture_has_full_overlap_and_no_warning(tmp_path):
     text = str(report)
     assert "000" in text and "1.000" in text and "100%" in text and "warning:" not in text
     sheet, _ = read_image(tmp_path / "check.png")
-    assert (np.abs(sheet - BOUNDARY).max(-1) < 0.01).sum() > 100  # the silhouettes
+    assert (np.abs(sheet - TINTS.boundary).max(-1) < 0.01).sum() > 100  # the silhouettes
     assert (sheet[..., 2] - sheet[..., 0] > 0.2).sum() > 50  # something blue
     assert (sheet[..., 0] - sheet[..., 2] > 0.2).sum() > 50  # something red
     assert [p.name for p in tmp_path.iterdir()] == ["check.png"]
@@ -120,7 +119,7 @@ def test_left_is_blue_and_right_is_red_on_the_photo():
     assert image[row, columns[-3], 2] > image[row, columns[-3], 0] + 0.2
     assert image[row, columns[2], 0] > image[row, columns[2], 2] + 0.2
     np.testing.assert_allclose(
-        side_tints(body)[:8], np.broadcast_to(module.MIDDLE, (8, 3)), atol=1e-6
+        side_tints(body)[:8], np.broadcast_to(TINTS.middle, (8, 3)), atol=1e-6
     )
 
 
@@ -135,10 +134,10 @@ def test_overlay_changes_only_the_body():
     covered = np.asarray(parts.covered)
     assert 0.05 < covered.mean() < 0.5
     np.testing.assert_array_equal(image[~covered], photo[~covered])
-    edge = np.abs(image - BOUNDARY).max(-1) < 1e-6
+    edge = np.abs(image - TINTS.boundary).max(-1) < 1e-6
     assert edge.any() and not (edge & ~covered).any() and edge.sum() < covered.sum() / 2
     inner = covered & ~edge
-    expected = (1 - module.OPACITY) * photo + module.OPACITY * np.asarray(parts.shaded)
+    expected = (1 - TINTS.opacity) * photo + TINTS.opacity * np.asarray(parts.shaded)
     np.testing.assert_allclose(image[inner], expected[inner], atol=1e-6)
     np.testing.assert_array_equal(overlay(photo, parts), image)
 
@@ -177,7 +176,7 @@ def test_the_displacement_of_a_capture_is_drawn(tmp_path, masks):
     assert "reconstruct will move the body as body.npz says, by up to 3.0 cm (yellow)" in str(
         report
     )
-    yellow = (np.abs(read_image(tmp_path / "check.png")[0] - module.DISPLACED) < 0.01).all(-1)
+    yellow = (np.abs(read_image(tmp_path / "check.png")[0] - TINTS.displaced) < 0.01).all(-1)
     assert yellow.sum() > 3 * SIZE / 4
 
 

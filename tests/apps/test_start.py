@@ -182,7 +182,7 @@ def test_keypoints_have_to_be_of_photos_without_lens_distortion(mine, capsys):
 
 @pytest.fixture
 def detected(mine, monkeypatch):
-    """What the detector finds is known, and the run ends before the fit: its material."""
+    """What the detector finds is known, and the run ends before the fit: what that is given."""
     capture, told = load_capture("demo_capture"), []
     points = np.nan_to_num(landmarks_in(capture, MEDIAPIPE_33.names))
     shown = []
@@ -203,8 +203,8 @@ def detected(mine, monkeypatch):
             )
         )
 
-    def stop(self, material, ahead):
-        told.append(material)
+    def stop(self, known, ahead):
+        told.append(known)
         raise ValueError("the fit")
         yield
 
@@ -228,10 +228,12 @@ def test_what_is_missing_is_found_in_the_photos_and_what_is_given_wins(
         err == "humangs: error: the fit\n"
         and f"{' and '.join(names)} found in the photos: me/people.png" in out
     )
-    (material,) = detected
-    assert material.keypoints == (
+    (known,) = detected
+    assert known.keypoints == (
         Path("me/keypoints.json") if "keypoints" in names else mine / "keypoints"
     )
+    assert known.keypoints_by_detector == ("keypoints" in names)
+    assert known.masks_by_detector == ("masks" in names)
     imported = load_photos("me")
     np.testing.assert_allclose(imported.masks, truth.masks, atol=1 / 255)
 
@@ -243,8 +245,9 @@ def test_photos_alone_are_enough(mine, detected, capsys):
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.7"]) == cli.BAD_DATA
     out, err = capsys.readouterr()
     assert err.endswith("humangs: error: the fit\n") and "cameras from the person: " in out
-    (material,) = detected
-    assert material.keypoints == Path("me/keypoints.json")
+    (known,) = detected
+    assert known.keypoints == Path("me/keypoints.json")
+    assert known.keypoints_by_detector and known.masks_by_detector
     imported, truth = load_photos("me"), load_capture("demo_capture")
     assert (imported.frames == 0).all()
     centers, true = (np.asarray(capture.cameras.center) for capture in (imported, truth))

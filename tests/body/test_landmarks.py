@@ -7,7 +7,13 @@ import pytest
 from rounding import bound
 
 from humangs_jax.body.joints import JOINT_NAMES
-from humangs_jax.body.landmarks import Place, landmark_model, mirrored_name, pose_landmarks, side_of
+from humangs_jax.body.landmarks import (
+    LandmarkDefinition,
+    landmark_model,
+    mirrored_name,
+    pose_landmarks,
+    side_of,
+)
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.body.resolution import decimate
 from humangs_jax.capture.keypoints.keypoints import (
@@ -72,7 +78,7 @@ def test_a_place_is_beside_its_joint_and_turns_with_its_bones(small, joints, tur
     names = ("left_elbow", "nose")
     plain, moved = (
         landmark_model(small, names, places)
-        for places in ((), (Place(names[0], names[0], (0.03, 0.02, 0), joints),))
+        for places in ((), (LandmarkDefinition(names[0], names[0], (0.03, 0.02, 0), joints),))
     )
     for betas in (jnp.zeros(2), jnp.asarray([2.0, -1.0])):
         (a, nose), (b, same) = (posed(model, betas, BENT)[0] for model in (plain, moved))
@@ -85,9 +91,9 @@ def test_a_place_beside_a_vertex_is_carried_by_the_same_bones_and_one_of_joints_
 ):
     names = ("left_index_tip", "nose")
     places = (
-        Place(names[0], names[0], (0.0, 0.01, 0.0)),
-        Place("nose", "left_horn", (1.0, 0, 0)),
-        Place("nose", "nose", (1, 0, 0), ("tail",)),
+        LandmarkDefinition(names[0], names[0], (0.0, 0.01, 0.0)),
+        LandmarkDefinition("nose", "left_horn", (1.0, 0, 0)),
+        LandmarkDefinition("nose", "nose", (1, 0, 0), ("tail",)),
     )
     plain, moved = (
         posed(landmark_model(small, names, own), jnp.zeros(1), BENT)[0] for own in ((), places)

@@ -6,17 +6,14 @@ import pytest
 from fit_people import NOISE, default_body, person
 
 from humangs_jax.apps import check as module
-from humangs_jax.apps.check import LEFT, RIGHT, fit_sheet
+from humangs_jax.apps.check import TINTS, fit_sheet
 from humangs_jax.avatar.video import GAP
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.capture.fitting import fit_capture
 from humangs_jax.capture.fitting.files import FitRecord
 from humangs_jax.capture.fitting.fit_capture import examine
 from humangs_jax.capture.fitting.report import (
-    NAMED,
-    ROWS,
-    UNDECIDED,
-    UNSURE,
+    WORTH_A_LINE,
     ViewReport,
     keypoint_warnings,
     undetermined_joints,
@@ -194,7 +191,7 @@ def test_the_table_is_of_the_views_that_fit_worst():
 
     text = str(examine(capture, with_points(keypoints, displace)).report)
     rows = [line for line in text.splitlines() if line[:1] == "m" and line[2:3] == "v"]
-    assert len(rows) == ROWS and "... " in text and "3 more that fit better" in text
+    assert len(rows) == WORTH_A_LINE.rows and "... " in text and "3 more that fit better" in text
     assert any(row.startswith("m4v1") for row in rows) and any(
         row.startswith("m8v2") and "0" in row for row in rows
     )
@@ -207,13 +204,13 @@ def test_the_table_is_of_the_views_that_fit_worst():
 
 def test_undetermined_joints_are_named_in_groups():
     index = JOINT_NAMES.index
-    joint_std = np.full((3, len(JOINT_NAMES)), 0.5 * UNSURE)
-    determined = np.full((3, len(JOINT_NAMES)), 2 * UNDECIDED)
+    joint_std = np.full((3, len(JOINT_NAMES)), 0.5 * WORTH_A_LINE.std)
+    determined = np.full((3, len(JOINT_NAMES)), 2 * WORTH_A_LINE.determined)
     for joint, name in enumerate(JOINT_NAMES):
         if name.startswith("left_") and name[-1] in "123":
             determined[:, joint] = 0
     determined[1, [index("right_index1"), index("left_eye")]] = 0
-    joint_std[:2, index("left_ankle")] = 2 * UNSURE
+    joint_std[:2, index("left_ankle")] = 2 * WORTH_A_LINE.std
     found = undetermined_joints(JOINT_NAMES, joint_std[:2], determined[:2])
     assert found == (
         "left hand",
@@ -227,13 +224,14 @@ def test_warnings_stay_few():
     fits = [ViewReport(f"v{i}", 0, 17, 1.0 + i, 9.0, 0.5 * (i % 2)) for i in range(30)]
     swaps = [Swap("sides", (f"v{i}",)) for i in range(12)]
     found = keypoint_warnings(fits, np.full(1, 5.0), [], swaps)
-    assert len(found) == NAMED + 3
-    assert found[NAMED] == "7 more views or pairs of views seem exchanged"
-    assert found[NAMED + 1].endswith(
+    assert len(found) == WORTH_A_LINE.named + 3
+    assert found[WORTH_A_LINE.named] == "7 more views or pairs of views seem exchanged"
+    assert found[WORTH_A_LINE.named + 1].endswith(
         "in view v20, v21, v22, v23, v24 and 5 more: median error 21 to 30 px"
     )
     assert (
-        found[NAMED + 2] == "many keypoints are outliers in view v1, v3, v5, v7, v9 and 5 more: 50%"
+        found[WORTH_A_LINE.named + 2]
+        == "many keypoints are outliers in view v1, v3, v5, v7, v9 and 5 more: 50%"
     )
 
 
@@ -304,7 +302,7 @@ def test_discs_are_where_the_keypoints_are_those_of_outliers_are_hollow_and_line
     )
     image, _ = read_image(tmp_path / "fit.png")
     top = image.shape[0] - 512 - GAP
-    blue = drawn(image[top : top + 60], LEFT)
+    blue = drawn(image[top : top + 60], TINTS.left)
     assert len(blue) > 30
     np.testing.assert_allclose(blue.mean(0), [2 * 16 - 0.5, 2 * 32 - 0.5 + GAP], atol=1.0)
     y, x = top + 2 * 16, GAP + 2 * 224
@@ -312,10 +310,10 @@ def test_discs_are_where_the_keypoints_are_those_of_outliers_are_hollow_and_line
         image[y - 1 : y + 1, x - 1 : x + 1, 2] > 0.9
     ).all()  # the white photo, or the line, but no red disc
     around = image[y - 8 : y + 8, x - 8 : x + 8]
-    assert ((around[..., 0] - around[..., 2]) > 0.3).sum() > 10 and RIGHT[0] > RIGHT[2]
+    assert ((around[..., 0] - around[..., 2]) > 0.3).sum() > 10 and TINTS.right[0] > TINTS.right[2]
     x, y = 2 * examination.landmarks[0, LEFT_WRIST] + [GAP, top]
     near = image[int(y) - 6 : int(y) + 7, int(x) - 6 : int(x) + 7]
-    assert (np.abs(near - np.asarray(module.CROSS) / 255).max(-1) < 0.3).sum() >= 5
+    assert (np.abs(near - np.asarray(TINTS.cross) / 255).max(-1) < 0.3).sum() >= 5
 
 
 @pytest.mark.slow

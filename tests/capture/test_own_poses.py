@@ -19,14 +19,14 @@ from humangs_jax.capture.fitting.own_poses import (
     record_of_photos,
     with_own_poses,
 )
-from humangs_jax.capture.fitting.refine import _as_motion
 from humangs_jax.capture.fitting.report import FitReport
+from humangs_jax.capture.fitting.silhouette_fit import _as_motion
 from humangs_jax.capture.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.geometry.camera import project
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
-from tests.capture.test_refine import SIZE, VIEWS, default_body, truth
+from tests.capture.test_silhouette_fit import SIZE, VIEWS, default_body, truth
 
 NOISE = 1.0
 """Pixels of the keypoints, half a percent of the person's height."""

@@ -24,7 +24,7 @@ from humangs_jax.capture.fitting import fit_capture, person_bundle
 from humangs_jax.capture.fitting.camera_errors import find_camera_errors, mended
 from humangs_jax.capture.fitting.fit_capture import examine, fit_photos
 from humangs_jax.capture.fitting.person_cameras import cameras_from_person, scaled_to_height
-from humangs_jax.capture.fitting.person_moments import DECIDING, explain
+from humangs_jax.capture.fitting.person_moments import ONE_MOMENT, explain
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
@@ -176,7 +176,7 @@ def test_photos_from_one_side_and_one_of_another_moment_stand_alone():
 
 @pytest.mark.parametrize("other", [None, 2, 11])
 def test_of_many_photos_a_few_decide_and_the_others_are_compared_with_them(other):
-    count = DECIDING + 4
+    count = ONE_MOMENT.deciding + 4
     matrices = cameras_around(count)
     landmarks = np.stack(
         [

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from changes import edit_json
 
-from humangs_jax.capture.fitting.refine import overlap
 from humangs_jax.capture.fitting.residuals.silhouettes import mask_boundary
+from humangs_jax.capture.fitting.silhouette_fit import overlap
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.body_and_masks import views_without_person
 from humangs_jax.data.capture import CaptureError, load_capture, save_capture

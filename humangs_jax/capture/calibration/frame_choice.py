@@ -15,13 +15,11 @@ from humangs_jax.io.reading import InvalidFileError
 
 PHOTOS = 8
 """Photos of a video in which nobody was found: a person from all sides."""
-WINDOWS = 64
-"""Windows of time, of which each offers its sharpest frame."""
 LONGER_SIDE = 480
 """Pixels of the frames that are looked at: blur that does not show there does not hurt."""
-CELLS = 24
+_CELLS = 24
 """Rows and columns of the thumbnails that are compared."""
-NOTHING_SHOWN = 3.0
+_NOTHING_SHOWN = 3.0
 """Levels of 255: the standard deviation of a frame that is all of one color, but for noise."""
 NOTHING_NEW = 0.05
 """Root mean square of the difference of two thumbnails, in standard deviations of one."""
@@ -39,18 +37,19 @@ def looked_at(
     sharpness, thumbnails = [], []
     for frame in frames:
         x = frame.astype(np.float32)
-        rows, columns = (np.linspace(0, side, CELLS + 1).astype(int)[:-1] for side in x.shape)
+        rows, columns = (np.linspace(0, side, _CELLS + 1).astype(int)[:-1] for side in x.shape)
         cells = np.add.reduceat(np.add.reduceat(x, rows, axis=0), columns, axis=1)
         cells /= np.add.reduceat(np.add.reduceat(np.ones_like(x), rows, axis=0), columns, axis=1)
         spread = float(x.std())
-        if spread < NOTHING_SHOWN or min(x.shape) < 3:
+        if spread < _NOTHING_SHOWN or min(x.shape) < 3:
             sharpness.append(0.0)
-            thumbnails.append(np.zeros(CELLS * CELLS, np.float32))
+            thumbnails.append(np.zeros(_CELLS * _CELLS, np.float32))
             continue
         edges = 4 * x[1:-1, 1:-1] - x[:-2, 1:-1] - x[2:, 1:-1] - x[1:-1, :-2] - x[1:-1, 2:]
         sharpness.append(float((edges**2).mean()) / spread**2)
-        thumbnails.append(((cells - cells.mean()) / max(float(cells.std()), NOTHING_SHOWN)).ravel())
-    shape = len(sharpness), CELLS * CELLS
+        deviation = max(float(cells.std()), _NOTHING_SHOWN)
+        thumbnails.append(((cells - cells.mean()) / deviation).ravel())
+    shape = len(sharpness), _CELLS * _CELLS
     return np.asarray(sharpness, np.float32), np.asarray(thumbnails, np.float32).reshape(shape)
 
 
@@ -67,7 +66,8 @@ def offered_frames(
         raise InvalidFileError(
             f"none of its {len(sharpness):,} frames shows anything: expected a video of a person"
         )
-    windows = np.array_split(shown, min(len(shown), WINDOWS))
+    # windows of time, of which each offers its sharpest frame
+    windows = np.array_split(shown, min(len(shown), 64))
     offered = np.asarray([window[np.argmax(sharpness[window])] for window in windows])
     return offered, np.minimum(1, sharpness[offered] / np.median(sharpness[offered]))
 
@@ -96,9 +96,6 @@ FRAMES = 16
 """Photos of a video: twice as many as the network reads, for the poses and for steps of
 refinement.
 """
-TURNED = np.pi / 2
-"""Radians of directions that frames have to cover to be chosen by them; somebody who is filmed from
-one side moves, but does not turn."""
 USUAL = 0.15
 """Share of the person's size by which a pose differs from the usual one when its frame is worth
 half.
@@ -153,7 +150,9 @@ def choose_by_direction(
     Arguments: directions: radians. worth: of each frame, 0 for one that is not to be taken.
     """
     rows = np.flatnonzero(worth > 0)
-    if not len(rows) or _covered(directions[rows]) < TURNED:
+    # somebody who is filmed from one side moves, but does not turn: directions have to cover a
+    # quarter turn
+    if not len(rows) or _covered(directions[rows]) < np.pi / 2:
         return []
     front = directions[rows[np.argmin(np.abs(np.angle(np.exp(1j * directions[rows]))))]]
     part = 2 * np.pi / most

@@ -65,15 +65,8 @@ from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import MASK, is_heic, read_grey, read_image, write_png
 from humangs_jax.io.reading import check_limit, reading, write_json
 
-SIZES_SHOWN = 5
+_SIZES_SHOWN = 5
 """Sizes of photos that a report lists."""
-NO_COMMON_MOMENT = "no two photos show the same moment: each is a frame with another pose"
-"""Warning about a file with a camera for each image."""
-NO_COMMON_FRAME = (
-    "no two cameras have a photo of the same frame: photos of one frame must have the same file"
-    " name"
-)
-"""Warning about a folder of photos by camera."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,20 +257,15 @@ def import_calibration(
     if heic:
         notes.append(f"written as PNG: {counted(heic, 'HEIC photo')}")
     notes += _padding_notes(turns, canvas)
-    warnings += about_masks
     if about_unit is not None:
         notes.append(about_unit)
-    if calibration.mask_key is not None:
-        named = f"{calibration.mask_key} of {calibration.file.name}"
-        if masks is not None:
-            warnings.append(f"{named}: not used, the masks are those in {masks}")
-        elif photos[0].mask is not None:
-            notes.append(f"masks: those of {named}")
-        else:
-            first = next(camera.mask for camera in calibration.cameras if camera.mask)
-            warnings.append(f"{named}: no such mask, {first}: imported without masks")
+    warnings += about_masks
+    named_masks, used = _mask_line(calibration, masks, photos)
+    if named_masks is not None:
+        told = notes if used else warnings
+        told.append(named_masks)
     if cameras > 1 and frames == len(photos) > 1:
-        warnings.append(NO_COMMON_MOMENT if calibration.per_image else NO_COMMON_FRAME)
+        warnings.append(_no_common_frame(calibration))
     names = names_from_paths([photo.key + ".png" for photo in photos])
     check_names(names, len(photos), images)
     # the folder, all of it or nothing
@@ -312,6 +300,31 @@ def import_calibration(
         warnings=(*checks.warnings, *warnings),
         unused=tuple(unused_photos(photos, images, calibration)),
     )
+
+
+def _no_common_frame(calibration: Calibration) -> str:
+    """The warning that no two photos are of one frame."""
+    if calibration.per_image:
+        return "no two photos show the same moment: each is a frame with another pose"
+    same = "photos of one frame must have the same file name"
+    return f"no two cameras have a photo of the same frame: {same}"
+
+
+def _mask_line(
+    calibration: Calibration, masks: Path | None, photos: Sequence[Photo]
+) -> tuple[str | None, bool]:
+    """A line about the masks that a calibration names, None if it names none; and whether these are
+    used.
+    """
+    if calibration.mask_key is None:
+        return None, False
+    named = f"{calibration.mask_key} of {calibration.file.name}"
+    if masks is not None:
+        return f"{named}: not used, the masks are those in {masks}", False
+    if photos[0].mask is not None:
+        return f"masks: those of {named}", True
+    first = next(camera.mask for camera in calibration.cameras if camera.mask)
+    return f"{named}: no such mask, {first}: imported without masks", False
 
 
 def _check_options(
@@ -371,9 +384,9 @@ def _padding_notes(turns: Sequence[Turn], canvas: tuple[int, int]) -> list[str]:
         return []
     sizes = ", ".join(
         f"{count} of {_by(*size)}"
-        for size, count in sorted(counts.items(), reverse=True)[:SIZES_SHOWN]
+        for size, count in sorted(counts.items(), reverse=True)[:_SIZES_SHOWN]
     )
-    more = ", ..." if len(counts) > SIZES_SHOWN else ""
+    more = ", ..." if len(counts) > _SIZES_SHOWN else ""
     return [
         f"photos of {len(counts)} sizes ({sizes}{more}): white was added on the right and below, so"
         f" that all have {_by(*canvas)}; pixels keep their places: keypoints of the upright photos"

@@ -16,17 +16,11 @@ from humangs_jax.data.capture_checks import counted
 
 NEAR = 0.6
 """Steps of a camera by which its frame may be off: half of one, and what clocks of phones shake."""
-GAP = 1.5
+_GAP = 1.5
 """Steps between two frames, beyond which frames are missing between them."""
-SAME_RATE = 0.01
+_SAME_RATE = 0.01
 """Share by which the steps of cameras of one rate differ."""
-LATE = 0.1
-"""Seconds after the first frames of others from which on a camera lacks its first ones: encoders
-shift them by less.
-"""
-MOST_LATE = 3.0
-"""Seconds up to which this holds: a video that begins later counts time from elsewhere."""
-USUAL_STEP = 1 / 30
+_USUAL_STEP = 1 / 30
 """Seconds between two frames, where no video tells."""
 
 
@@ -51,7 +45,7 @@ def find_moments(times: Mapping[str, Float[np.ndarray, " n"]]) -> Moments:
     """
     steps = {camera: _step(each) for camera, each in times.items()}
     known = [step for step in steps.values() if step is not None]
-    slowest = max(known, default=USUAL_STEP)
+    slowest = max(known, default=_USUAL_STEP)
     first = min((each[0] for each in times.values()), default=0.0)
     clocks = {camera: _clock(each, steps[camera], slowest, first) for camera, each in times.items()}
     moments = _all_moments(clocks, {camera: step or slowest for camera, step in steps.items()})
@@ -67,7 +61,7 @@ def _step(times: Float[np.ndarray, " n"]) -> float | None:
     apart = np.diff(times)
     if not len(apart) or not np.isfinite(apart).all() or not (apart > 0).all():
         return None
-    return float(np.mean(apart[apart < GAP * np.median(apart)]))
+    return float(np.mean(apart[apart < _GAP * np.median(apart)]))
 
 
 def _clock(
@@ -79,7 +73,9 @@ def _clock(
     if step is None:
         return np.arange(len(times)) * slowest
     late = times[0] - first
-    start = late if LATE < late < MOST_LATE else 0.0
+    # encoders shift first frames by less than 0.1 s; a video that begins more than 3 s later
+    # counts time from elsewhere
+    start = late if 0.1 < late < 3.0 else 0.0
     return times - times[0] + start
 
 
@@ -90,12 +86,12 @@ def _all_moments(
     behind its end.
     """
     slowest = max(steps.values())
-    slow = [camera for camera, step in steps.items() if step > (1 - SAME_RATE) * slowest]
+    slow = [camera for camera, step in steps.items() if step > (1 - _SAME_RATE) * slowest]
     own = max((clocks[camera] for camera in slow), key=lambda each: len(each))
     earlier = own[0] - slowest * np.arange(round(own[0] / slowest), 0, -1)
     parts = [earlier, own[:1]]
     for before, after in itertools.pairwise(own.tolist()):
-        missing = round((after - before) / slowest) if after - before > GAP * slowest else 1
+        missing = round((after - before) / slowest) if after - before > _GAP * slowest else 1
         parts.append(before + (after - before) * np.arange(1, missing + 1) / missing)
     end = max(each[-1] for each in clocks.values())
     further = max(0, int(np.floor((end - own[-1]) / slowest + NEAR - 0.1)))
@@ -106,7 +102,7 @@ def nearest(times: Float[np.ndarray, " n"], moments: Float[np.ndarray, " m"]) ->
     """The frame of a camera at each moment, None where the nearest one is too far, or nearer to
     another moment.
     """
-    step = float(np.median(np.diff(times))) if len(times) > 1 else USUAL_STEP
+    step = float(np.median(np.diff(times))) if len(times) > 1 else _USUAL_STEP
     found = np.searchsorted((times[1:] + times[:-1]) / 2, moments)
     off = np.abs(times[found] - moments)
     best: dict[int, int] = {}
@@ -125,7 +121,7 @@ def _notes(
     frames: Mapping[str, Sequence[int | None]],
     steps: Sequence[float],
 ) -> tuple[str, ...]:
-    if not steps or max(steps) < (1 + SAME_RATE) * min(steps):
+    if not steps or max(steps) < (1 + _SAME_RATE) * min(steps):
         return ()
     apart = 0.0
     for numbers in zip(*frames.values(), strict=True):

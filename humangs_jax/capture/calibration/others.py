@@ -26,9 +26,6 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import PHOTO_SUFFIXES, orientation, read_grey
 
-TOUCHES = 3
-"""Pixels: a mask that ends so near to what the camera has not seen is cut off there."""
-
 
 def find_others(folder: Path | None, images: Path, photos: Sequence[Path]) -> dict[Path, Path]:
     """The masks of others by photo, of those photos that have one; empty without a folder.
@@ -92,7 +89,8 @@ def not_photographed(
 
 def is_cut_off(person: Bool[np.ndarray, "h w"], unseen: Bool[np.ndarray, "h w"]) -> bool:
     """Tells whether the person reaches what the camera has not seen, and so may go on there."""
-    near = ndimage.binary_dilation(unseen, iterations=TOUCHES)
+    # three pixels: a mask that ends so near to what the camera has not seen is cut off there
+    near = ndimage.binary_dilation(unseen, iterations=3)
     return bool((person & near).any())
 
 

@@ -39,11 +39,7 @@ from humangs_jax.io.images import (
     read_image,
 )
 
-SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in PHOTO_SUFFIXES)
-"""File types of photos that are looked for by a name without one; with one, any mix of cases will
-do.
-"""
-LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
+_LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
 """How photos of named cameras are stored, for errors."""
 
 
@@ -71,8 +67,6 @@ NO_PHOTOS = (*MASK_FOLDERS, *OTHERS_FOLDERS)
 """Names of folders whose pictures are no photos."""
 NO_CAMERA = "without a camera in"
 """How the reason begins why a photo is not used."""
-NO_PHOTO_SHOWN = 4
-"""Names of cameras without photos in a line."""
 
 
 def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, str | None]:
@@ -104,7 +98,7 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
     whole = counted(len(there), noun)
     line = (
         f"left out, without a photo: {len(missing)} of {whole} of {calibration.file.name}"
-        f" ({few(missing, NO_PHOTO_SHOWN)})"
+        f" ({few(missing, 4)})"
     )
     return kept, line
 
@@ -114,7 +108,7 @@ def _refuse_missing(calibration: Calibration, images: Path, name: str) -> None:
     if calibration.per_image:
         photo_of(images, name, calibration.file)
     raise CaptureError(
-        calibration.file, name, f"no photo of this camera in {images}: expected {LAYOUTS}"
+        calibration.file, name, f"no photo of this camera in {images}: expected {_LAYOUTS}"
     )
 
 
@@ -219,7 +213,9 @@ def _any_suffix(path: Path) -> Path | None:
     if is_photo(path):
         stems.append(path.stem)
         candidates.append(path)
-    candidates += [path.with_name(stem + suffix) for stem in stems for suffix in SUFFIXES]
+    # without a suffix all lower or all upper case is looked for; with one, any mix will do
+    suffixes = tuple(case(each) for case in (str.lower, str.upper) for each in PHOTO_SUFFIXES)
+    candidates += [path.with_name(stem + suffix) for stem in stems for suffix in suffixes]
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
@@ -338,8 +334,6 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
 # Orientation
 # --------------------------------------------------------------------------------------------------
 
-QUARTERS = {1: 0, 6: 1, 3: 2, 8: 3}
-"""Clockwise quarter turns that a flag asks for."""
 MIRRORED = {2: 1, 4: 3, 5: 6, 7: 8}
 """Flags that mirror besides turning, and those that only turn so."""
 MIRROR = 2
@@ -414,7 +408,9 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
         raise CaptureError(photo.image, "size", f"{stored[0]} x {stored[1]}{flagged}, {problem}")
     as_stored = calibrated == stored and not upright
     mask = 1 if photo.mask is None else mask_flag(photo.mask, flag, stored, shown)
-    quarters = QUARTERS[MIRRORED.get(flag, flag)] if as_stored else 0
+    # clockwise quarter turns that a flag asks for
+    quarter_turns = {1: 0, 6: 1, 3: 2, 8: 3}
+    quarters = quarter_turns[MIRRORED.get(flag, flag)] if as_stored else 0
     certain = flag == 1 or stored != shown or upright
     return Turn(flag, mask, quarters, shown, certain, as_stored and flag in MIRRORED)
 
@@ -529,16 +525,8 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
 # Masks
 # --------------------------------------------------------------------------------------------------
 
-AROUND = 0.8
-"""Share of a photo's border that no person covers: a mask that does is inverted."""
-EMPTY = "the mask is empty, the photo will be left out"
+_EMPTY = "the mask is empty, the photo will be left out"
 """Warning about a mask without a person."""
-FULL = "the mask covers the whole photo: is nothing of it background?"
-"""Warning about a mask that is all person."""
-INVERTED = (
-    "the mask covers the border of the photo: is it inverted? expected 255 where the person is"
-)
-"""Warning about a mask whose border is person."""
 
 
 def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
@@ -569,7 +557,7 @@ def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
             found.setdefault(problem, []).append((photo.mask or photo.image).name)
     if not masked and opaque:
         return ()  # many programs write an opaque alpha channel: it says nothing
-    if len(found.get(EMPTY, ())) == len(photos):
+    if len(found.get(_EMPTY, ())) == len(photos):
         first = photos[0].mask or photos[0].image
         raise CaptureError(
             first, "mask", "empty, as are all of them: expected 255 where the person is"
@@ -580,11 +568,16 @@ def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
 def _mask_problem(person: Bool[np.ndarray, "h w"]) -> str | None:
     """The fault of a mask; None for a usual one."""
     if not person.any():
-        return EMPTY
+        return _EMPTY
     if person.all():
-        return FULL
+        return "the mask covers the whole photo: is nothing of it background?"
     border = np.concatenate([person[0], person[-1], person[1:-1, 0], person[1:-1, -1]])
-    return INVERTED if border.mean() > AROUND else None
+    if border.mean() > 0.8:  # no person covers that much of it
+        return (
+            "the mask covers the border of the photo: is it inverted? expected 255 where the"
+            " person is"
+        )
+    return None
 
 
 def has_alpha(photo: Path) -> bool:

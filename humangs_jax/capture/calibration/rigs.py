@@ -28,7 +28,7 @@ from humangs_jax.data.cameras import (
     UNDISTORT_BEFORE,
     CalibratedCamera,
     Calibration,
-    Source,
+    CalibrationFile,
     brown_conrady,
     fisheye_lens,
     image_size,
@@ -48,7 +48,7 @@ from humangs_jax.io.reading import (
     reading,
 )
 
-FISHEYE = ("fisheye", "is_fisheye", "equidistant")
+_FISHEYE = ("fisheye", "is_fisheye", "equidistant")
 """Values of `model` and the like, or keys that are true, of lenses with another formula."""
 
 
@@ -61,7 +61,7 @@ def _in_map(file: Path, name: str) -> Where:
     return lambda key: (file, f"{name}.{key}")
 
 
-def recognizes_opencv(source: Source) -> bool:
+def recognizes_opencv(source: CalibrationFile) -> bool:
     """Whether a file has K, R and T of cameras."""
     if not (
         source.text.lstrip().startswith(("{", "%YAML", "---"))
@@ -75,7 +75,7 @@ def recognizes_opencv(source: Source) -> bool:
     )
 
 
-def read_opencv(source: Source, format: CameraFormat) -> Calibration:
+def read_opencv(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """The cameras of one file. Raises: CaptureError naming the key."""
     values = _values(source)
     nested = {name: value for name, value in values.items() if isinstance(value, Mapping)}
@@ -86,12 +86,12 @@ def read_opencv(source: Source, format: CameraFormat) -> Calibration:
 
 
 @functools.lru_cache(maxsize=1)
-def _values(source: Source) -> dict[str, Any]:
+def _values(source: CalibrationFile) -> dict[str, Any]:
     """Parsed once: YAML is slow."""
     return parse_file_storage(source.text, source.path)
 
 
-def read_easymocap(source: Source, format: CameraFormat) -> Calibration:
+def read_easymocap(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """The cameras of both files. Raises: CaptureError naming file and key."""
     inner, outer = source.path / "intri.yml", source.path / "extri.yml"
 
@@ -177,9 +177,9 @@ def _lens(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
     coefficients, at, refusal = None, "", None
     for key, value in values.items():
         if isinstance(value, str):
-            fisheye = value.lower() in FISHEYE
+            fisheye = value.lower() in _FISHEYE
         else:
-            fisheye = key.lower() in FISHEYE and bool(value)
+            fisheye = key.lower() in _FISHEYE and bool(value)
             if key.lower() == "d" or key.lower().startswith("dist"):
                 coefficients, at = value, key
         if fisheye:
@@ -213,14 +213,8 @@ def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
 # FileStorage
 # --------------------------------------------------------------------------------------------------
 
-MATRIX = "opencv-matrix"
+_MATRIX = "opencv-matrix"
 """The tag of matrices."""
-YAML_TAG = "tag:yaml.org,2002:"
-"""What `!!` stands for."""
-NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
-"""How a number is written."""
-TIGHT_KEY = re.compile(r"([{,]\s*\w+):(?=\S)")
-"""A key of a flow map with its value right behind the colon."""
 
 
 def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
@@ -242,7 +236,9 @@ def _yaml(text: str, file: Path) -> Any:
     check_limit("slow_text_bytes", len(text), "characters of YAML")
     kept = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
     try:
-        root = _Loader(TIGHT_KEY.sub(r"\1: ", "\n".join(kept))).get_single_node()
+        # keys of flow maps have their value right behind the colon, which YAML does not allow
+        spaced = re.sub(r"([{,]\s*\w+):(?=\S)", r"\1: ", "\n".join(kept))
+        root = _Loader(spaced).get_single_node()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"line {mark.line + 1}" if mark else ""
@@ -278,20 +274,22 @@ def _value(node: yaml.Node, file: Path) -> Any:
         value = {str(key.value): _value(item, file) for key, item in node.value}
     if node.tag in yaml.SafeLoader.yaml_constructors:
         return value
-    return _matrix(value, node.tag.removeprefix(YAML_TAG), file, f"line {node.start_mark.line + 1}")
+    tag = node.tag.removeprefix("tag:yaml.org,2002:")  # what `!!` stands for
+    return _matrix(value, tag, file, f"line {node.start_mark.line + 1}")
 
 
 def _scalar(text: str) -> int | float | str | None:
     if text.lower() in (".nan", ".inf", "-.inf"):
         return float(text.lower().replace(".", ""))
-    if NUMBER.fullmatch(text) and not re.fullmatch(r"[+-]?0\d+", text):
+    number = re.fullmatch(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", text)
+    if number and not re.fullmatch(r"[+-]?0\d+", text):
         return int(text) if re.fullmatch(r"[+-]?\d+", text) else float(text)
     return text if text not in ("", "~", "null") else None
 
 
 def _matrix(value: Any, tag: str, file: Path, where: str) -> Float[np.ndarray, "rows columns"]:
-    if tag != MATRIX:
-        raise CaptureError(file, where, f"type {tag!r} is not supported: expected {MATRIX}")
+    if tag != _MATRIX:
+        raise CaptureError(file, where, f"type {tag!r} is not supported: expected {_MATRIX}")
     try:
         # dt is "d", or "3d" with three channels
         channels = int(re.sub(r"\D.*", "", str(value["dt"])) or 1)
@@ -317,18 +315,8 @@ def _matrices(value: Any, file: Path, field: str) -> Any:
 # CMU Panoptic: a list `cameras` of K, distCoef, R, t (centimetres) and resolution
 # --------------------------------------
 
-PANOPTIC_KEYS = {
-    "K": "K",
-    "distCoef": "dist",
-    "R": "R",
-    "T": "T",
-    "t": "T",
-    "resolution": "imgSize",
-}
-"""Panoptic's keys -> OpenCV's."""
 
-
-def recognizes_panoptic(source: Source) -> bool:
+def recognizes_panoptic(source: CalibrationFile) -> bool:
     """Whether a file has a list of cameras."""
     return (
         isinstance(source.json, dict)
@@ -337,13 +325,22 @@ def recognizes_panoptic(source: Source) -> bool:
     )
 
 
-def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
+def read_panoptic(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """The cameras of the list. Raises: CaptureError naming the key."""
+    # Panoptic's keys -> OpenCV's
+    keys = {
+        "K": "K",
+        "distCoef": "dist",
+        "R": "R",
+        "T": "T",
+        "t": "T",
+        "resolution": "imgSize",
+    }
     cameras, file = [], source.path
     for i, entry in enumerate(source.json["cameras"]):
         expect(entry, dict, file, f"cameras[{i}]")
         cameras.append(
-            _renamed_camera(str(entry.get("name", i)), entry, PANOPTIC_KEYS, file, f"cameras[{i}]")
+            _renamed_camera(str(entry.get("name", i)), entry, keys, file, f"cameras[{i}]")
         )
     return source.calibration(format, cameras)
 
@@ -351,19 +348,19 @@ def read_panoptic(source: Source, format: CameraFormat) -> Calibration:
 # multical: `cameras` with lenses, and `camera_poses` from one camera to another
 # -------------------------------------------
 
-RELATIVE = "_to_"
+_RELATIVE = "_to_"
 """Separates the names of two cameras in a key: "a_to_b" has the pose of a relative to b, with
 X_a = R X_b + T."""
 
 
-def recognizes_multical(source: Source) -> bool:
+def recognizes_multical(source: CalibrationFile) -> bool:
     """Whether a file has maps of cameras and of their poses."""
     return isinstance(source.json, dict) and all(
         isinstance(source.json.get(key), dict) for key in ("cameras", "camera_poses")
     )
 
 
-def read_multical(source: Source, format: CameraFormat) -> Calibration:
+def read_multical(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """Reads the cameras of both maps; the world is the camera whose pose is relative to no other.
 
     Raises: CaptureError naming the key.
@@ -408,9 +405,9 @@ def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
     """The camera that a key of `camera_poses` is of, and the one in whose axes it is, None for the
     world's.
     """
-    parts = key.split(RELATIVE)
+    parts = key.split(_RELATIVE)
     for i in range(1, len(parts)):
-        name, base = RELATIVE.join(parts[:i]), RELATIVE.join(parts[i:])
+        name, base = _RELATIVE.join(parts[:i]), _RELATIVE.join(parts[i:])
         if name in names and base in names:
             return name, base
     return key, None
@@ -419,23 +416,13 @@ def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
 # TOML of Caliscope, Anipose and Pose2Sim: a table of each camera
 # -------------------------------------------------------
 
-TOML_KEYS = {
-    "matrix": "K",
-    "rotation": "R",
-    "translation": "T",
-    "distortions": "dist",
-    "size": "imgSize",
-    "fisheye": "fisheye",
-}
-"""Keys of a table -> OpenCV's."""
 
-
-def recognizes_toml(source: Source) -> bool:
+def recognizes_toml(source: CalibrationFile) -> bool:
     """Whether a file is called so and has tables of cameras."""
     return source.path.suffix.lower() == ".toml" and bool(_tables(source))
 
 
-def read_toml(source: Source, format: CameraFormat) -> Calibration:
+def read_toml(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """The cameras of a file, but for those to be ignored or never placed.
 
     Raises: CaptureError naming the key.
@@ -445,14 +432,23 @@ def read_toml(source: Source, format: CameraFormat) -> Calibration:
         if table.get("ignore") is True:
             continue
         name = str(table.get("name", key.rsplit(".", 1)[-1]))
-        cameras.append(_renamed_camera(name, table, TOML_KEYS, file, key))
+        # keys of a table -> OpenCV's
+        keys = {
+            "matrix": "K",
+            "rotation": "R",
+            "translation": "T",
+            "distortions": "dist",
+            "size": "imgSize",
+            "fisheye": "fisheye",
+        }
+        cameras.append(_renamed_camera(name, table, keys, file, key))
     if not cameras:
         raise CaptureError(file, "", "every camera is to be ignored")
     return source.calibration(format, cameras)
 
 
 @functools.lru_cache(maxsize=1)
-def _tables(source: Source) -> dict[str, Mapping[str, Any]]:
+def _tables(source: CalibrationFile) -> dict[str, Mapping[str, Any]]:
     check_limit("slow_text_bytes", len(source.text), "characters of TOML")
     content = tomllib.loads(source.text)
     check_nesting(content)
@@ -471,21 +467,19 @@ def _tables(source: Source) -> dict[str, Mapping[str, Any]]:
 # Qualisys Track Manager's XML
 # ------------------------------------------------------------------------------------------
 
-SUBPIXELS = 64.0
+_SUBPIXELS = 64.0
 """Units of intrinsics per pixel."""
-METRES = 1e-3
-"""Metres per unit of places."""
-LENS = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
+_LENS = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
 """Attributes of Brown and Conrady's coefficients k1, k2, p1, p2."""
 
 
-def recognizes_qualisys(source: Source) -> bool:
+def recognizes_qualisys(source: CalibrationFile) -> bool:
     """Whether a file is XML of a calibration with fields of view."""
     text = source.text.lstrip()
     return text.startswith("<") and "<transform" in text and "focalLengthU" in text
 
 
-def read_qualisys(source: Source, format: CameraFormat) -> Calibration:
+def read_qualisys(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """The cameras of a file. Raises: CaptureError naming the camera and what is missing."""
     check_limit("slow_text_bytes", len(source.text), "characters of XML")
     if re.search(r"<!(DOCTYPE|ENTITY)", source.text):
@@ -501,7 +495,7 @@ def read_qualisys(source: Source, format: CameraFormat) -> Calibration:
     return source.calibration(format, cameras)
 
 
-def _camera(element: tree.Element, field: str, source: Source) -> CalibratedCamera:
+def _camera(element: tree.Element, field: str, source: CalibrationFile) -> CalibratedCamera:
     def number(part: str, key: str) -> float:
         text = getattr(element.find(part), "attrib", {}).get(key, "")
         try:
@@ -514,16 +508,16 @@ def _camera(element: tree.Element, field: str, source: Source) -> CalibratedCame
     turn = np.diag([1.0, -1, -1]) @ [
         [number("transform", f"r{i}{j}") for j in (1, 2, 3)] for i in (1, 2, 3)
     ]
-    place = METRES * np.asarray([number("transform", axis) for axis in "xyz"])
+    place = 1e-3 * np.asarray([number("transform", axis) for axis in "xyz"])  # millimetres
     left, top, right, bottom = (
         number("fov_video", side) for side in ("left", "top", "right", "bottom")
     )
-    focal = [number("intrinsic", f"focalLength{axis}") / SUBPIXELS for axis in "UV"]
-    center = [number("intrinsic", f"centerPoint{axis}") / SUBPIXELS for axis in "UV"]
+    focal = [number("intrinsic", f"focalLength{axis}") / _SUBPIXELS for axis in "UV"]
+    center = [number("intrinsic", f"centerPoint{axis}") / _SUBPIXELS for axis in "UV"]
     K = intrinsics(*focal, center[0] - left, center[1] - top)
     size = image_size([right - left + 1, bottom - top + 1], source.path, f"{field}.fov_video")
     lens = brown_conrady(
-        [number("intrinsic", key) for key in LENS], source.path, f"{field}.intrinsic"
+        [number("intrinsic", key) for key in _LENS], source.path, f"{field}.intrinsic"
     )
     name = element.get("serial") or element.get("name") or field
     return CalibratedCamera(name, K, pose_matrix(turn, -turn @ place), *size, lens)

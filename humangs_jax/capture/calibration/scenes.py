@@ -22,8 +22,8 @@ from humangs_jax.data.cameras import (
     WORLD_FROM_CAM_OPENGL,
     CalibratedCamera,
     Calibration,
+    CalibrationFile,
     Observations,
-    Source,
     fisheye_lens,
     image_size,
     intrinsics,
@@ -45,7 +45,7 @@ Registered = tuple[str, str, str, Sequence[float], np.ndarray]
 """An image: where it stands, its name, the number of the camera, quaternion and translation, (n, 3)
 points as x y id.
 """
-PARAMETERS = {
+_PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
@@ -57,13 +57,11 @@ PARAMETERS = {
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
 }
 """Camera models and their parameters in cameras.txt."""
-NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9), PARAMETERS, strict=True))
+NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9), _PARAMETERS, strict=True))
 """Camera models by their numbers in cameras.bin."""
-UNDISTORTED = tuple(PARAMETERS)[:5]
-"""Camera models whose photos `import_cameras` undistorts."""
 
 
-def read_colmap(source: Source, format: CameraFormat) -> Calibration:
+def read_colmap(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """The registered images of a model, in the order of its file.
 
     Raises: CaptureError naming the file and, of text, the line.
@@ -109,7 +107,7 @@ def read_colmap(source: Source, format: CameraFormat) -> Calibration:
 def _lens(
     model: str, size: Sequence[float | int], values: Sequence[float], file: Path, where: str
 ) -> CalibratedCamera:
-    names = PARAMETERS[model]
+    names = _PARAMETERS[model]
     p = dict(zip(names, floats(values, file, where, (len(names),)).tolist(), strict=True))
     focal = p.get("f", 0.0)
     K = intrinsics(p.get("fx", focal), p.get("fy", focal), p["cx"], p["cy"])
@@ -123,12 +121,12 @@ def _lens(
 
 
 def _check_camera_model(model: str, file: Path, where: str) -> None:
-    if model not in PARAMETERS:
+    if model not in _PARAMETERS:
         raise _refusal(model, file, where)
 
 
 def _refusal(model: str, file: Path, where: str) -> CaptureError:
-    supported = ", ".join(UNDISTORTED)
+    supported = ", ".join(tuple(_PARAMETERS)[:5])  # the others have lenses that nobody undistorts
     return CaptureError(
         file, where, f"camera model {model}: expected one of {supported}; else {UNDISTORT_BEFORE}"
     )
@@ -145,10 +143,6 @@ def _pose(values: Sequence[float], file: Path, where: str) -> Float[np.ndarray, 
 
 # Text
 # --------------------------------------------------------------------------------------------------
-
-
-GREY = (128.0, 128.0, 128.0)
-"""Color of points whose line has none, of 255."""
 
 
 def _lines(file: Path) -> Iterator[tuple[str, str]]:
@@ -170,8 +164,8 @@ def _text_cameras(file: Path) -> Iterator[tuple[str, CalibratedCamera]]:
             continue
         camera_id, model, *values = line.split()
         _check_camera_model(model, file, where)
-        if len(values) != 2 + len(PARAMETERS[model]):
-            wanted = f"WIDTH HEIGHT {' '.join(PARAMETERS[model])}"
+        if len(values) != 2 + len(_PARAMETERS[model]):
+            wanted = f"WIDTH HEIGHT {' '.join(_PARAMETERS[model])}"
             raise CaptureError(
                 file, where, f"{model}: expected {wanted}, got {len(values)} numbers"
             )
@@ -202,7 +196,8 @@ def _text_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
         if line.strip():
             number, *words = line.split()[:7]
             place = floats(_numbers(words[:3], file, where), file, where, (3,))
-            color = _numbers(words[3:], file, where) if len(words) == 6 else GREY
+            grey = [128.0, 128.0, 128.0]  # a line may have no color
+            color = _numbers(words[3:], file, where) if len(words) == 6 else grey
             yield int(number), [*place.tolist(), *color]
 
 
@@ -244,7 +239,7 @@ def _binary_cameras(file: Path) -> Iterator[tuple[str, CalibratedCamera]]:
             camera_id, number, width, height = data.read("iiQQ")
             model = NUMBERS.get(number, str(number))
             _check_camera_model(model, file, f"camera {i}")
-            values = data.read("d" * len(PARAMETERS[model]))
+            values = data.read("d" * len(_PARAMETERS[model]))
             yield str(camera_id), _lens(model, (width, height), values, file, f"camera {i}")
 
 
@@ -274,22 +269,20 @@ def _binary_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
 # transforms.json
 # --------------------------------------------------------------------------------------------------
 
-CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+_CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 """Values of `camera_model` for lenses that are read."""
-FISHEYE_MODEL = "OPENCV_FISHEYE"
+_FISHEYE_MODEL = "OPENCV_FISHEYE"
 """The value for a fisheye."""
-MASK_KEYS = ("fg_mask_path", "mask_path")
-"""Keys of a mask's path, of VHAP and of nerfstudio."""
-MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_intrinsics")
+_MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_intrinsics")
 """Keys of a whole K, in a frame or in the file."""
 
 
-def recognizes_transforms(source: Source) -> bool:
+def recognizes_transforms(source: CalibrationFile) -> bool:
     """Whether a file is JSON with `frames`."""
     return isinstance(source.json, dict) and "frames" in source.json
 
 
-def read_transforms(source: Source, format: CameraFormat) -> Calibration:
+def read_transforms(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """The cameras of `frames`, in their order. Raises: CaptureError naming the key."""
     values, file = source.json, source.path
     (frames,) = members(values, file, frames=list)
@@ -297,7 +290,11 @@ def read_transforms(source: Source, format: CameraFormat) -> Calibration:
         raise CaptureError(file, "frames", "expected at least one")
     for i, frame in enumerate(frames):
         expect(frame, dict, file, f"frames[{i}]")
-    mask_key = next((key for key in MASK_KEYS if any(key in frame for frame in frames)), None)
+    # the mask of VHAP, and of nerfstudio
+    mask_key = next(
+        (key for key in ("fg_mask_path", "mask_path") if any(key in frame for frame in frames)),
+        None,
+    )
     cameras = [
         _frame_camera(values | frame, file, f"frames[{i}].", source.photo_size)
         for i, frame in enumerate(frames)
@@ -331,7 +328,7 @@ def _frame_camera(
     if "w" in values or "h" in values:
         sides = [required(values, key, file, prefix) for key in ("w", "h")]
         size = image_size(sides, file, f"{prefix}w, h")
-    elif not ({"fl_x", "cx", "cy"} <= values.keys() or values.keys() & set(MATRICES)):
+    elif not ({"fl_x", "cx", "cy"} <= values.keys() or values.keys() & set(_MATRICES)):
         size = photo_size(name)
     K = _frame_intrinsics(values, size, file, prefix)
     width, height = size or (None, None)
@@ -354,7 +351,7 @@ def _frame_intrinsics(
 
     Raises: CaptureError for none of them.
     """
-    for key in MATRICES:
+    for key in _MATRICES:
         if key in values and "fl_x" not in values:
             return floats(values[key], file, f"{prefix}{key}", (3, 3))
     focal = {
@@ -381,10 +378,10 @@ def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str,
     Raises: CaptureError for a model of cameras that is not read.
     """
     model, refusal = values.get("camera_model", "OPENCV"), None
-    if model not in CAMERA_MODELS:
-        expected = f"expected {', '.join(CAMERA_MODELS)}; else {UNDISTORT_BEFORE}"
+    if model not in _CAMERA_MODELS:
+        expected = f"expected {', '.join(_CAMERA_MODELS)}; else {UNDISTORT_BEFORE}"
         refusal = CaptureError(file, f"{prefix}camera_model", f"{shown(model)}: {expected}")
-        if model != FISHEYE_MODEL:
+        if model != _FISHEYE_MODEL:
             raise refusal
     # five coefficients do not describe these lenses
     for key in ("is_fisheye", "k4"):
@@ -392,7 +389,7 @@ def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str,
             problem = f"fisheye lenses are not supported: {UNDISTORT_BEFORE}"
             refusal = CaptureError(file, f"{prefix}{key}", problem)
 
-    is_fisheye = model == FISHEYE_MODEL or bool(values.get("is_fisheye"))
+    is_fisheye = model == _FISHEYE_MODEL or bool(values.get("is_fisheye"))
     keys = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2", "k3", "k4")
     coefficients = [_number(values, key, file, prefix) if key in values else 0.0 for key in keys]
     if refusal is not None and is_fisheye:
@@ -410,23 +407,6 @@ def _number(values: Mapping[str, Any], key: str, file: Path, prefix: str) -> flo
 # Moments
 # --------------------------------------------------------------------------------------------------
 
-MOMENT_KEYS = (
-    "timestep_index",
-    "timestep",
-    "timestep_index_original",
-    "time",
-    "timestamp",
-    "time_id",
-    "timestep_id",
-)
-"""Keys of the time of an image, the first that is there is taken."""
-CAMERA_KEYS = ("camera_index", "camera_id", "cam_id", "camera_label")
-"""Keys of the camera of an image, the first that is there is taken."""
-SAME_TIME = 1e-6
-"""Times that differ by less are one moment written twice."""
-SAME_POSE = 1e-9
-"""Poses are rounded to multiples of this to be compared."""
-
 
 def _find_moments(
     frames: Sequence[Mapping[str, Any]], cameras: Sequence[CalibratedCamera], file: Path
@@ -437,13 +417,23 @@ def _find_moments(
     two images of one camera and one moment, and for several images of a camera where nothing tells
     which were taken together.
     """
-    # which moment and which camera an image is of; a camera without a name is known by its pose
-    key, times = _values(frames, MOMENT_KEYS, file)
-    owner, owners = _values(frames, CAMERA_KEYS, file)
+    # which moment and which camera an image is of, by the first of these keys that is there
+    of_time = (
+        "timestep_index",
+        "timestep",
+        "timestep_index_original",
+        "time",
+        "timestamp",
+        "time_id",
+        "timestep_id",
+    )
+    key, times = _values(frames, of_time, file)
+    of_camera = ("camera_index", "camera_id", "cam_id", "camera_label")
+    owner, owners = _values(frames, of_camera, file)
+    # a camera without a name is known by its pose, but for rounding
     if not owner:
         owners = [
-            tuple(np.round(camera.cam_from_world / SAME_POSE).ravel().tolist())
-            for camera in cameras
+            tuple(np.round(camera.cam_from_world / 1e-9).ravel().tolist()) for camera in cameras
         ]
     first: dict[Any, int] = {}
     again = [(first.setdefault(each, i), i) for i, each in enumerate(owners)]
@@ -506,7 +496,8 @@ def _ranks(times: Sequence[Any], key: str, file: Path) -> list[int]:
     known = sorted(set(times))
     ranks = range(len(known))
     if not isinstance(known[0], str):
-        tolerance = SAME_TIME * max(1.0, abs(known[-1]))
+        # times that differ by less are one moment written twice
+        tolerance = 1e-6 * max(1.0, abs(known[-1]))
         ranks = np.cumsum(np.diff(known, prepend=known[0]) > tolerance).tolist()
     rank = dict(zip(known, ranks, strict=True))
     return [rank[time] for time in times]

@@ -34,11 +34,7 @@ from humangs_jax.io.color_spaces import Encoding, cube, of_code_points
 from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import InvalidFileError, check_limit, limits, open_file, reading
 
-CONTAINERS = "mov,matroska,avi,mpegts"
-"""Formats that ffmpeg reads, whatever the name says: others are lists of files (ffconcat,
-playlists).
-"""
-LONGEST_SECONDS = 3600
+_LONGEST_SECONDS = 3600
 """Seconds after which ffmpeg is stopped."""
 
 
@@ -279,10 +275,6 @@ def _write_chosen(path: Path, folder: Path, chosen: Sequence[int | None], shown:
         (folder / f"{i:08d}.png").rename(folder / f"{place:08d}.png")
 
 
-MOST_RUNS = 2000
-"""Terms of an expression of ffmpeg, which is an argument of a program."""
-
-
 def _expression(numbers: Sequence[int]) -> str:
     """ffmpeg's condition for frames of these numbers.
 
@@ -294,7 +286,8 @@ def _expression(numbers: Sequence[int]) -> str:
             terms.append(f"between(n\\,{first}\\,{last})*not(mod(n-{first}\\,{step}))")
         else:
             terms.append(f"eq(n\\,{first})")
-    if len(terms) > MOST_RUNS:
+    # an expression is an argument of a program, which may not be too long
+    if len(terms) > 2000:
         count = f"{len(numbers):,} frames to be paired by time with those of other rates"
         raise InvalidFileError(f"{count}: expected a larger step, or fewer frames")
     return "+".join(terms)
@@ -316,25 +309,25 @@ def _frame_size(path: Path, shown: _Shown) -> tuple[int, int]:
 # What a video says about itself
 # ---------------------------------------------------------------------------------------
 
-STREAM = re.compile(r"^ *Stream #0:\d+.*?: Video: (.*)$", re.MULTILINE)
+_STREAM = re.compile(r"^ *Stream #0:\d+.*?: Video: (.*)$", re.MULTILINE)
 """ffmpeg's line about the stream of pictures."""
 COLORS = re.compile(r"\b\w+\((?:\w+, )?([\w-]+)/([\w-]+)/([\w-]+)[,)]")
 """Matrix, primaries and curve, behind the format of pixels: yuv420p10le(tv,
 bt2020nc/bt2020/arib-std-b67, progressive).
 """
-PIXEL_SHAPE = re.compile(r"\[SAR (\d+):(\d+) ")
+_PIXEL_SHAPE = re.compile(r"\[SAR (\d+):(\d+) ")
 """Sides of a pixel, width to height."""
 RATE = re.compile(r", ([\d.]+)(k?) fps\b")
 """Frames a second, perhaps in thousands."""
 PRIMARIES = {"bt2020": 9, "smpte432": 12}
 """ffmpeg's names of primaries -> numbers of H.273; videos of others are shown as sRGB."""
-TRANSFERS = {"smpte2084": 16, "arib-std-b67": 18}
+_TRANSFERS = {"smpte2084": 16, "arib-std-b67": 18}
 """ffmpeg's names of transfer curves -> numbers of H.273; videos of others are shown as sRGB."""
-WIDEST_PIXEL = 4
+_WIDEST_PIXEL = 4
 """Sides of a pixel that is not square, over each other; the widest in use is 2."""
-SQUARE = "scale=w=round(iw*max(sar\\,1)):h=round(ih*max(1/sar\\,1)),setsar=1"
+_SQUARE = "scale=w=round(iw*max(sar\\,1)):h=round(ih*max(1/sar\\,1)),setsar=1"
 """Filter that makes pixels square. It only makes frames larger: nothing is lost."""
-TABLE = "colors.cube"
+_TABLE = "colors.cube"
 """Temporary file of a table of colors."""
 
 
@@ -346,13 +339,13 @@ def _shown(path: Path) -> _Shown:
     open_file(path).close()
     # without an output ffmpeg fails, after it has printed what is there
     printed = subprocess.run(
-        _opened(path, "info"), capture_output=True, timeout=LONGEST_SECONDS, check=False
+        _opened(path, "info"), capture_output=True, timeout=_LONGEST_SECONDS, check=False
     ).stderr
     text = printed.decode(errors="replace")
-    line = STREAM.search(text)
+    line = _STREAM.search(text)
     if line is None:
         return _Shown()  # what reads its frames says what is wrong
-    rate, shape, colors = RATE.search(line[1]), PIXEL_SHAPE.search(line[1]), COLORS.search(line[1])
+    rate, shape, colors = RATE.search(line[1]), _PIXEL_SHAPE.search(line[1]), COLORS.search(line[1])
     a_second = None
     if rate is not None:
         unit = 1000 if rate[2] else 1
@@ -360,21 +353,21 @@ def _shown(path: Path) -> _Shown:
     found = _Shown(rate=a_second, from_zero="Input #0, mpegts" not in text)
     if shape is not None and shape[1] != shape[2]:
         wide, high = int(shape[1]), int(shape[2])
-        if max(wide, high) > WIDEST_PIXEL * min(wide, high):
+        if max(wide, high) > _WIDEST_PIXEL * min(wide, high):
             problem = (
-                f"its pixels are {wide} to {high} wide to high: expected at most {WIDEST_PIXEL} to"
+                f"its pixels are {wide} to {high} wide to high: expected at most {_WIDEST_PIXEL} to"
                 " 1, or square ones"
             )
             raise InvalidFileError(problem)
-        found = found._replace(shape=SQUARE)
+        found = found._replace(shape=_SQUARE)
     return found if colors is None else _with_colors(found, *colors.groups())
 
 
 def _with_colors(shown: _Shown, matrix: str, primaries: str, transfer: str) -> _Shown:
-    bright = transfer in TRANSFERS
+    bright = transfer in _TRANSFERS
     usual = PRIMARIES["bt2020"] if bright and primaries == "unknown" else 1
     code = PRIMARIES.get(primaries, usual)
-    encoding = of_code_points(code, TRANSFERS.get(transfer, 1))
+    encoding = of_code_points(code, _TRANSFERS.get(transfer, 1))
     if encoding is None:
         return shown
     wide = matrix.startswith("bt2020") or (bright and matrix == "unknown")
@@ -469,7 +462,7 @@ def _small_frames(
             assert process.stdout is not None
             # a video that does not end is stopped by the clock, and one of too many pixels while it
             # is read
-            clock, count = threading.Timer(LONGEST_SECONDS, process.kill), 0
+            clock, count = threading.Timer(_LONGEST_SECONDS, process.kill), 0
             clock.start()
             try:
                 data = process.stdout.read(size)
@@ -509,7 +502,9 @@ def _opened(path: Path, verbosity: str = "error") -> list[str]:
     ]
     # a playlist in disguise may name other files and hosts; pictures may be larger than what is
     # read later
-    command += ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS]
+    # formats that ffmpeg reads, whatever the name says: others are lists of files (ffconcat,
+    # playlists)
+    command += ["-protocol_whitelist", "file", "-format_whitelist", "mov,matroska,avi,mpegts"]
     return [*command, "-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
 
 
@@ -521,13 +516,13 @@ def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int
     """Write at most that many frames for which ffmpeg's expression is not 0; returns how many there
     are.
     """
-    table, filters = folder / TABLE, [f"select={select}", *filter(None, [shown.shape])]
+    table, filters = folder / _TABLE, [f"select={select}", *filter(None, [shown.shape])]
     if shown.encoding is not None:
         table.write_text(cube(shown.encoding))
         whole = (
             f"scale=in_color_matrix={shown.matrix}:flags=accurate_rnd+full_chroma_int,format=rgb48"
         )
-        filters += [whole, f"lut3d=file={TABLE}:interp=tetrahedral", "format=rgb24"]
+        filters += [whole, f"lut3d=file={_TABLE}:interp=tetrahedral", "format=rgb24"]
     # a PNG would say for each program in its own words that its values are a video's
     filters += ["setparams=color_primaries=unknown:color_trc=unknown"]
     command = [
@@ -550,11 +545,11 @@ def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int
 def _finished(path: Path, command: Sequence[str], folder: Path | None = None) -> bytes:
     try:
         done = subprocess.run(
-            command, cwd=folder, capture_output=True, timeout=LONGEST_SECONDS, check=False
+            command, cwd=folder, capture_output=True, timeout=_LONGEST_SECONDS, check=False
         )
     except subprocess.TimeoutExpired:
         raise InvalidFileError(
-            f"its frames take more than {LONGEST_SECONDS:,} seconds: expected a shorter video"
+            f"its frames take more than {_LONGEST_SECONDS:,} seconds: expected a shorter video"
         ) from None
     if done.returncode:
         raise _said(path, done.stderr)

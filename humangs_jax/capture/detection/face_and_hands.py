@@ -14,35 +14,19 @@ from humangs_jax.capture.detection.people import Crop, load_networks, outputs_of
 from humangs_jax.core.array_types import Float
 from humangs_jax.motion.face_tracks import ARKIT
 
-FACE = "face_landmarks_detector.tflite"
-"""File of the landmarks of a face in `assets/mediapipe`."""
-SHAPES = "face_blendshapes.tflite"
-"""File of the expressions of a face."""
-HAND = "hand_landmark_full.tflite"
-"""File of the landmarks of a hand."""
-FACE_SIZE = 256
+_FACE_SIZE = 256
 """Pixels a side of the network of faces."""
-HAND_SIZE = 224
+_HAND_SIZE = 224
 """Pixels a side of the network of hands."""
-FACE_POINTS = 478
-"""Landmarks of a face."""
-HAND_POINTS = 21
+_HAND_POINTS = 21
 """Landmarks of a hand."""
-LEAST_PRESENCE = 0.5
+_LEAST_PRESENCE = 0.5
 """Probability of a face or a hand from which on it is believed."""
-LEAST_VISIBLE = 0.5
-"""Visibility of a wrist from which on its hand is looked at."""
-ENLARGED = {"face": 1.5, "hand": 2.7, "palm": 2.0}
+_ENLARGED = {"face": 1.5, "hand": 2.7, "palm": 2.0}
 """Side of a region over that of the box around the landmarks, or twice the length from the wrist to
 the knuckles."""
-FACE_BOX = 2.75
-"""Height of a face over the distance from the eyes to the mouth."""
-FACE_MIDDLE = 0.4
-"""Where along that distance the middle of the face is."""
 PALM = (0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18)
 """Landmarks of a hand that say where it is in the next look: fingers move, the palm less."""
-PALM_SHIFT = -0.1
-"""How far the region is moved from the palm to the fingers, a share of its side."""
 SMALLEST = 24.0
 """Pixels. In a smaller region faces and hands are not looked for."""
 SHAPE_NAMES = ARKIT[:-1]
@@ -58,11 +42,9 @@ SHAPE_POINTS = (
     466, 468, 469, 470, 471, 472, 473, 474, 475, 476, 477,
 )  # fmt: skip
 """Indices of the face's landmarks that the network of the scores reads."""
-EYES, MOUTH, WRISTS = (2, 5), (9, 10), (15, 16)
+_EYES, _MOUTH, _WRISTS = (2, 5), (9, 10), (15, 16)
 """Landmarks of BlazePose: eyes, the corners of the mouth, and the wrists, the left one first."""
-KNUCKLES = ((17, 19), (18, 20))
-"""Of BlazePose: the little finger's and the index finger's, of each side."""
-EYE_CORNERS, WRIST, ROOTS = (33, 263), 0, (5, 9, 13)
+_EYE_CORNERS, _WRIST, _ROOTS = (33, 263), 0, (5, 9, 13)
 """Of a face, in the photo from left to right; of a hand, and the roots of its fingers."""
 
 
@@ -82,7 +64,9 @@ class FaceAndHands:
     """The networks. Raises: ImportError, saying what to install, without LiteRT."""
 
     def __init__(self) -> None:
-        self._face, self._shapes, self._hand = load_networks("mediapipe", (FACE, SHAPES, HAND))
+        names = "face_landmarks_detector", "face_blendshapes", "hand_landmark_full"
+        files = [f"{name}.tflite" for name in names]
+        self._face, self._shapes, self._hand = load_networks("mediapipe", files)
 
     def face(
         self, photo: Float[np.ndarray, "h w 3"], body: Float[np.ndarray, "33 2"]
@@ -94,12 +78,13 @@ class FaceAndHands:
         for _ in range(2):
             if crop.side < SMALLEST:
                 return None
-            outputs = outputs_of(self._face, sampled(photo, crop, FACE_SIZE))
-            if _probability(outputs["Identity_1"]) < LEAST_PRESENCE:
+            outputs = outputs_of(self._face, sampled(photo, crop, _FACE_SIZE))
+            if _probability(outputs["Identity_1"]) < _LEAST_PRESENCE:
                 return None
-            points = crop.to_photo(outputs["Identity"].reshape(FACE_POINTS, 3)[:, :2] / FACE_SIZE)
-            right, left = points[list(EYE_CORNERS)]
-            crop = _around(points, _angle(left - right), ENLARGED["face"])
+            landmarks = outputs["Identity"].reshape(-1, 3)  # 478 of them
+            points = crop.to_photo(landmarks[:, :2] / _FACE_SIZE)
+            right, left = points[list(_EYE_CORNERS)]
+            crop = _around(points, _angle(left - right), _ENLARGED["face"])
         scores = next(iter(outputs_of(self._shapes, points[list(SHAPE_POINTS)]).values()))
         return np.asarray(scores, np.float32).ravel()[1:]  # the first is that of a neutral face
 
@@ -111,8 +96,8 @@ class FaceAndHands:
     ) -> tuple[Hand | None, Hand | None]:
         """The left and the right hand of somebody with these landmarks of BlazePose."""
         found: list[Hand | None] = []
-        for side, wrist in enumerate(WRISTS):
-            if visibility[wrist] < LEAST_VISIBLE:
+        for side, wrist in enumerate(_WRISTS):
+            if visibility[wrist] < 0.5:  # hands of hidden wrists are not looked at
                 found.append(None)
             else:
                 found.append(self._hand_in(photo, hand_region(body, side), body[wrist]))
@@ -126,18 +111,18 @@ class FaceAndHands:
         for _ in range(2):
             if crop.side < SMALLEST:
                 return None
-            outputs = outputs_of(self._hand, sampled(photo, crop, HAND_SIZE))
+            outputs = outputs_of(self._hand, sampled(photo, crop, _HAND_SIZE))
             presence = float(outputs["Identity_1"].ravel()[0])
-            if presence < LEAST_PRESENCE:
+            if presence < _LEAST_PRESENCE:
                 return None
-            points = outputs["Identity"].reshape(HAND_POINTS, 3)[:, :2] / HAND_SIZE
-            world = outputs["Identity_3"].reshape(HAND_POINTS, 3).astype(np.float64)
+            points = outputs["Identity"].reshape(_HAND_POINTS, 3)[:, :2] / _HAND_SIZE
+            world = outputs["Identity_3"].reshape(_HAND_POINTS, 3).astype(np.float64)
             world[:, :2] = world[:, :2] @ crop.turn.T
             points, crop = crop.to_photo(points), _palm_region(crop.to_photo(points))
         # a hand elsewhere is another one
-        if np.hypot(*(points[WRIST] - wrist)) > first.side / 3:
+        if np.hypot(*(points[_WRIST] - wrist)) > first.side / 3:
             return None
-        return Hand(points, world - world[WRIST], presence)
+        return Hand(points, world - world[_WRIST], presence)
 
 
 def hand_columns(
@@ -148,8 +133,8 @@ def hand_columns(
     """
     if hands == (None, None):
         return None
-    found = np.zeros((2, HAND_POINTS, 6))
-    for row, hand, wrist in zip(found, hands, body[list(WRISTS)], strict=True):
+    found = np.zeros((2, _HAND_POINTS, 6))
+    for row, hand, wrist in zip(found, hands, body[list(_WRISTS)], strict=True):
         if hand is not None:
             row[:, :2], row[:, 2], row[:, 3:] = hand.pixels, hand.presence, hand.world + wrist
     return found.reshape(-1, 6)
@@ -166,30 +151,35 @@ def _angle(across: Float[np.ndarray, "2"]) -> float:
 
 def face_region(body: Float[np.ndarray, "33 2"]) -> Crop:
     """Where the face of somebody with these landmarks of BlazePose is looked for."""
-    left, right = body[list(EYES)]
-    eyes, mouth = (left + right) / 2, body[list(MOUTH)].mean(0)
+    left, right = body[list(_EYES)]
+    eyes, mouth = (left + right) / 2, body[list(_MOUTH)].mean(0)
     down = mouth - eyes
     # from the side the eyes are one behind the other: the mouth says the size and what is up
     size = max(float(np.hypot(*down)), float(np.hypot(*(left - right))))
     angle = float(np.arctan2(-down[0], down[1]))
-    return Crop(eyes + FACE_MIDDLE * down, ENLARGED["face"] * FACE_BOX * size, angle)
+    # the height of a face is 2.75 times the distance from the eyes to the mouth, its middle at
+    # 0.4 of that
+    return Crop(eyes + 0.4 * down, _ENLARGED["face"] * 2.75 * size, angle)
 
 
 def hand_region(body: Float[np.ndarray, "33 2"], side: int) -> Crop:
     """Where a hand of somebody is looked for. side: 0 for the left one, 1 for the right one."""
-    pinky, index = body[list(KNUCKLES[side])]
-    middle, wrist = (2 * index + pinky) / 3, body[WRISTS[side]]
+    # the little finger and the index finger, of each side
+    knuckles = ((17, 19), (18, 20))
+    pinky, index = body[list(knuckles[side])]
+    middle, wrist = (2 * index + pinky) / 3, body[_WRISTS[side]]
     x, y = middle - wrist
     # fingers point up
-    return Crop(middle, 2 * ENLARGED["hand"] * float(np.hypot(x, y)), float(np.arctan2(x, -y)))
+    return Crop(middle, 2 * _ENLARGED["hand"] * float(np.hypot(x, y)), float(np.arctan2(x, -y)))
 
 
 def _palm_region(points: Float[np.ndarray, "21 2"]) -> Crop:
     """The region of the next look, from the landmarks of this one."""
-    index, middle, ring = points[list(ROOTS)]
-    x, y = ((index + ring) / 2 + middle) / 2 - points[WRIST]
-    crop = _around(points[list(PALM)], float(np.arctan2(x, -y)), ENLARGED["palm"])
-    up = np.asarray([0.0, PALM_SHIFT * crop.side / ENLARGED["palm"]])
+    index, middle, ring = points[list(_ROOTS)]
+    x, y = ((index + ring) / 2 + middle) / 2 - points[_WRIST]
+    crop = _around(points[list(PALM)], float(np.arctan2(x, -y)), _ENLARGED["palm"])
+    # moved from the palm to the fingers by a tenth of the side
+    up = np.asarray([0.0, -0.1 * crop.side / _ENLARGED["palm"]])
     return crop._replace(center=crop.center + crop.turn @ up)
 
 

@@ -6,13 +6,7 @@ from scipy import ndimage
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.io.images import resized
 
-LONGEST = 512
-"""Pixels: longest side of the photo in which colors are spread; the detector sees no more."""
-NEAR = 1 / 32
-"""Standard deviation over which colors spread, a share of the longest side."""
-FAR = 1 / 8
-"""The same where no color is so near."""
-LEAST_NEAR = 1e-3
+_LEAST_NEAR = 1e-3
 """Weight of the colors nearby below which those far away count."""
 
 
@@ -28,7 +22,8 @@ def painted_over(
     a share of the longest side.
     """
     height, width = photo.shape[:2]
-    scale = min(1.0, LONGEST / max(height, width))
+    # the detector sees no more than 512 pixels
+    scale = min(1.0, 512 / max(height, width))
     size = max(1, round(scale * width)), max(1, round(scale * height))
     longest = max(size)
     share = resized(covered.astype(np.float32), *size)
@@ -38,10 +33,10 @@ def painted_over(
 
     # means of what is kept, weighted by a Gaussian: first of what is near, then, where there is
     # nothing, of what is far
-    near, near_weight = _spread(colors, kept, NEAR * longest)
-    far, far_weight = _spread(colors, kept, FAR * longest)
+    near, near_weight = _spread(colors, kept, longest / 32)
+    far, far_weight = _spread(colors, kept, longest / 8)
     distant = far / np.maximum(far_weight, 1e-6)[..., None]
-    fill = (near + LEAST_NEAR * distant) / (near_weight + LEAST_NEAR)[..., None]
+    fill = (near + _LEAST_NEAR * distant) / (near_weight + _LEAST_NEAR)[..., None]
     fill = np.clip(fill, 0, 1).astype(np.float32)
     painted = resized(small.astype(np.float32), width, height) > 0.5
     return np.where(painted[..., None], resized(fill, width, height), photo), painted

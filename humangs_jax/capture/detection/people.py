@@ -9,8 +9,8 @@ landmark network looks at the square around them, turned so that the person stan
 postprocessing are mediapipe's for its pose graph, in numpy: bilinear samples from the crop's
 corner, no antialiasing. The networks depend on both.
 
-Pixels of the networks are mediapipe's: (x, y), the centre of the first at 0. `detect_people` adds
-our half pixel.
+Pixels of the networks are mediapipe's: (x, y), the centre of the first at 0. `apps.detect` adds our
+half pixel.
 
 The detector finds people from a third of its window's side on, so it looks at the whole photo and
 at windows of a half of its longer side that overlap by half, and, where nobody in these is large,
@@ -21,6 +21,7 @@ colors around them, and it looks again, until it finds nobody more: see `find_pe
 """
 
 import contextlib
+import dataclasses
 import functools
 import importlib
 import importlib.util
@@ -35,29 +36,23 @@ import numpy as np
 from humangs_jax.capture.detection.painting import painted_over
 from humangs_jax.core.array_types import Bool, Float
 
-DETECTOR = "pose_detection.tflite"
+_DETECTOR = "pose_detection.tflite"
 """File of the detector in `assets/blazepose`."""
 LANDMARKS = "pose_landmark_heavy.tflite"
 """File of the landmark network. The lite and full ones exchange left and right often, heavy hardly
 ever.
 """
-DETECTOR_SIZE = 224
+_DETECTOR_SIZE = 224
 """Pixels a side of the detector's input."""
 LANDMARK_SIZE = 256
 """Pixels a side of the landmark network's input."""
-LANDMARK_COUNT = 33
+_LANDMARK_COUNT = 33
 """Landmarks of a person."""
-ALIGNMENT = 6
+_ALIGNMENT = 6
 """The landmark network's further points; the first two are the detector's, found again."""
-STRIDES = ((8, 2), (16, 2), (32, 6))
-"""Strides of the detector's grids, pixels, and how many anchors a cell has."""
-LEAST_SCORE = 0.5
-"""Least score of a detection."""
-SAME_BOX = 0.3
-"""Intersection over union from which on detections of one window are one person."""
 ENLARGED = 1.25
 """Side of the crop over the diameter of the circle through the detector's second point."""
-PEAK = 0.5
+_PEAK = 0.5
 """Least height of the heatmap around a landmark that is moved to the centroid."""
 WINDOW = 7
 """Side of the window of the centroid, pixels of the heatmap."""
@@ -177,7 +172,7 @@ class Networks:
     """The two networks. Raises: ImportError, saying what to install, without LiteRT."""
 
     def __init__(self) -> None:
-        self._runs = load_networks("blazepose", (DETECTOR, LANDMARKS))
+        self._runs = load_networks("blazepose", (_DETECTOR, LANDMARKS))
 
     def _run(self, which: int, image: Float[np.ndarray, "size size 3"]) -> dict[str, np.ndarray]:
         return outputs_of(self._runs[which], image)
@@ -187,10 +182,10 @@ class Networks:
 
         The best first.
         """
-        outputs = self._run(0, 2 * sampled(photo, window, DETECTOR_SIZE, outside=0.0) - 1)
+        outputs = self._run(0, 2 * sampled(photo, window, _DETECTOR_SIZE, outside=0.0) - 1)
         scores, raw = _sigmoid(outputs["Identity_1"][:, 0]), outputs["Identity"]
-        kept = scores > LEAST_SCORE
-        points = raw[kept] / DETECTOR_SIZE + np.tile(_anchors()[kept], 6)
+        kept = scores > 0.5
+        points = raw[kept] / _DETECTOR_SIZE + np.tile(_anchors()[kept], 6)
         points[:, 2:4] -= _anchors()[kept]  # width and height are no places
         return [
             Detection(float(score), *(window.to_photo(box[i : i + 2]) for i in (4, 6)))
@@ -200,20 +195,20 @@ class Networks:
     def landmarks(self, photo: Float[np.ndarray, "h w 3"], crop: Crop) -> Landmarks:
         """Landmarks of the person in a crop of a photo with values in [0, 1]."""
         outputs = self._run(1, sampled(photo, crop, LANDMARK_SIZE))
-        raw = outputs["Identity"].reshape(LANDMARK_COUNT + ALIGNMENT, 5).astype(np.float64)
+        raw = outputs["Identity"].reshape(_LANDMARK_COUNT + _ALIGNMENT, 5).astype(np.float64)
         points = refined(raw[:, :2] / LANDMARK_SIZE, _sigmoid(outputs["Identity_3"]))
         pixels = crop.to_photo(points)
-        world = outputs["Identity_4"].reshape(-1, 3)[:LANDMARK_COUNT].astype(np.float64)
+        world = outputs["Identity_4"].reshape(-1, 3)[:_LANDMARK_COUNT].astype(np.float64)
         world[:, :2] = world[:, :2] @ crop.turn.T
         presence = float(outputs["Identity_1"][0])
         return Landmarks(
-            pixels=pixels[:LANDMARK_COUNT],
-            visibility=_sigmoid(raw[:LANDMARK_COUNT, 3]),
+            pixels=pixels[:_LANDMARK_COUNT],
+            visibility=_sigmoid(raw[:_LANDMARK_COUNT, 3]),
             world=world,
             presence=presence,
             mask=_sigmoid(outputs["Identity_2"][..., 0]),
             crop=crop,
-            again=Detection(presence, *pixels[LANDMARK_COUNT : LANDMARK_COUNT + 2]),
+            again=Detection(presence, *pixels[_LANDMARK_COUNT : _LANDMARK_COUNT + 2]),
         )
 
 
@@ -263,7 +258,7 @@ def refined(
             np.arange(max(0, at - half), min(size, at + half + 1)) for at in (row, column)
         )
         heights = heatmaps[rows[:, None], columns, i].astype(np.float64)
-        if heights.max() >= PEAK:
+        if heights.max() >= _PEAK:
             centroid = np.asarray([heights.sum(0) @ columns, heights.sum(1) @ rows]) / heights.sum()
             moved[i] = centroid / size
     return moved
@@ -324,8 +319,9 @@ def mask_in_window(found: Landmarks, window: Window) -> Float[np.ndarray, "h w"]
 @functools.cache
 def _anchors() -> Float[np.ndarray, "a 2"]:
     grids = []
-    for stride, copies in STRIDES:
-        middles = (np.arange(DETECTOR_SIZE // stride) + 0.5) * stride / DETECTOR_SIZE
+    # strides of the grids, pixels, and how many anchors a cell has
+    for stride, copies in ((8, 2), (16, 2), (32, 6)):
+        middles = (np.arange(_DETECTOR_SIZE // stride) + 0.5) * stride / _DETECTOR_SIZE
         grids.append(
             np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2).repeat(copies, axis=0)
         )
@@ -338,7 +334,8 @@ def _merged(
     """Weighted non-maximum suppression: what overlaps the best is averaged by score."""
     left, merged = np.argsort(-scores), []
     while len(left):
-        same = _overlaps(boxes[left[0]], boxes[left]) > SAME_BOX
+        # detections of one window that overlap by more are one person
+        same = _overlaps(boxes[left[0]], boxes[left]) > 0.3
         same[0] = True
         weights = scores[left[same], None]
         merged.append(
@@ -382,105 +379,88 @@ def _silent() -> Generator[None]:
 # All people of a photo
 # -------------------------------------------------------------------------------------------------
 
-SHARES = (1.0, 0.5)
-"""Sides of the windows over the photo's longer side."""
-SMALL_SHARES = (0.25,)
-"""Sides of further windows where nobody is large; these are most of all windows."""
-LARGE = 0.4
-"""Side of a large person's crop over the photo's longer side. Windows of a half find people from a
-sixth of it on, whose crops are a fifth: whoever needs smaller windows has at most a quarter of the
-pixels of a person with a crop of two fifths, and is not the one who is meant.
-"""
-SMALLEST = 0.06
-"""Side of a crop over the photo's longer side below which the person is somebody in the background,
-or nobody.
-"""
-MOST_CROPS = 16
-"""Crops that the landmark network looks at, best detections first."""
-SAME_HIPS = 0.15
-"""Two detections are one person if their hips are nearer than this share of the larger crop."""
-SAME_SIZE = 1.6
-"""Factor by which the sides of the crops of one person differ, at most."""
-LEAST_PRESENCE = 0.95
-"""Least presence of a person. Measured on 8 photos of a laboratory with 2 to 3 people each: legs,
-lamps and chairs that the detector takes for people have 0.69 to 0.88, people 0.999 at the worst.
-"""
-LEAST_ON_MASK = 0.8
-"""Least share of the landmarks in the photo that lie on the mask: there 0.33 to 0.76, people 0.94.
-"""
-MOST_SHARED = 0.5
-"""Largest share of the smaller mask that two people both have: there 0.77 to 0.94, people 0.02."""
-LARGER = 1.25
-"""Side of the second crop over the first, at the most: the mask has 256 pixels a side, whatever the
-side.
-"""
-MOST_LOOKS = 4
-"""Looks of the landmark network at a person, at most."""
-SETTLED = 0.05
-"""Drift of the crop (see `_settled`) below which it has found the person."""
-LEAST_ON_REST = 0.6
-"""`LEAST_ON_MASK` for a person who is partly painted over, whose mask then has holes."""
-PAINTED = 0.4
-"""Probability from which on a pixel of a mask is painted over; the detector's masks end there."""
+
+@dataclasses.dataclass(frozen=True)
+class _SearchConfig:
+    """How people are looked for in a photo."""
+
+    shares: tuple[float, float] = (1.0, 0.5)
+    """Sides of the windows over the photo's longer side."""
+    small_shares: tuple[float, ...] = (0.25,)
+    """Sides of further windows where nobody is large; these are most of all windows."""
+    large: float = 0.4
+    """Side of a large person's crop over the photo's longer side. Windows of a half find people
+    from a sixth of it on, whose crops are a fifth: whoever needs smaller windows has at most a
+    quarter of the pixels of a person with a crop of two fifths, and is not the one who is meant."""
+    smallest: float = 0.06
+    """Side of a crop over the photo's longer side below which the person is somebody in the
+    background, or nobody."""
+    most_crops: int = 16
+    """Crops that the landmark network looks at, best detections first."""
+    same_hips: float = 0.15
+    """Two detections are one person if their hips are nearer than this share of the larger crop."""
+    same_size: float = 1.6
+    """Factor by which the sides of the crops of one person differ, at most."""
+    most_looks: int = 4
+    """Looks of the landmark network at a person, at most."""
+    settled: float = 0.05
+    """Drift of the crop (see `_settled`) below which it has found the person."""
+    larger: float = 1.25
+    """Side of the second crop over the first, at the most: the mask has 256 pixels a side, whatever
+    the side."""
+
+
+SEARCH = _SearchConfig()
+
+
+@dataclasses.dataclass(frozen=True)
+class _Believed:
+    """When what the landmark network sees is a person."""
+
+    presence: float = 0.95
+    """Least presence of a person. Measured on 8 photos of a laboratory with 2 to 3 people each:
+    legs, lamps and chairs that the detector takes for people have 0.69 to 0.88, people 0.999 at the
+    worst."""
+    on_mask: float = 0.8
+    """Least share of the landmarks in the photo that lie on the mask: there 0.33 to 0.76, people
+    0.94."""
+    on_rest: float = 0.6
+    """`on_mask` for a person who is partly painted over, whose mask then has holes."""
+    shared: float = 0.5
+    """Largest share of the smaller mask that two people both have: there 0.77 to 0.94, people
+    0.02."""
+    size: float = 0.4
+    """Side of the crop of a person who was found by painting over, of the largest one's, at least.
+    Smaller ones, in photos of two to six people, were what is left of a person whose mask ends too
+    early."""
+
+
+BELIEVED = _Believed()
+
+
 MARGINS = (1 / 150, 1 / 100)
 """How far what is painted reaches beyond a mask, shares of the longest side; the second is tried
 where the first shows nobody. Too little leaves a rim that looks like a person, too much hides who
 stands behind.
 """
-MOST_PAINTINGS = 8
-"""Times that a photo is painted over, at most."""
-LEAST_SIZE = 0.4
-"""Side of the crop of a person who was found by painting over, of the largest one's, at least.
-Smaller ones, in photos of two to six people, were what is left of a person whose mask ends too
-early."""
 SEEN = 0.5
 """Probability from which on a pixel of a mask is a person's."""
 
 
-class DetectedPerson(NamedTuple):
-    """A person in a photo."""
-
-    pixels: Float[np.ndarray, "33 2"]
-    """Landmarks, (33, 2), pixels, the centre of the first pixel at (0.5, 0.5)."""
-    visibility: Float[np.ndarray, " 33"]
-    """Visibility of the landmarks, (33,), in [0, 1]."""
-    world: Float[np.ndarray, "33 3"]
-    """Landmarks from the middle of the hips in the camera's axes, of a person of average size, (33,
-    3), metres.
-    """
-    presence: float
-    """Probability of a person, in [0, 1]."""
-    mask: Float[np.ndarray, "h w"]
-    """Probability of the person, (h, w)."""
-    side: float
-    """Side of the crop that holds the person, pixels."""
-
-
-def detect_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[DetectedPerson]:
-    """The people of a photo with values in [0, 1], the largest first."""
-    height, width = photo.shape[:2]
-    found = find_people(networks, photo)
-    return [
-        DetectedPerson(p.pixels + 0.5, *p[1:4], mask_in_photo(p, width, height), p.crop.side)
-        for p in found
-    ]
-
-
 def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[Landmarks]:
-    """Returns the people as `detect_people`, with masks of the crops alone, which are small
-    whatever the size of the photo.
+    """Returns the people of a photo with values in [0, 1], the largest first.
 
     Who was found is painted over, and the photo is looked at again, until there is nobody more.
     """
     longest = max(photo.shape[:2])
-    detections = window_detections(networks, photo, SHARES)
+    detections = window_detections(networks, photo, SEARCH.shares)
     found = _people(networks, photo, detections)
-    if not any(person.crop.side >= LARGE * longest for person in found):
-        smaller = window_detections(networks, photo, SMALL_SHARES)
+    if not any(person.crop.side >= SEARCH.large * longest for person in found):
+        smaller = window_detections(networks, photo, SEARCH.small_shares)
         if smaller:
             found = _people(networks, photo, detections + smaller)
     margins = list(MARGINS) if found else []
-    for _ in range(MOST_PAINTINGS):
+    for _ in range(8):  # paintings at most
         if not margins:
             break
         further = _hidden_people(networks, photo, found, margins[0])
@@ -498,13 +478,13 @@ def _hidden_people(
     """
     height, width = photo.shape[:2]
     painted, covered = _painted_over(photo, found, margin)
-    detections = window_detections(networks, painted, SHARES)
-    least = LEAST_SIZE * max(person.crop.side for person in found)
+    detections = window_detections(networks, painted, SEARCH.shares)
+    least = BELIEVED.size * max(person.crop.side for person in found)
     further = [
         person
         for person in _people(networks, painted, detections, covered)
         if person.crop.side >= least
-        and not any(_shared(person, other, width, height) > MOST_SHARED for other in found)
+        and not any(_shared(person, other, width, height) > BELIEVED.shared for other in found)
     ]
     return [person._replace(mask=_without(person, found), covered=True) for person in further]
 
@@ -517,7 +497,8 @@ def _painted_over(
     covered = np.zeros((height, width), bool)
     for person in found:
         window = mask_window(person, width, height)
-        covered[window] |= mask_in_window(person, window) > PAINTED
+        # the detector's masks end at 0.4
+        covered[window] |= mask_in_window(person, window) > 0.4
     return painted_over(photo, covered, margin)
 
 
@@ -545,15 +526,15 @@ def _people(
     height, width = photo.shape[:2]
     found = []
     best_first = sorted(detections, key=lambda detection: -detection.score)
-    for detection in distinct(best_first, max(height, width))[:MOST_CROPS]:
+    for detection in distinct(best_first, max(height, width))[: SEARCH.most_crops]:
         person, drift = _settled(networks, photo, detection.crop())
         on_mask = _on_mask(person, width, height, covered)
-        least = LEAST_ON_MASK if covered is None else LEAST_ON_REST
-        if person.presence >= LEAST_PRESENCE and on_mask >= least:
+        least = BELIEVED.on_mask if covered is None else BELIEVED.on_rest
+        if person.presence >= BELIEVED.presence and on_mask >= least:
             found.append((drift, person))
     # crops far off that still drift towards a person have wrong landmarks: the one that settled
     # speaks for the person, and among these the detector's best
-    found.sort(key=lambda pair: pair[0] > SETTLED)
+    found.sort(key=lambda pair: pair[0] > SEARCH.settled)
     kept: list[Landmarks] = []
     for _, person in found:
         shares = [
@@ -561,7 +542,7 @@ def _people(
             for other in kept
             for pair in ((person, other), (other, person))
         ]
-        if max(shares, default=0.0) <= MOST_SHARED:
+        if max(shares, default=0.0) <= BELIEVED.shared:
             kept.append(person)
     return sorted(kept, key=lambda person: -person.crop.side)
 
@@ -575,11 +556,11 @@ def _settled(
     The landmark network knows hips and size better than the detector. It looks at least twice.
     """
     look, drift = networks.landmarks(photo, crop), np.inf
-    for _ in range(MOST_LOOKS - 1):
-        if look.presence < LEAST_PRESENCE or drift < SETTLED:
+    for _ in range(SEARCH.most_looks - 1):
+        if look.presence < BELIEVED.presence or drift < SEARCH.settled:
             break
         again = look.again.crop()
-        crop = again._replace(side=min(again.side, LARGER * crop.side))
+        crop = again._replace(side=min(again.side, SEARCH.larger * crop.side))
         look = networks.landmarks(photo, crop)
         after = look.again.crop()
         drift = (np.hypot(*(after.center - crop.center)) + abs(after.side - crop.side)) / crop.side
@@ -597,7 +578,7 @@ def window_detections(
 
 
 def windows(
-    width: int, height: int, shares: Sequence[float] = (*SHARES, *SMALL_SHARES)
+    width: int, height: int, shares: Sequence[float] = (*SEARCH.shares, *SEARCH.small_shares)
 ) -> list[Crop]:
     """Upright squares that cover a photo: one around it, then smaller ones that overlap by half,
     without those beside it.
@@ -625,7 +606,7 @@ def distinct(detections: list[Detection], longest: int) -> list[Detection]:
     kept: list[Detection] = []
     for detection in detections:
         side = detection.crop().side
-        if side >= SMALLEST * longest and not any(
+        if side >= SEARCH.smallest * longest and not any(
             _same_detection(detection, other) for other in kept
         ):
             kept.append(detection)
@@ -635,8 +616,8 @@ def distinct(detections: list[Detection], longest: int) -> list[Detection]:
 def _same_detection(a: Detection, b: Detection) -> bool:
     sides = sorted((a.crop().side, b.crop().side))
     return (
-        float(np.hypot(*(a.hips - b.hips))) < SAME_HIPS * sides[1]
-        and sides[1] < SAME_SIZE * sides[0]
+        float(np.hypot(*(a.hips - b.hips))) < SEARCH.same_hips * sides[1]
+        and sides[1] < SEARCH.same_size * sides[0]
     )
 
 

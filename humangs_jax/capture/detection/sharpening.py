@@ -11,18 +11,8 @@ from scipy import ndimage
 from humangs_jax.core.array_types import Float
 from humangs_jax.io.images import resized
 
-LEVEL = 0.4
-"""Value of the detector's masks at the person's edge: at 0.5 they are 3 % too small, and lose hands
-and feet.
-"""
-RADIUS = 2.0
+_RADIUS = 2.0
 """Half side of the filter's windows, pixels of the detector's mask."""
-EPSILON = 1e-4
-"""Variance of colors that is no edge."""
-STEEPER = 2.0
-"""The filter's masks rise more slowly than true ones by this factor."""
-MOST = 2.0
-"""Pixels of the reduced photo for one of the detector's mask."""
 
 
 def sharpened(
@@ -39,15 +29,18 @@ def sharpened(
     window = tuple(
         slice(max(int(each[0]) - margin, 0), int(each[-1]) + 1 + margin) for each in (rows, columns)
     )
-    guide, own = photo[window], np.clip(mask[window] * 0.5 / LEVEL, 0, 1)
+    # the detector's masks are 0.4 at the person's edge: at 0.5 they are 3 % too small, and lose
+    # hands and feet
+    guide, own = photo[window], np.clip(mask[window] * 0.5 / 0.4, 0, 1)
     height, width = own.shape
     # the filter's coefficients, of the reduced photo
-    reduced = min(1.0, MOST / pixel)
+    # two pixels of the reduced photo for one of the detector's mask
+    reduced = min(1.0, 2.0 / pixel)
     size = max(1, round(reduced * width)), max(1, round(reduced * height))
     small_guide, small_mask = guide, own
     if reduced < 1:
         small_guide, small_mask = resized(guide, *size), resized(own, *size)
-    slopes, offsets = _affine(small_guide, small_mask, max(1, round(RADIUS * reduced * pixel)))
+    slopes, offsets = _affine(small_guide, small_mask, max(1, round(_RADIUS * reduced * pixel)))
 
     def enlarged(values):
         """Values of the reduced photo at the size of the window."""
@@ -58,13 +51,14 @@ def sharpened(
     for color in range(3):
         found += enlarged(slopes[..., color]) * guide[..., color]
     result = np.zeros_like(mask)
-    result[window] = np.clip(STEEPER * (found - 0.5) + 0.5, 0, 1)
+    # the filter's masks rise half as steeply as true ones
+    result[window] = np.clip(2.0 * (found - 0.5) + 0.5, 0, 1)
     return result
 
 
 def filter_margin(pixel: float) -> int:
     """Returns how many pixels around a mask `sharpened` looks at."""
-    return int(np.ceil(2 * RADIUS * pixel))
+    return int(np.ceil(2 * _RADIUS * pixel))
 
 
 def _affine(
@@ -86,7 +80,8 @@ def _affine(
         mean(guide[..., :, None] * guide[..., None, :])
         - colors[..., :, None] * colors[..., None, :]
     )
-    solved = np.linalg.solve(spread + EPSILON * np.eye(3), together[..., None].astype(float))
+    # 1e-4: a variance of colors that is no edge
+    solved = np.linalg.solve(spread + 1e-4 * np.eye(3), together[..., None].astype(float))
     slopes = solved[..., 0]
     offsets = level - (slopes * colors).sum(-1)
     return mean(slopes).astype(np.float32), mean(offsets).astype(np.float32)

@@ -30,46 +30,36 @@ from humangs_jax.data.photos import Photos
 from humangs_jax.geometry import quaternion, transform
 
 P = TypeVar("P", Photos, Capture)
-LEAST_DEGREES = 0.3
-"""Degrees: smaller errors hardly matter, a third of a degree is 1.5 cm at 3 m."""
-MOST_DEGREES = 8.0
-"""Degrees: larger errors are no calibration that is a little off."""
-CLEAR = 5.0
-"""Standard errors from which on a rotation is no chance."""
-LEAST_GAIN = 25.0
-"""Fall of the cost from which on a rotation is no chance. A detector that errs alike in all
-landmarks of a view imitates one: on five synthetic people in rooms with exact cameras the cost fell
-by 5 to 16, on five photos of a man whose calibration is off by 32 to 121.
-"""
-PRIOR = np.radians(1.0)
+_PRIOR = np.radians(1.0)
 """Expected size of rotations, radians: holds what cameras and points together can do without a
 residual.
 """
-ALIKE = 0.9
-"""Share of the cost from which on another camera explains as much."""
-ITERATIONS = 8
+_ITERATIONS = 8
 """Iterations that reweight the residuals."""
-FRAMES = 24
-"""Moments that are looked at, at most."""
-CAMERAS = 64
-"""Cameras up to which errors are looked for."""
-ROBUST_SCALE = 3.0
-"""Robust scale of residuals, standard deviations."""
-PARTS = (
-    "nose",
-    "eye",
-    "ear",
-    "shoulder",
-    "elbow",
-    "wrist",
-    "hip",
-    "knee",
-    "ankle",
-    "heel",
-    "big_toe",
-    "foot_index",
-)
-"""Landmarks that err independently: those of a face or a hand err together."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Decision:
+    """When a camera counts as turned."""
+
+    clear: float = 5.0
+    """Standard errors from which on a rotation is no chance."""
+    least_gain: float = 25.0
+    """Fall of the cost from which on a rotation is no chance. A detector that errs alike in all
+    landmarks of a view imitates one: on five synthetic people in rooms with exact cameras the cost
+    fell by 5 to 16, on five photos of a man whose calibration is off by 32 to 121.
+    """
+    least_degrees: float = 0.3
+    """Smaller errors hardly matter: a third of a degree is 1.5 cm at 3 m."""
+    most_degrees: float = 8.0
+    """With larger errors the calibration is something else than a little off."""
+    alike: float = 0.9
+    """Share of the gain from which on another camera explains as much."""
+    most_cameras: int = 64
+    """Cameras up to which errors are looked for."""
+
+
+_DECISION = _Decision()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,38 +88,37 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
     than three cameras.
     """
     camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
-    if not 3 <= camera_of.max() + 1 <= CAMERAS:
+    if not 3 <= camera_of.max() + 1 <= _DECISION.most_cameras:
         return ()
     seen = _Seen.of(photos, keypoints, camera_of)
     if seen is None:
         return ()
     # the cameras that explain most are turned one after the other, as long as each is clear
-    gradients, matrices = seen.equations()
-    solved = functools.partial(_solved, gradients, matrices)
+    solved = functools.partial(_solved, seen.equations())
     chosen: list[int] = []
     gain = 0.0
     while len(chosen) < seen.count - 2:
         found = {c: solved([*chosen, c]) for c in range(seen.count) if c not in chosen}
         best = max(found, key=lambda c: found[c].gain)
-        if found[best].clear < CLEAR or found[best].gain < gain + LEAST_GAIN:
+        if found[best].clear < _DECISION.clear or found[best].gain < gain + _DECISION.least_gain:
             break
         chosen, gain = [*chosen, best], found[best].gain
     if not chosen:
         return ()
     rotations = solved(chosen).rotations
-    # large rotations mean that the calibration is something else than a little off
     sizes = np.degrees(np.linalg.norm(rotations, axis=-1))
-    if sizes.max() > MOST_DEGREES:
+    if sizes.max() > _DECISION.most_degrees:
         return ()
     errors = []
     for camera, rotation, size in zip(chosen, rotations, sizes, strict=True):
-        if size <= LEAST_DEGREES:
+        if size <= _DECISION.least_degrees:
             continue
         # other cameras that would explain as much in its place are named with it
         without = [c for c in chosen if c != camera]
         rest = solved(without).gain if without else 0.0
         others = (c for c in range(seen.count) if c not in chosen)
-        alike = [c for c in others if solved([*without, c]).gain - rest > ALIKE * (gain - rest)]
+        enough = _DECISION.alike * (gain - rest)
+        alike = [c for c in others if solved([*without, c]).gain - rest > enough]
         views = [np.flatnonzero(camera_of == c).tolist() for c in (camera, *alike)]
         names = tuple(photos.names[own[0]] for own in views)
         errors.append(CameraError(tuple(views[0]), names, tuple(rotation.tolist())))
@@ -177,12 +166,18 @@ class _Seen:
         camera_of: Int[np.ndarray, " v"],
     ) -> "_Seen | None":
         """Gathers what the cameras see of the person; None if that is too little."""
+        # landmarks that err independently: those of a face or a hand err together
+        parts = (
+            *("nose", "eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle"),
+            *("heel", "big_toe", "foot_index"),
+        )
         kinds = [
-            name.removeprefix("left_").removeprefix("right_") in PARTS
+            name.removeprefix("left_").removeprefix("right_") in parts
             for name in keypoints.set.names
         ]
+        # 24 moments at most, evenly chosen
         observations, views = group_by_frame(photos, keypoints)
-        some = np.unique(np.linspace(0, len(views) - 1, FRAMES).round().astype(int))
+        some = np.unique(np.linspace(0, len(views) - 1, 24).round().astype(int))
 
         def as_double(name: str) -> Float[np.ndarray, "..."]:
             """A field of the observations, of those moments."""
@@ -201,24 +196,25 @@ class _Seen:
             count=int(camera_of.max()) + 1,
         )
 
-    def equations(self) -> tuple[Float[np.ndarray, "k u"], Float[np.ndarray, "k u u"]]:
-        """Gradients (k, 3 n) of the cost by rotations of the n cameras from where they are, and
-        Hessians (k, 3 n, 3 n), in standard deviations, landmark by landmark; the points are
-        eliminated.
+    def equations(self) -> "_Equations":
+        """The equations of rotations from the cameras as they are given, weighted so that outliers
+        count little.
         """
         turned, points, weights = np.zeros((self.count, 3)), self._middle(), self.weights
-        # Outliers are found with all cameras free to turn: else a turned camera's landmarks are.
-        for _ in range(ITERATIONS):
-            gradients, matrices, errors, points = self._linear(turned, points, weights)
-            turned = turned - _solve(gradients.sum(0), matrices.sum(0)).reshape(-1, 3)
-            lengths = np.linalg.norm(errors, axis=-1)
+        # outliers are found with all cameras free to turn: else a turned camera's landmarks are
+        for _ in range(_ITERATIONS):
+            step = self._linearized(turned, points, weights)
+            gradient, matrix = step.equations.gradients.sum(0), step.equations.matrices.sum(0)
+            turned, points = turned - _solve(gradient, matrix).reshape(-1, 3), step.points
+            lengths = np.linalg.norm(step.errors, axis=-1)
             noise = max(float(np.median(lengths[weights > 0])) / RAYLEIGH_MEDIAN, LEAST_NOISE)
-            scale = (ROBUST_SCALE * noise) ** 2
+            scale = (3.0 * noise) ** 2  # robust scale: three standard deviations
             weights = self.weights * np.square(scale / (scale + lengths**2)) / noise**2
-        # With these weights, the equations at the cameras as they are given.
-        for _ in range(ITERATIONS):
-            gradients, matrices, _, points = self._linear(np.zeros_like(turned), points, weights)
-        return gradients, matrices
+        # with these weights, the points settle for the cameras as they are given
+        for _ in range(_ITERATIONS):
+            step = self._linearized(np.zeros_like(turned), points, weights)
+            points = step.points
+        return step.equations
 
     def _middle(self) -> Float[np.ndarray, "m k 3"]:
         """(m, k, 3) the point nearest to the axes of all cameras, to begin with."""
@@ -229,71 +225,117 @@ class _Seen:
         middle = np.linalg.solve(total + 1e-6 * np.eye(3), right)
         return np.broadcast_to(middle, (len(axes), self.points.shape[2], 3))
 
-    def _project(
+    def _projected(
         self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]
-    ) -> tuple[np.ndarray, ...]:
-        """Rotations (m, c, 3, 3), points in the cameras (m, c, k, 3), depths, slopes, focal
-        lengths, and errors (m, c, k, 2).
-        """
+    ) -> "_Projected":
+        """The points as cameras see them that are turned so, axis-angle in radians."""
         turn = Rotation.from_rotvec(turned).as_matrix()[self.camera]
         rotation = turn @ self.matrices[..., :3, :3]
         shift = np.einsum("mcab,mcb->mca", turn, self.matrices[..., :3, 3])
         local = np.einsum("mcab,mkb->mcka", rotation, points) + shift[:, :, None]
         depth = np.maximum(local[..., 2], 0.05)
-        focal, slope = self.K[:, :, None, [0, 1], [0, 1]], local[..., :2] / depth[..., None]
+        focal = self.K[:, :, None, [0, 1], [0, 1]]
+        slope = local[..., :2] / depth[..., None]
         errors = slope * focal + self.K[:, :, None, :2, 2] - self.points
-        return rotation, local, depth, slope, focal, errors
+        return _Projected(rotation, local, depth, slope, focal, errors)
 
-    def _linear(
+    def _linearized(
         self,
         turned: Float[np.ndarray, "n 3"],
         points: Float[np.ndarray, "m k 3"],
         weights: Float[np.ndarray, "m c k"],
-    ) -> tuple[
-        Float[np.ndarray, "k u"],
-        Float[np.ndarray, "k u u"],
-        Float[np.ndarray, "m c k 2"],
-        Float[np.ndarray, "m k 3"],
-    ]:
-        """Gradients and Hessians at rotations, the residuals, and the points after one more step of
-        Gauss and Newton.
-        """
-        rotation, local, depth, slope, focal, errors = self._project(turned, points)
-        # derivatives of the pixels by the point in the camera's axes, by the point in the world,
-        # and by the camera's turn
-        by_local = np.zeros((*depth.shape, 2, 3))
-        by_local[..., [0, 1], [0, 1]] = focal / depth[..., None]
-        by_local[..., 2] = -focal * slope / depth[..., None]
-        by_point = np.einsum("mckia,mcab->mckib", by_local, rotation)
-        by_turn = np.einsum(
-            "mckia,mckab->mckib", by_local, np.cross(local[..., None, :], np.eye(3))
-        )
+    ) -> "_Linearized":
+        """Equations of the cameras about these rotations and points, with the points eliminated."""
+        seen = self._projected(turned, points)
+        by_point, by_turn = seen.derivatives()
         # a step of Gauss and Newton for each point, with the cameras held still
         own = np.einsum("mck,mckia,mckib->mkab", weights, by_point, by_point)
         ridge = 1e-9 + 1e-6 * np.trace(own, axis1=-2, axis2=-1)[..., None, None]
         inverse = np.linalg.inv(own + ridge * np.eye(3))
         step = np.einsum(
-            "mkab,mck,mckib,mcki->mka", inverse, weights, by_point, errors, optimize=True
+            "mkab,mck,mckib,mcki->mka", inverse, weights, by_point, seen.errors, optimize=True
         )
-        left = errors - np.einsum("mckib,mkb->mcki", by_point, step)
-        # the Schur complement of the points: what is left are equations of the cameras, added up
-        # where several views are of one camera
+        # gradients: what the cameras can still do about the errors that this step leaves
+        left = seen.errors - np.einsum("mckib,mkb->mcki", by_point, step)
+        of_views = np.einsum("mck,mckia,mcki->mcka", weights, by_turn, left)
+        # Hessians: the Schur complement of the points, for each pair of views
         mixed = np.einsum("mck,mckia,mckib->mckab", weights, by_turn, by_point)
-        k, n = points.shape[1], self.count
+        of_pairs = -np.einsum("mckap,mkpq,mdkbq->mcdkab", mixed, inverse, mixed, optimize=True)
+        every = np.arange(of_pairs.shape[1])
+        of_pairs[:, every, every] += np.einsum("mck,mckia,mckib->mckab", weights, by_turn, by_turn)
+        return _Linearized(self._by_camera(of_views, of_pairs), seen.errors, points - step)
+
+    def _by_camera(
+        self, of_views: Float[np.ndarray, "m c k 3"], of_pairs: Float[np.ndarray, "m c c k 3 3"]
+    ) -> "_Equations":
+        """Gradients of views and Hessians of pairs of views, added up where several views are of
+        one camera.
+        """
+        k, n = of_views.shape[2], self.count
         gradients, matrices = np.zeros((n, k, 3)), np.zeros((n, n, k, 3, 3))
-        np.add.at(gradients, self.camera, np.einsum("mck,mckia,mcki->mcka", weights, by_turn, left))
-        pairs = -np.einsum("mckap,mkpq,mdkbq->mcdkab", mixed, inverse, mixed, optimize=True)
-        every = np.arange(pairs.shape[1])
-        pairs[:, every, every] += np.einsum("mck,mckia,mckib->mckab", weights, by_turn, by_turn)
-        np.add.at(matrices, (self.camera[:, :, None], self.camera[:, None]), pairs)
-        flat = matrices.transpose(2, 0, 3, 1, 4).reshape(k, 3 * n, 3 * n)
-        return gradients.transpose(1, 0, 2).reshape(k, 3 * n), flat, errors, points - step
+        np.add.at(gradients, self.camera, of_views)
+        np.add.at(matrices, (self.camera[:, :, None], self.camera[:, None]), of_pairs)
+        return _Equations(
+            gradients.transpose(1, 0, 2).reshape(k, 3 * n),
+            matrices.transpose(2, 0, 3, 1, 4).reshape(k, 3 * n, 3 * n),
+        )
+
+
+class _Projected(NamedTuple):
+    """Points of m moments in the pixels of c views."""
+
+    rotation: Float[np.ndarray, "m c 3 3"]
+    """Rotations from the world to the turned cameras, (m, c, 3, 3)."""
+    local: Float[np.ndarray, "m c k 3"]
+    """Points in the axes of the cameras, (m, c, k, 3), metres."""
+    depth: Float[np.ndarray, "m c k"]
+    """Depths of the points, at least 5 cm, (m, c, k), metres."""
+    slope: Float[np.ndarray, "m c k 2"]
+    """x and y over the depth, (m, c, k, 2)."""
+    focal: Float[np.ndarray, "m c 1 2"]
+    """Focal lengths, (m, c, 1, 2), pixels."""
+    errors: Float[np.ndarray, "m c k 2"]
+    """Pixels of the points minus detections, (m, c, k, 2)."""
+
+    def derivatives(
+        self,
+    ) -> tuple[Float[np.ndarray, "m c k 2 3"], Float[np.ndarray, "m c k 2 3"]]:
+        """Derivatives of the pixels by the points in the world, and by small turns of the
+        cameras.
+        """
+        by_local = np.zeros((*self.depth.shape, 2, 3))
+        by_local[..., [0, 1], [0, 1]] = self.focal / self.depth[..., None]
+        by_local[..., 2] = -self.focal * self.slope / self.depth[..., None]
+        by_point = np.einsum("mckia,mcab->mckib", by_local, self.rotation)
+        # a turn t moves a point p of the camera by t x p: row a is the cross product with axis a
+        moved = np.cross(self.local[..., None, :], np.eye(3))
+        return by_point, np.einsum("mckia,mckab->mckib", by_local, moved)
+
+
+class _Equations(NamedTuple):
+    """Least squares about rotations of n cameras, landmark by landmark, in standard deviations."""
+
+    gradients: Float[np.ndarray, "k u"]
+    """Gradients of the cost, (k, 3 n)."""
+    matrices: Float[np.ndarray, "k u u"]
+    """Hessians of Gauss and Newton, (k, 3 n, 3 n)."""
+
+
+class _Linearized(NamedTuple):
+    """Where an iteration of the adjustment arrives."""
+
+    equations: _Equations
+    """Equations of the cameras."""
+    errors: Float[np.ndarray, "m c k 2"]
+    """Pixels of the points minus detections, (m, c, k, 2), before the step."""
+    points: Float[np.ndarray, "m k 3"]
+    """Points after the step, (m, k, 3), metres."""
 
 
 def _solve(
     gradient: Float[np.ndarray, " u"], matrix: Float[np.ndarray, "u u"]
 ) -> Float[np.ndarray, " u"]:
-    return np.linalg.solve(matrix + np.eye(len(matrix)) / PRIOR**2, gradient)
+    return np.linalg.solve(matrix + np.eye(len(matrix)) / _PRIOR**2, gradient)
 
 
 class _Solved(NamedTuple):
@@ -307,14 +349,14 @@ class _Solved(NamedTuple):
     """Size of the last camera's rotation in standard errors."""
 
 
-def _solved(
-    gradients: Float[np.ndarray, "k u"], matrices: Float[np.ndarray, "k u u"], cameras: list[int]
-) -> _Solved:
+def _solved(equations: _Equations, cameras: list[int]) -> _Solved:
+    """What turning these cameras achieves; the last one's rotation over its standard errors."""
     at = (3 * np.asarray(cameras)[:, None] + np.arange(3)).ravel()
-    own, curved = gradients[:, at], matrices[:, at[:, None], at]
+    own, curved = equations.gradients[:, at], equations.matrices[:, at[:, None], at]
     total = curved.sum(0)
     found = -_solve(own.sum(0), total)
-    inverse = np.linalg.inv(total + np.eye(len(at)) / PRIOR**2)
+    # sandwich estimate of the covariance, clustered by landmark
+    inverse = np.linalg.inv(total + np.eye(len(at)) / _PRIOR**2)
     used = int((np.abs(own).max(1) > 0).sum())
     scatter = own + curved @ found
     covariance = inverse @ (scatter.T @ scatter) @ inverse * used / max(used - len(at), 1)

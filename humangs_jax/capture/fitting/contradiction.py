@@ -23,25 +23,32 @@ from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.data.photos import Photos
 
-MOST_MISSED = 0.06
-"""Median distance of landmarks from the triangulated ones over the person's size in the photo, from
-which on a calibration is wrong whatever else is known. It was 0.015 for four photos of a woman,
-0.12 with their y axis upside down. A camera turned by a degree adds 0.02 in its own photo."""
-AGREES = 0.035
-"""The same, below which cameras agree."""
-BETTER = 0.5
-"""Share of the distance that may be left without a mistake, to believe in it."""
-MIRRORED = 0.8
-"""Share of the distance from the detector's own places that is left where those are mirrored in
-depth, below which the person is a mirror image, unless cameras agree."""
-SEEN = 0.5
-"""Least confidence of a keypoint that counts."""
-LEAST_LANDMARKS = 8
-"""Triangulated landmarks below which nothing is concluded."""
-LEAST_VIEWS = 4
-"""Views from which on all but one of them may agree without it."""
-LEAST_DEPTH = 1e-6
-"""Depths are at least this far from 0, in units of the world."""
+
+@dataclasses.dataclass(frozen=True)
+class _Limits:
+    """When a calibration and keypoints contradict each other."""
+
+    most_missed: float = 0.06
+    """Median distance of landmarks from the triangulated ones over the person's size in the photo,
+    from which on a calibration is wrong whatever else is known. It was 0.015 for four photos of a
+    woman, 0.12 with their y axis upside down. A camera turned by a degree adds 0.02 in its own
+    photo."""
+    agrees: float = 0.035
+    """The same, below which cameras agree."""
+    better: float = 0.5
+    """Share of the distance that may be left without a mistake, to believe in it."""
+    mirrored: float = 0.8
+    """Share of the distance from the detector's own places that is left where those are mirrored in
+    depth, below which the person is a mirror image, unless cameras agree."""
+    seen: float = 0.5
+    """Least confidence of a keypoint that counts."""
+    least_landmarks: int = 8
+    """Triangulated landmarks below which nothing is concluded."""
+    least_views: int = 4
+    """Views from which on all but one of them may agree without it."""
+
+
+_LIMITS = _Limits()
 
 
 class Agreement(NamedTuple):
@@ -100,25 +107,25 @@ def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | 
     best: tuple[str, Agreement] | None = None
     for remedy, (own_K, own) in _remedies(K, matrices, photos.images.shape[1]).items():
         after = agreement(own_K, own, frames, keypoints)
-        if after is None or not _agrees(after) or after.missed > BETTER * found.missed:
+        if after is None or not _agrees(after) or after.missed > _LIMITS.better * found.missed:
             continue
         if best is None or after.missed < best[1].missed:
             best = remedy, after
     if best is not None:
         return Contradiction(found, *best)
     # one photo that does not agree with the others is of somebody else, or one camera is off
-    candidates = range(len(K)) if len(K) >= LEAST_VIEWS else range(0)
+    candidates = range(len(K)) if len(K) >= _LIMITS.least_views else range(0)
     for view in candidates:
         others = dataclasses.replace(keypoints, confidences=keypoints.confidences.copy())
         others.confidences[view] = 0
         rest = agreement(K, matrices, frames, others)
-        if rest is not None and _agrees(rest) and rest.missed <= BETTER * found.missed:
+        if rest is not None and _agrees(rest) and rest.missed <= _LIMITS.better * found.missed:
             return None
     without = _without_calibration(photos, keypoints)
-    if without is not None and _agrees(without) and without.missed <= BETTER * found.missed:
+    if without is not None and _agrees(without) and without.missed <= _LIMITS.better * found.missed:
         return Contradiction(found, "without it", without)
     # the person may have moved between the photos, which looks like a small contradiction
-    if found.missed <= MOST_MISSED and not (found.mirrored or found.behind):
+    if found.missed <= _LIMITS.most_missed and not (found.mirrored or found.behind):
         return None
     return Contradiction(found, None, None)
 
@@ -149,7 +156,7 @@ def _without_calibration(photos: Photos, keypoints: Keypoints) -> Agreement | No
     if cameras.moments > 1 or len(cameras.views) < views:
         return None
     # the median distance over the person's size, as in `agreement`
-    pairs = zip(seen.points, seen.visibility > SEEN, strict=True)
+    pairs = zip(seen.points, seen.visibility > _LIMITS.seen, strict=True)
     sizes = [np.ptp(points[known], axis=0).max() for points, known in pairs]
     pixels = float(np.median(cameras.errors))
     missed = float(np.median(cameras.errors / np.maximum(sizes, 1.0)))
@@ -157,7 +164,7 @@ def _without_calibration(photos: Photos, keypoints: Keypoints) -> Agreement | No
 
 
 def _agrees(found: Agreement) -> bool:
-    return found.missed <= AGREES and not found.behind
+    return found.missed <= _LIMITS.agrees and not found.behind
 
 
 def _remedies(
@@ -191,7 +198,7 @@ def agreement(
         # landmarks where the rays of the views of one moment meet
         own = np.flatnonzero(frames == frame)
         points = np.asarray(keypoints.points, np.float64)[own]
-        seen = np.asarray(keypoints.confidences)[own] > SEEN
+        seen = np.asarray(keypoints.confidences)[own] > _LIMITS.seen
         project = K[own] @ matrices[own, :3]
         places, known = _triangulated(project, points, seen)
         count += int(known.sum())
@@ -200,7 +207,8 @@ def agreement(
         # where each camera shows them; depths near 0 must not divide
         local = np.einsum("vab,kb->vka", matrices[own, :3, :3], places) + matrices[own, None, :3, 3]
         depth = local[..., 2]
-        safe = np.where(np.abs(depth) < LEAST_DEPTH, LEAST_DEPTH, depth)
+        # depths are at least this far from 0, in units of the world
+        safe = np.where(np.abs(depth) < 1e-6, 1e-6, depth)
         shown = np.einsum("vab,vkb->vka", K[own], local)[..., :2] / safe[..., None]
         for i, v in enumerate(own):
             used = known & seen[i]
@@ -213,17 +221,17 @@ def agreement(
             sizes.append(np.full(len(off), max(size, 1.0)))
             behind.append(depth[i][used] <= 0)
             # the detector's 3D landmarks tell the person from a mirror image
-            if keypoints.world is not None and used.sum() >= LEAST_LANDMARKS:
+            if keypoints.world is not None and used.sum() >= _LIMITS.least_landmarks:
                 as_seen = np.asarray(keypoints.world[v], np.float64)[used]
                 plain += _apart(local[i][used], as_seen)
                 mirrored += _apart(local[i][used] * [1, 1, -1], as_seen)
-    if count < LEAST_LANDMARKS:
+    if count < _LIMITS.least_landmarks:
         return None
     distances = np.concatenate(errors)
     return Agreement(
         missed=float(np.median(distances / np.concatenate(sizes))),
         pixels=float(np.median(distances)),
-        mirrored=bool(mirrored < MIRRORED * plain),
+        mirrored=bool(mirrored < _LIMITS.mirrored * plain),
         behind=bool(np.mean(np.concatenate(behind)) > 0.5),
     )
 

@@ -36,11 +36,9 @@ from humangs_jax.io.reading import reading, write_json
 
 FIT_FILE = "fit.npz"
 """File of the input of a fit to keypoints, and of how well its result is known."""
-REPORT_FILE = "fit.json"
-"""File of the report."""
-FOUND = ("noise", "joint_std", "determined", "shape_covariance")
+_FOUND = ("noise", "joint_std", "determined", "shape_covariance")
 """Keys of fit.npz that are fields of `FitRecord`."""
-KEYS = ("set", "names", "points", "confidences", *FOUND, "places", "certainty")
+KEYS = ("set", "names", "points", "confidences", *_FOUND, "places", "certainty")
 """All keys of fit.npz."""
 
 
@@ -82,7 +80,7 @@ class FitRecord:
         )
 
 
-def write_fit_record(path: str | Path, record: FitRecord) -> None:
+def _write_fit_record(path: str | Path, record: FitRecord) -> None:
     """Write fit.npz, whole or not at all."""
     kind = record.keypoints.set
     arrays = {
@@ -90,7 +88,7 @@ def write_fit_record(path: str | Path, record: FitRecord) -> None:
         "names": np.asarray(record.names),
         "points": record.keypoints.points.astype(np.float32),
         "confidences": record.keypoints.confidences.astype(np.float32),
-        **{key: np.asarray(getattr(record, key), np.float32) for key in FOUND},
+        **{key: np.asarray(getattr(record, key), np.float32) for key in _FOUND},
         "places": kind.offsets.astype(np.float32),
         "certainty": np.asarray(kind.certainty or usual_certainty(kind.names), np.float32),
     }
@@ -187,7 +185,7 @@ def write_fitted(
     """
     source, target = capture_folder(source), Path(target)
     description = read_description(source / "capture.json")
-    contents = {"capture.json": _with_cameras(description, capture), REPORT_FILE: report.to_json()}
+    contents = {"capture.json": _with_cameras(description, capture), "fit.json": report.to_json()}
     name, arrays = description["body"], capture_parameters(target, capture)
 
     def write_fit(folder: Path):
@@ -196,7 +194,7 @@ def write_fitted(
         for file, content in contents.items():
             write_json(folder / file, content)
         if record is not None:
-            write_fit_record(folder / FIT_FILE, record)
+            _write_fit_record(folder / FIT_FILE, record)
 
     def write(folder: Path):
         folder.mkdir()

@@ -43,9 +43,14 @@ from humangs_jax.capture.fitting.residuals.keypoints import (
     group_by_frame,
     make_observations,
 )
-from humangs_jax.capture.fitting.swaps import agreements, find_exchanged_hands, find_swaps
+from humangs_jax.capture.fitting.swaps import (
+    Swap,
+    agreements,
+    find_exchanged_hands,
+    find_swaps,
+)
 from humangs_jax.capture.keypoints.keypoints import Keypoints, KeypointSet
-from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.processes import Call
 from humangs_jax.core.pytree import replace
@@ -53,11 +58,6 @@ from humangs_jax.data.capture import DEFAULT_BODY, Capture
 from humangs_jax.data.capture_checks import few
 from humangs_jax.data.hidden import hidden_line, with_hidden_parts
 from humangs_jax.data.photos import Photos
-
-UNSEEN = 1e-8
-"""Least information about position and orientation; keeps the inverse finite for frames without
-keypoints.
-"""
 
 
 class Uncertainty(NamedTuple):
@@ -89,8 +89,9 @@ def fit_uncertainty(
     shapes = len(fit.betas)
     by_pose, by_shape = np.split(residuals_by, [residuals_by.shape[-1] - shapes], axis=-1)
     # Schur complement: the poses are eliminated, which leaves the information about the shape
+    # keeps the inverse finite for frames without keypoints
     own = np.linalg.inv(
-        np.einsum("mra,mrb->mab", by_pose, by_pose) + UNSEEN * np.eye(by_pose.shape[-1])
+        np.einsum("mra,mrb->mab", by_pose, by_pose) + 1e-8 * np.eye(by_pose.shape[-1])
     )
     coupling = np.einsum("mra,mrs->mas", by_pose, by_shape)
     carried = own @ coupling
@@ -146,7 +147,7 @@ def _derivatives(
             "body_pose": vector[6:p].reshape(-1, 3),
         }
         moved = replace(state, betas=vector[p:], **pose)
-        found = frame_residuals(problem, seen, moved, ROBUST_SCALES[-1])
+        found = frame_residuals(problem, seen, moved, ROBUST_SCALES["person"])
         found.pop("shape")
         return (
             jnp.concatenate([leaf.ravel() for leaf in found.values()]),
@@ -155,12 +156,6 @@ def _derivatives(
 
     vectors = jnp.concatenate([poses, jnp.tile(state.betas, (m, 1))], axis=1)
     return jax.lax.map(lambda each: jax.jacfwd(both)(*each), (vectors, observations))
-
-
-OUTLIER = 5.0
-"""Standard deviations of the noise beyond which a keypoint is an outlier: the robust scale of the
-last stage of a fit.
-"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -185,74 +180,85 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
     Raises: ValueError if the number of views differs, the record is of fewer frames, or the body
     has none of the landmarks.
     """
-    if len(keypoints.points) != capture.view_count:
-        raise ValueError(
-            f"keypoints of {len(keypoints.points)} views, but the capture has {capture.view_count}"
-        )
-    names = capture.body.joint_names
-    if record is not None and (
-        len(record.noise) <= capture.frames.max() or record.joint_std.shape[1] != len(names)
-    ):
-        raise ValueError(
-            f"the capture's fit is of {len(record.noise)} frames and {record.joint_std.shape[1]}"
-            f" joints, but the capture has {capture.frames.max() + 1} and {len(names)}: fit it"
-            " again"
-        )
+    _check_same_views(capture, keypoints, record)
+    # distances of the body's landmarks from the keypoints, frame by frame
     observations, views = group_by_frame(capture, keypoints)
-    # errors of the body's landmarks, frame by frame
-    expected = np.asarray(observations.noise)
-    poses = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(views)], capture.poses)
     kind = keypoints.set
     model = landmark_model(capture.body, kind.names, kind.places, kind.certainty)
-    errors = np.asarray(
-        body_errors(model, from_host(capture.betas), poses, observations, np.arange(len(views)))
-    )
+    poses = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(views)], capture.poses)
+    betas = from_host(capture.betas)
+    errors = np.asarray(body_errors(model, betas, poses, observations, np.arange(len(views))))
     compared = (np.asarray(observations.confidences) > 0) & np.asarray(model.known)
     lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)
-    frames = np.asarray([_quantile(own, 0.5) for own in lengths])
     # noise of the detections: from the fit, or else from the errors themselves
-    undetermined = ()
+    expected = np.asarray(observations.noise)
+    names, undetermined = capture.body.joint_names, ()
     if record is None:
         noise = np.asarray(list(map(found_noise, lengths, expected)))
     else:
         noise, shown = record.noise[: len(views)], np.flatnonzero(compared.any((1, 2)))
         undetermined = undetermined_joints(names, record.joint_std[shown], record.determined[shown])
-    outliers = compared & (lengths * np.asarray(model.certainty) > OUTLIER * noise[:, None, None])
+    # outliers are beyond five standard deviations, the robust scale of the last stage of a fit
+    outliers = compared & (lengths * np.asarray(model.certainty) > 5.0 * noise[:, None, None])
 
     # back from frames to the order of the views
     frame_of, slot_of = np.argwhere(views >= 0)[np.argsort(views[views >= 0])].T
     at = frame_of, slot_of
     of_views = zip(capture.names, frame_of.tolist(), lengths[at], outliers[at], strict=True)
     rows = tuple(_view_report(*own) for own in of_views)
-    # exchanged hands are reported once, not again as exchanged sides of their view
+    # what points to a mistake
     violations = limit_violations(names, poses)
-    hands = find_exchanged_hands(keypoints, capture.names)
-    explained = {swap.views[0] for swap in hands}
-    others = [
-        swap
-        for swap in find_swaps(observations, kind, views, capture.names)
-        if swap.kind == "cameras" or explained.isdisjoint((*swap.views, *swap.instead))
-    ]
-    swaps = (*others, *hands)
+    swaps = _exchanges(observations, keypoints, views, capture.names)
     turned = [
         f"{error}, as the keypoints show: `humangs fit` turns it back"
         for error in find_camera_errors(capture, keypoints)
     ]
-    median = {}
-    if compared.any():
-        median["keypoint_error_px"] = Change(_quantile(lengths, 0.5))
     report = FitReport(
         fitted="keypoints",
-        errors=median,
+        errors={"keypoint_error_px": Change(_quantile(lengths, 0.5))} if compared.any() else {},
         views=rows,
         violations=violations,
         swaps=swaps,
         undetermined=undetermined,
-        notes=_worst_frame(frames),
+        notes=_worst_frame(np.asarray([_quantile(own, 0.5) for own in lengths])),
         warnings=(*turned, *keypoint_warnings(rows, expected, violations, swaps)),
     )
     landmarks = errors + np.asarray(observations.points)
     return Examination(report, landmarks[at], compared[at], outliers[at])
+
+
+def _check_same_views(capture: Capture, keypoints: Keypoints, record: FitRecord | None) -> None:
+    """Raises: ValueError, see `examine`."""
+    views, joints = capture.view_count, len(capture.body.joint_names)
+    if len(keypoints.points) != views:
+        raise ValueError(f"keypoints of {len(keypoints.points)} views, but the capture has {views}")
+    if record is None:
+        return
+    frames, known = capture.frames.max() + 1, record.joint_std.shape[1]
+    if len(record.noise) < frames or known != joints:
+        raise ValueError(
+            f"the capture's fit is of {len(record.noise)} frames and {known} joints, but the"
+            f" capture has {frames} and {joints}: fit it again"
+        )
+
+
+def _exchanges(
+    observations: Observations,
+    keypoints: Keypoints,
+    views: Int[np.ndarray, "m c"],
+    names: tuple[str, ...],
+) -> tuple[Swap, ...]:
+    """What seems exchanged. Exchanged hands are reported once, and not again as exchanged sides of
+    their view.
+    """
+    hands = find_exchanged_hands(keypoints, names)
+    explained = {swap.views[0] for swap in hands}
+    others = [
+        swap
+        for swap in find_swaps(observations, keypoints.set, views, names)
+        if swap.kind == "cameras" or explained.isdisjoint((*swap.views, *swap.instead))
+    ]
+    return (*others, *hands)
 
 
 def _worst_frame(frames: Float[np.ndarray, " m"]) -> tuple[str, ...]:
@@ -278,14 +284,6 @@ def _quantile(values: Float[np.ndarray, "..."], share: float) -> float:
     """A quantile of the values that are not NaN; NaN if all are."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if known.size else float("nan")
-
-
-FAR_MM = 10.0
-"""Millimetres between places of landmarks that are worth a line."""
-FAR = 4.0
-"""A frame is far from its neighbours if its distance from their midpoint exceeds this multiple of
-half their distance.
-"""
 
 
 def calls_of_fit(body: BodyModel, kind: KeypointSet, views: int) -> Iterator[Call]:
@@ -402,10 +400,11 @@ def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:
         return
     moved = 1000 * PLACE_STD * np.linalg.norm(np.asarray(fit.state.places), axis=-1)
     kinds = {group: kind_of(model.names[landmark]) for landmark, group, _ in model.placed}
+    # a centimetre is worth a line
     far = [
         f"{kinds[group]} {moved[group]:.0f} mm"
         for group in np.argsort(-moved)[:3]
-        if moved[group] > FAR_MM
+        if moved[group] > 10.0
     ]
     if far:
         yield (
@@ -452,7 +451,9 @@ def _motion_warnings(
         )
     off = np.linalg.norm(accelerations(joints), axis=-1).mean(-1) / 2
     around = np.linalg.norm(joints[2:] - joints[:-2], axis=-1).mean(-1)
-    for frame in 1 + np.flatnonzero(off > FAR * around / 2 + MOTION_SCALE * smoothness):
+    # a frame is far from its neighbours if its distance from their midpoint exceeds four times
+    # half their distance
+    for frame in 1 + np.flatnonzero(off > 4.0 * around / 2 + MOTION_SCALE * smoothness):
         yield (
             f"frame {frame}: {off[frame - 1]:.2f} m from where the frames beside it would have it:"
             " is it somebody else?"

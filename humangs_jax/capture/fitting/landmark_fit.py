@@ -56,32 +56,24 @@ from humangs_jax.capture.fitting.state import (
 )
 from humangs_jax.capture.fitting.triangulation import triangulate_robustly
 from humangs_jax.capture.keypoints.keypoints import mirrored_name
-from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.transform import EXACT
 
-PLACED_FRAMES = 4
-"""With this many frames a fit finds where the detector sees its landmarks: fewer say too little
-about both shape and places.
-"""
-USUAL_COUNT = 16
-"""Keypoints that what is usual counts for where the noise of a landmark is found."""
-LEAST_RATIO = 0.5
-"""Least noise of a landmark, a share of what is usual."""
-ROBUST_SCALES = (30.0, 15.0, 15.0, 10.0, 5.0)
-"""Robust scales of keypoints in the stages rigid, points, body, hands and person, standard
-deviations.
-"""
-STARTS = (4, 2)
-"""Numbers of orientations that are followed, for one view and for several."""
+ROBUST_SCALES = {"rigid": 30.0, "points": 15.0, "body": 15.0, "hands": 10.0, "person": 5.0}
+"""Robust scales of keypoints in the stages, standard deviations."""
 STEPS = 150
-"""Steps of the solver in a stage of one frame, at most."""
-PERSON_STEPS = 150
-"""Steps of the solver for all frames together, at most."""
-TOLERANCE = 3e-4
+"""Steps of the solver in a stage, at most."""
+_TOLERANCE = 3e-4
 """Tolerance of the unknowns, which are of unit size."""
+MOTION_SCALE = 5.0
+"""Robust scale of accelerations, multiples of the expected one: a frame that shows somebody else
+hardly pulls the others.
+"""
+FEW = 6
+"""Keypoints below which a frame's pose is mostly the prior's. Smooth motion interpolates it."""
 
 
 @pytree_dataclass
@@ -131,13 +123,15 @@ def fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit:
     observations = replace(observations, noise=_noise_found(problem, observations, states))
     model = replace(model, certainty=_certainty_found(problem, observations, states))
     problem = keypoint_problem(model)
+    # where the detector sees its landmarks: fewer than four frames say too little about both shape
+    # and places
     groups = len({group for _, group, _ in model.placed})
     frames, views = observations.points.shape[:2]
-    placed = groups and frames >= PLACED_FRAMES and views > 1
+    placed = groups and frames >= 4 and views > 1
     places = jnp.zeros((groups, 3)) if placed else None
     start = replace(states, betas=jnp.median(states.betas, axis=0), places=places)
     residuals = functools.partial(_person_residuals, problem, observations)
-    state, _ = solve(residuals, start, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
+    state, _ = solve(residuals, start, STEPS, method="lbfgs", tolerance=_TOLERANCE)
     return _result(problem, observations.noise, state, jnp.zeros(()))
 
 
@@ -172,19 +166,25 @@ def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
 
 def _fit_frame(problem: KeypointProblem, seen: Observations) -> FitState:
     """Stages rigid to hands of one frame, from several starts; the best by its keypoints."""
-    several = seen.points.shape[0] > 1
     points, counts, weights = triangulate_robustly(seen)
-    starts = _rigid_starts(problem, seen, points, counts, STARTS[several])
-    targets = Targets(points, counts >= 2, _metres_per_pixel(seen, points, weights))
-    stages = _stages(problem, targets)
+    # one view leaves more orientations open than several
+    followed = 2 if seen.points.shape[0] > 1 else 4
+    starts = _rigid_starts(problem, seen, points, counts, followed)
+    # metres per pixel where the points are, a mean over views and points
+    centers = transform.invert_rigid(seen.cam_from_world)[:, :3, 3]
+    distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
+    each = distance / seen.K[:, :1, 0]
+    pixel = jnp.sum(weights * each) / jnp.maximum(jnp.sum(weights), 1e-6) + 1e-4
+    stages = _stages(problem, Targets(points, counts >= 2, pixel))
 
     def run(state, stage):
-        weighted = replace(seen, confidences=seen.confidences * stage.views)
+        """The state after one stage, and its cost."""
+        weighted = replace(seen, confidences=seen.confidences * stage.landmark_weights)
 
         def residuals(y):
             return frame_residuals(problem, weighted, y, stage.scale, stage.targets)
 
-        return solve(residuals, state, STEPS, method="lbfgs", tolerance=TOLERANCE, free=stage.free)
+        return solve(residuals, state, STEPS, method="lbfgs", tolerance=_TOLERANCE, free=stage.free)
 
     states, costs = jax.vmap(lambda start: jax.lax.scan(run, start, stages))(starts)
     best = jnp.argmin(costs[:, -1])
@@ -193,9 +193,6 @@ def _fit_frame(problem: KeypointProblem, seen: Observations) -> FitState:
 
 # The start of a frame
 # ------------------------------------------------------------------------------------------------
-
-COARSE = 30.0
-"""Robust scale of keypoints while the body rests, standard deviations."""
 
 
 def _rigid_starts(
@@ -221,7 +218,7 @@ def _rigid_starts(
     weights = trunk_weights(problem.model.names) * problem.known
     product = functools.partial(jnp.matmul, precision=EXACT)
     turned = _kabsch(landmarks, points, weights * (counts >= 2))
-    rotations = jnp.concatenate([turned[None], jnp.asarray(cube_rotations(), jnp.float32)])
+    rotations = jnp.concatenate([turned[None], jnp.asarray(_cube_rotations(), jnp.float32)])
     positions = jax.vmap(
         lambda r: _position(observations, product(landmarks - pelvis, r.T), weights)
     )(rotations)
@@ -239,7 +236,10 @@ def _rigid_starts(
 
     def cost(state):
         errors = keypoint_residuals(
-            problem.model, observations, problem.landmarks_and_joints(state)[0], COARSE
+            problem.model,
+            observations,
+            problem.landmarks_and_joints(state)[0],
+            ROBUST_SCALES["rigid"],
         )
         return 0.5 * jnp.sum(weights[:, None] * jnp.square(errors))
 
@@ -247,7 +247,7 @@ def _rigid_starts(
     return jax.tree.map(lambda leaf: leaf[best], starts)
 
 
-def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
+def _cube_rotations() -> Float[np.ndarray, "24 3 3"]:
     """The rotations that map the axes to each other."""
     signed = (
         np.eye(3)[list(order)] * np.asarray(signs)[:, None]
@@ -293,15 +293,6 @@ def _position(
     return jnp.linalg.solve(matrix / scale + 1e-7 * jnp.eye(3), vector / scale)
 
 
-def _metres_per_pixel(
-    seen: Observations, points: Float[Array, "k 3"], weights: Float[Array, "c k"]
-) -> Float[Array, ""]:
-    centers = transform.invert_rigid(seen.cam_from_world)[:, :3, 3]
-    distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
-    each = distance / seen.K[:, :1, 0]
-    return jnp.sum(weights * each) / jnp.maximum(jnp.sum(weights), 1e-6) + 1e-4
-
-
 # Stages
 # --------------------------------------------------------------------------------------------------
 
@@ -310,8 +301,8 @@ def _metres_per_pixel(
 class _Stage:
     """One run of the solver."""
 
-    views: Float[Array, " k"]
-    """Weights of the keypoints, (k,)."""
+    landmark_weights: Float[Array, " k"]
+    """What the keypoints of each landmark count, (k,)."""
     targets: Targets
     """Triangulated points with their weights."""
     scale: Float[Array, ""]
@@ -320,14 +311,13 @@ class _Stage:
     """Which numbers of the state move, booleans."""
 
 
-BODY = (*BODY_NAMES, "jaw")
-"""Joints that move before the hands do."""
-
-
 def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
+    """The stages rigid, points, body and hands, a batch."""
     model, resting = problem.model, zero_state(problem.origin)
     trunk = jnp.asarray(trunk_weights(model.names))
-    body = np.asarray([model.joint_names[j] in BODY for j in problem.origin.joints])[:, None]
+    # joints that move before the hands do
+    names = {*BODY_NAMES, "jaw"}
+    body = np.asarray([model.joint_names[j] in names for j in problem.origin.joints])[:, None]
     ones, none = jnp.ones_like(trunk), jnp.zeros_like(trunk)
 
     def free(shape, joints):
@@ -340,16 +330,16 @@ def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
             body_pose=jnp.broadcast_to(jnp.asarray(joints), resting.body_pose.shape),
         )
 
-    # stages in space pull the body to the points and not to the keypoints, if there are points
+    # points in space pull the body in one stage alone, and keypoints do not, if there are points
     points = replace(targets, known=targets.known * 1.0)
     unused = replace(targets, known=targets.known * 0.0)
     beside_points = jnp.where(jnp.any(targets.known), none, ones)
-    scales = [jnp.asarray(scale) for scale in ROBUST_SCALES]
+    scales = {name: jnp.asarray(scale) for name, scale in ROBUST_SCALES.items()}
     stages = [
-        _Stage(trunk, unused, scales[0], free(False, False)),
-        _Stage(beside_points, points, scales[1], free(True, body)),
-        _Stage(ones, unused, scales[2], free(True, body)),
-        _Stage(ones, unused, scales[3], free(True, True)),
+        _Stage(trunk, unused, scales["rigid"], free(shape=False, joints=False)),
+        _Stage(beside_points, points, scales["points"], free(shape=True, joints=body)),
+        _Stage(ones, unused, scales["body"], free(shape=True, joints=body)),
+        _Stage(ones, unused, scales["hands"], free(shape=True, joints=True)),
     ]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stages)
 
@@ -357,6 +347,8 @@ def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
 def _noise_found(
     problem: KeypointProblem, observations: Observations, states: FitState
 ) -> Float[Array, " m"]:
+    """The noise of the detections in each frame, pixels, from what its state leaves."""
+
     def of_frame(seen, state):
         errors = keypoint_errors(seen, problem.landmarks_and_joints(state)[0])
         known = seen.confidences * problem.known > 0
@@ -369,25 +361,32 @@ def _noise_found(
 def _certainty_found(
     problem: KeypointProblem, observations: Observations, states: FitState
 ) -> Float[Array, " k"]:
-    """(k,) of landmarks, from the errors of the first stages in the frames that several views show:
-    a robust noise of each pair, over that of all. The fewer there are, the nearer to the usual.
+    """Certainties of the landmarks, (k,): the noise of all over the noise of each, which is the
+    median error in keypoints that several views of a frame show. The fewer these are, the nearer to
+    what is usual.
     """
-    model = problem.model
-    pair = np.asarray([model.names.index(mirrored_name(name)) for name in model.names])
+    names = problem.model.names
 
-    def lengths(seen, state):
+    def errors_of_frame(seen, state):
+        """Errors in units of the frame's noise, (c, k); NaN where one view alone says something."""
         errors = keypoint_errors(seen, problem.landmarks_and_joints(state)[0]) / seen.noise
         known = (seen.confidences > 0) & (problem.known > 0)
         shared = known & (jnp.sum(known, axis=0) > 1)
         return jnp.where(shared, jnp.linalg.norm(errors, axis=-1), jnp.nan)
 
-    found = jax.vmap(lengths)(observations, states)
-    found = jnp.stack([found, found[..., pair]])
-    count = jnp.sum(~jnp.isnan(found), axis=(0, 1, 2)) / (1 + (pair != np.arange(len(pair))))
+    # left and right have one noise: each landmark has the errors of its mirror image, too
+    mirror = np.asarray([names.index(mirrored_name(name)) for name in names])
+    own = jax.vmap(errors_of_frame)(observations, states)
+    found = jnp.stack([own, own[..., mirror]])
     ratio = jnp.nan_to_num(jnp.nanmedian(found, axis=(0, 1, 2)) / RAYLEIGH_MEDIAN, nan=1.0)
-    usual = 1 / model.certainty
-    variance = (USUAL_COUNT * usual**2 + count * ratio**2) / (USUAL_COUNT + count)
-    return 1 / jnp.maximum(jnp.sqrt(variance), LEAST_RATIO * usual)
+    # keypoints that it comes from; those of a landmark in the middle are in `found` twice
+    twice = 1 + (mirror != np.arange(len(mirror)))
+    count = jnp.sum(~jnp.isnan(found), axis=(0, 1, 2)) / twice
+    # the usual noise counts for 16 keypoints, and half of it is the least
+    usual_count, least_share = 16, 0.5
+    usual = 1 / problem.model.certainty
+    variance = (usual_count * usual**2 + count * ratio**2) / (usual_count + count)
+    return 1 / jnp.maximum(jnp.sqrt(variance), least_share * usual)
 
 
 def _person_residuals(
@@ -396,7 +395,7 @@ def _person_residuals(
     """All frames at once with one shape."""
 
     def of_frame(seen, own):
-        return frame_residuals(problem, seen, own, ROBUST_SCALES[-1])
+        return frame_residuals(problem, seen, own, ROBUST_SCALES["person"])
 
     found = jax.vmap(of_frame, in_axes=(0, frame_axes(state)))(observations, state)
     found["shape"] = state.betas  # once, whatever the number of frames
@@ -407,16 +406,6 @@ def _person_residuals(
 
 # Smooth motion
 # --------------------------------------------------------------------------------------------------
-
-MOTION_LEVELS = (64.0, 16.0, 4.0, 1.0)
-"""Multiples of the expected acceleration, one solve each. Weak ones first: frames that one view
-hardly determines come together before anything pulls hard."""
-MOTION_SCALE = 5.0
-"""Robust scale of accelerations, multiples of the expected one: a frame that shows somebody else
-hardly pulls the others.
-"""
-FEW = 6
-"""Keypoints below which a frame's pose is mostly the prior's. Smooth motion interpolates it."""
 
 
 @jax.jit
@@ -430,52 +419,67 @@ def smooth_motion(
 
     Arguments: observations: those of the fit. fit: without smooth motion, of at least three frames.
 
-    The result is that of the last of `MOTION_LEVELS` which follows the keypoints of every frame as
-    well as the fit does, up to their noise: the robust cost of a frame may exceed the fit's by the
-    number of its unknowns. That is twice what the true pose exceeds it by on average, because a fit
-    with p unknowns takes up p of the squared normal errors and half of them are the cost. If no
-    level does, the fit itself.
+    The expected acceleration is multiplied by 64, 16, 4 and 1, one solve each: frames that one view
+    hardly determines come together before anything pulls hard. The result is that of the last level
+    which follows the keypoints of every frame as well as the fit does, up to their noise: the
+    robust cost of a frame may exceed the fit's by the number of its unknowns. That is twice what
+    the true pose exceeds it by on average, because a fit with p unknowns takes up p of the squared
+    normal errors and half of them are the cost. If no level does, the fit itself.
     """
     problem = keypoint_problem(replace(model, certainty=fit.certainty))
     seen = replace(observations, noise=fit.noise)
-    axes = frame_axes(fit.state)
-
-    def costs(state):
-        """(m,) of the keypoints of each frame."""
-
-        def cost(each, points):
-            return half_squares(keypoint_residuals(problem.model, each, points, ROBUST_SCALES[-1]))
-
-        landmarks = jax.vmap(problem.landmarks_and_joints, in_axes=(axes,))(state)[0]
-        return jax.vmap(cost)(seen, landmarks)
-
-    # how much worse the keypoints of a frame may become, see above
+    costs = functools.partial(_keypoint_costs, problem, seen)
+    # how much worse the keypoints of a frame may become: by its unknowns, or the numbers observed
     observed = 2 * jnp.sum(seen.confidences * problem.known > 0, axis=(1, 2))
     limit = costs(fit.state) + jnp.minimum(6 + 3 * len(problem.origin.joints), observed)
 
-    def run(carry, std):
+    def solve_level(carry, std):
+        """Goes on from the level before; its result is kept if it follows the keypoints."""
         state, kept, held = carry
-
-        def residuals(y):
-            joints = jax.vmap(problem.landmarks_and_joints, in_axes=(axes,))(y)[1]
-            motion = robust(accelerations(joints) / std, MOTION_SCALE)
-            return _person_residuals(problem, seen, y) | {"motion": motion}
-
-        state, _ = solve(residuals, state, PERSON_STEPS, method="lbfgs", tolerance=TOLERANCE)
+        residuals = functools.partial(_motion_residuals, problem, seen, std)
+        state, _ = solve(residuals, state, STEPS, method="lbfgs", tolerance=_TOLERANCE)
         good = jnp.all(costs(state) <= limit)
-        kept, held = jax.tree.map(
-            lambda new, old: jnp.where(good, new, old), (state, std), (kept, held)
-        )
+        kept, held = _chosen(good, (state, std), (kept, held))
         return (state, kept, held), None
 
-    # frames without keypoints begin between their neighbours; levels follow each other from weak to
-    # strong, and the last good one is kept
+    # frames without keypoints begin between their neighbours
     start = _bridged(problem, seen, fit.state)
-    bridges = jnp.all(costs(start) <= limit)
-    kept = jax.tree.map(lambda new, old: jnp.where(bridges, new, old), start, fit.state)
-    carry = (start, kept, jnp.zeros(()))
-    (_, state, held), _ = jax.lax.scan(run, carry, smoothness * jnp.asarray(MOTION_LEVELS))
+    kept = _chosen(jnp.all(costs(start) <= limit), start, fit.state)
+    levels = smoothness * jnp.asarray((64.0, 16.0, 4.0, 1.0))
+    (_, state, held), _ = jax.lax.scan(solve_level, (start, kept, jnp.zeros(())), levels)
     return _result(problem, fit.noise, state, held)
+
+
+def _keypoint_costs(
+    problem: KeypointProblem, observations: Observations, state: FitState
+) -> Float[Array, " m"]:
+    """The robust cost of the keypoints of each frame, (m,), half squares of standard deviations."""
+
+    def of_frame(seen, landmarks):
+        return half_squares(
+            keypoint_residuals(problem.model, seen, landmarks, ROBUST_SCALES["person"])
+        )
+
+    axes = frame_axes(state)
+    landmarks = jax.vmap(problem.landmarks_and_joints, in_axes=(axes,))(state)[0]
+    return jax.vmap(of_frame)(observations, landmarks)
+
+
+def _motion_residuals(
+    problem: KeypointProblem, observations: Observations, std: Float[Array, ""], state: FitState
+) -> dict[str, Float[Array, "..."]]:
+    """Residuals of all frames, and of the accelerations of their joints. std: the expected
+    acceleration, metres per frame squared.
+    """
+    axes = frame_axes(state)
+    joints = jax.vmap(problem.landmarks_and_joints, in_axes=(axes,))(state)[1]
+    motion = robust(accelerations(joints) / std, MOTION_SCALE)
+    return _person_residuals(problem, observations, state) | {"motion": motion}
+
+
+def _chosen(good: Bool[Array, ""], new: Any, old: Any) -> Any:
+    """The new pytree where it is good, else the old one."""
+    return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
 
 
 def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) -> Any:

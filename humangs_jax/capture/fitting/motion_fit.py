@@ -56,43 +56,44 @@ from humangs_jax.geometry.transform import EXACT
 
 WINDOW, OVERLAP = 120, 24
 """Frames of a window, and those that it shares with the next."""
-STEPS, STEP_LENGTH = 120, 0.1
+_STEPS, _STEP_LENGTH = 120, 0.1
 """Of gradient descent in a stage of a window: how many, and the length of the first in each
 unknown."""
-ACCELERATION, JERK = 10.0, 100.0
+_ACCELERATION, _JERK = 10.0, 100.0
 """Expected standard deviations of a joint's acceleration, m/s^2, and jerk, m/s^3: those of people
 who dance."""
-ROBUST_SCALE = 5.0
-"""Of accelerations and jerk, standard deviations."""
-LEVELS = ((30.0, 8.0), (10.0, 3.0), (5.0, 1.0))
+
+
+@dataclasses.dataclass(frozen=True)
+class _MotionPrior:
+    """What is expected of a motion."""
+
+    keypoint: float = 0.008
+    """Noise of a keypoint at the person, metres, for the preconditioning."""
+    held_speed: float = 0.03
+    """Standard deviation of the speed of a foot that stands still, metres a second."""
+    height: float = 0.005
+    """How exactly a person's height is known, metres."""
+    anchor: float = 20.0
+    """How hard a window holds to frames that the one before has found, per unit of the state."""
+    robust_scale: float = 5.0
+    """Robust scale of accelerations and jerk, standard deviations."""
+
+
+_PRIOR = _MotionPrior()
+
+
+_LEVELS = ((30.0, 8.0), (10.0, 3.0), (5.0, 1.0))
 """Of the stages of a motion: the robust scale of keypoints, and a multiple of the expected
 accelerations."""
-KEYPOINT_METRES = 0.008
-"""The noise of a keypoint at the person, for the preconditioning."""
-STATIC_SPEEDS = (0.25, 0.5)
-"""Metres a second: a point of the foot that is slower than the first stands still, one that is
-faster than the second moves."""
-HELD_SPEED = 0.03
-"""Metres a second, the standard deviation of a foot that stands still."""
-SMOOTH = {*BODY_NAMES, *(f"{side}_{each}3" for side in ("left", "right") for each in FINGERS)}
-"""Joints whose accelerations and jerk are expected: the body's, and the last of each finger."""
-FEET = ("left_heel", "left_foot_index", "right_heel", "right_foot_index")
+_FEET = ("left_heel", "left_foot_index", "right_heel", "right_foot_index")
 """Landmarks that stand still while a foot does."""
-HEIGHT_STD = 0.005
-"""Metres: how exactly a person's height is known."""
-ANCHOR = 20.0
-"""How hard a window holds to frames that the one before has found, per unit of the state."""
-SMOOTHED = 0.1
-"""Seconds over which the start is smoothed."""
-LEAST_SEEN = 6
+_LEAST_SEEN = 6
 """Keypoints of a frame below which its start is interpolated."""
-LEAST_VISIBLE = 0.3
+_LEAST_VISIBLE = 0.3
 """Visibility of a keypoint from which on it counts for that."""
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
 """Of the camera, in a world with y up and z towards it."""
-MOST_TILT = 50.0
-"""Degrees between the camera's upright and the direction in which a person stands; beyond it people
-are taken to lie, and the camera to be level."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -108,7 +109,7 @@ class MotionFit:
     cam_from_world: Float[np.ndarray, "4 4"]
     """The camera, which stands still, metres."""
     static: Float[np.ndarray, "m f"]
-    """How surely each landmark of `FEET` stands still, 0 to 1."""
+    """How surely each landmark of `_FEET` stands still, 0 to 1."""
 
 
 @pytree_dataclass
@@ -134,7 +135,7 @@ class _Window:
     rate: Float[Array, ""]
     """Frames per second."""
     scales: Float[Array, "2"]
-    """A row of `LEVELS`."""
+    """A row of `_LEVELS`."""
 
 
 def fit_motion(
@@ -169,7 +170,7 @@ def fit_motion(
     poses = _start(model, seen, fps, shape)
     # one stage for the shape, then all levels and the feet of each window
     windows = _windows(m)
-    stages = iter(watch(range(1 + len(windows) * (len(LEVELS) + 1)), len(windows)))
+    stages = iter(watch(range(1 + len(windows) * (len(_LEVELS) + 1)), len(windows)))
 
     def run(
         frames: np.ndarray, poses: BodyPose, scales: tuple[float, float], **options: Any
@@ -181,15 +182,15 @@ def fit_motion(
     if betas is None:
         spread = np.unique(np.linspace(0, m - 1, min(m, WINDOW)).round().astype(int))
         found = poses
-        for scales in LEVELS[1:]:
+        for scales in _LEVELS[1:]:
             found, shape = run(spread, found, scales, timed=False)
         shape = _of_height(shape, tall, height)
     # the motion; then once more, with the feet held that stand still
-    for scales in LEVELS:
+    for scales in _LEVELS:
         poses = _joined(windows, poses, functools.partial(run, scales=scales))
     static = _static_feet(model, shape, poses, fps)
     poses = _joined(
-        windows, poses, functools.partial(run, scales=LEVELS[-1]), lambda w: {"static": static[w]}
+        windows, poses, functools.partial(run, scales=_LEVELS[-1]), lambda w: {"static": static[w]}
     )
     return _standing(model, body, shape, poses, static, fps)
 
@@ -202,7 +203,7 @@ def _observations(keypoints: Keypoints, K: Float[np.ndarray, "3 3"]) -> Observat
     if keypoints.world is None:
         raise ValueError("expected keypoints of a detector that sees them in space, too")
     points, confidences = keypoints.points[:, None], keypoints.confidences[:, None]
-    if not ((confidences > LEAST_VISIBLE).sum(-1) >= LEAST_SEEN).any():
+    if not ((confidences > _LEAST_VISIBLE).sum(-1) >= _LEAST_SEEN).any():
         raise ValueError("the person is seen in no frame")
     cameras = np.broadcast_to(K, (len(points), 1, 3, 3))
     world = in_camera_axes(keypoints.world[:, None], points, confidences, cameras)
@@ -235,7 +236,7 @@ def _start(
     views = (np.asarray(x)[:, 0] for x in (seen.points, seen.confidences, seen.K))
     places = np.stack([_place(*each) for each in zip(*views, offsets, strict=True)])
     # frames that show nothing lie between the others
-    shown = (np.asarray(seen.confidences)[:, 0] > LEAST_VISIBLE).sum(-1) >= LEAST_SEEN
+    shown = (np.asarray(seen.confidences)[:, 0] > _LEAST_VISIBLE).sum(-1) >= _LEAST_SEEN
     shown &= places[:, 2] < 0
     known, frames = np.flatnonzero(shown), np.arange(len(shown))
     if not len(known):
@@ -263,7 +264,8 @@ def _radius(points: Float[np.ndarray, "*m k 3"]) -> Float[np.ndarray, "*m"] | np
 def _steady(values: Float[np.ndarray, "m ..."], fps: float) -> Float[np.ndarray, "m ..."]:
     """Values of the frames without outliers, smoothed over time."""
     kept = median_filter(values, size=(5, *[1] * (values.ndim - 1)), mode="nearest")
-    return gaussian_filter1d(kept, max(SMOOTHED * fps, 0.5), axis=0, mode="nearest")
+    # over a tenth of a second, or half a frame
+    return gaussian_filter1d(kept, max(0.1 * fps, 0.5), axis=0, mode="nearest")
 
 
 def _turn(
@@ -371,7 +373,7 @@ def _run(
         betas=jnp.asarray(betas, jnp.float32),
         smoother=jnp.asarray(_smoother(fps) if timed else np.eye(WINDOW), jnp.float32),
         timed=jnp.asarray(filled(np.ones(count)) * timed, jnp.float32),
-        held=jnp.asarray(filled(np.zeros((count, len(FEET))) if static is None else static)[1:]),
+        held=jnp.asarray(filled(np.zeros((count, len(_FEET))) if static is None else static)[1:]),
         anchored=jnp.asarray(filled(np.zeros(count) if anchored is None else anchored)),
         height=jnp.asarray([height or 0.0, height is not None], jnp.float32),
         tall=jnp.asarray(tall, jnp.float32),
@@ -388,7 +390,7 @@ def _smoother(fps: float) -> Float[np.ndarray, "w w"]:
     """S of a window."""
     third = np.diff(np.eye(WINDOW), n=3, axis=0)
     values, vectors = np.linalg.eigh(third.T @ third)
-    weight = (KEYPOINT_METRES * fps**3 / JERK) ** 2
+    weight = (_PRIOR.keypoint * fps**3 / _JERK) ** 2
     return (vectors / np.sqrt(1 + weight * np.maximum(values, 0))) @ vectors.T
 
 
@@ -408,8 +410,10 @@ def _solved(
     origins = jax.vmap(lambda pose: replace(origin, pose=pose))(starts)
     begun = jax.vmap(lambda own, pose: state_of(own, window.betas, pose))(origins, window.poses)
     begun = replace(begun, betas=window.betas)
-    heavy = np.asarray([name in SMOOTH for name in model.joint_names])
-    feet = np.asarray([model.names.index(name) for name in FEET])
+    # joints whose accelerations and jerk are expected: the body's, and the last of each finger
+    expected = {*BODY_NAMES, *(f"{side}_{each}3" for side in ("left", "right") for each in FINGERS)}
+    heavy = np.asarray([name in expected for name in model.joint_names])
+    feet = np.asarray([model.names.index(name) for name in _FEET])
 
     def smooth(state: FitState) -> FitState:
         """x = begun + S u."""
@@ -440,19 +444,19 @@ def _solved(
         second = accelerations(joints[:, heavy]) * times[1:] * window.rate**2
         third = jnp.diff(second, axis=0) * window.rate
         slack = window.scales[1]
-        found["acceleration"] = robust(second / (ACCELERATION * slack), ROBUST_SCALE)
-        found["jerk"] = robust(third * times[2:] / (JERK * slack), ROBUST_SCALE)
+        found["acceleration"] = robust(second / (_ACCELERATION * slack), _PRIOR.robust_scale)
+        found["jerk"] = robust(third * times[2:] / (_JERK * slack), _PRIOR.robust_scale)
         # feet that stand still
-        steps = jnp.diff(landmarks[:, feet], axis=0) * window.rate / HELD_SPEED
-        found["feet"] = robust(jnp.sqrt(window.held)[..., None] * steps, ROBUST_SCALE)
+        steps = jnp.diff(landmarks[:, feet], axis=0) * window.rate / _PRIOR.held_speed
+        found["feet"] = robust(jnp.sqrt(window.held)[..., None] * steps, _PRIOR.robust_scale)
         # frames that another window has solved
         found["anchor"] = []
         for name in ("global_orient", "transl", "body_pose"):
             moved = getattr(state, name) - getattr(begun, name)
-            weights = (ANCHOR * window.anchored).reshape(-1, *[1] * (moved.ndim - 1))
+            weights = (_PRIOR.anchor * window.anchored).reshape(-1, *[1] * (moved.ndim - 1))
             found["anchor"].append(weights * moved)
         tall = window.tall[0] + jnp.sum(window.tall[1:] * state.betas)
-        found["height"] = window.height[1] * (tall - window.height[0]) / HEIGHT_STD
+        found["height"] = window.height[1] * (tall - window.height[0]) / _PRIOR.height
         return found
 
     none = jax.tree.map(jnp.zeros_like, begun)
@@ -462,15 +466,15 @@ def _solved(
 
 
 def _descended(loss: Callable[[FitState], Float[Array, ""]], start: Any) -> FitState:
-    """Where Adam gets in `STEPS` steps, whose length falls to 0 (cosine)."""
-    optimizer = optax.adam(optax.cosine_decay_schedule(STEP_LENGTH, STEPS), b1=0.9, b2=0.95)
+    """Where Adam gets in `_STEPS` steps, whose length falls to 0 (cosine)."""
+    optimizer = optax.adam(optax.cosine_decay_schedule(_STEP_LENGTH, _STEPS), b1=0.9, b2=0.95)
 
     def step(carry, _):
         unknowns, memory = carry
         updates, memory = optimizer.update(jax.grad(loss)(unknowns), memory)
         return (optax.apply_updates(unknowns, updates), memory), None
 
-    (found, _), _ = jax.lax.scan(step, (start, optimizer.init(start)), length=STEPS)
+    (found, _), _ = jax.lax.scan(step, (start, optimizer.init(start)), length=_STEPS)
     return found
 
 
@@ -491,7 +495,7 @@ def _landmarks(
 
 
 def _feet(model: LandmarkModel, landmarks: Float[Array, "m k 3"]) -> Float[np.ndarray, "m f 3"]:
-    return np.asarray(landmarks)[:, [model.names.index(name) for name in FEET]]
+    return np.asarray(landmarks)[:, [model.names.index(name) for name in _FEET]]
 
 
 def _static_feet(
@@ -502,7 +506,9 @@ def _static_feet(
     moved = np.diff(_feet(model, points), axis=0, prepend=np.nan) * fps
     moved[..., 2] /= 2  # depths of a single camera are unsteady
     speed = np.nan_to_num(np.linalg.norm(moved, axis=-1), nan=np.inf)
-    slow, fast = STATIC_SPEEDS
+    # metres a second: a point that is slower than the first stands still, one that is faster than
+    # the second moves
+    slow, fast = 0.25, 0.5
     return np.clip((fast - speed) / (fast - slow), 0, 1)
 
 
@@ -528,7 +534,9 @@ def _standing(
     up = np.average(upwards, axis=0, weights=weights)
     up /= max(np.linalg.norm(up), 1e-9)
     turn = Rotation.identity()
-    if np.degrees(np.arccos(np.clip(up[1], -1, 1))) < MOST_TILT:
+    # beyond 50 degrees from the camera's upright people are taken to lie, and the camera to be
+    # level
+    if np.degrees(np.arccos(np.clip(up[1], -1, 1))) < 50.0:
         turn = Rotation.align_vectors([[0.0, 1, 0]], [up])[0]
     rotations = np.asarray(poses.rotations, np.float64).copy()
     rotations[:, 0] = (turn * Rotation.from_rotvec(rotations[:, 0])).as_rotvec()

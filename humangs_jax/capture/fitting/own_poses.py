@@ -3,7 +3,7 @@ explains.
 
 Whoever turns before a camera moves head, arms and legs by centimetres. Between "one moment" and
 "each photo its own moment" lies this: one shape, one set of cameras, and in each photo a pose that
-starts at the shared one and stays near it (`STD`, `BY_JOINT`). Photos of a video follow each other:
+starts at the shared one and stays near it (`CONFIG`). Photos of a video follow each other:
 their deviations x_i from the shared pose, in standard deviations, are a process of Ornstein and
 Uhlenbeck, where x_{i+1} - r x_i has the variance 1 - r^2, with r = exp(-t / MEMORY) for photos that
 are t seconds apart.
@@ -20,9 +20,9 @@ import jax
 import numpy as np
 
 from humangs_jax.capture.fitting.files import FitRecord
-from humangs_jax.capture.fitting.refine import (
+from humangs_jax.capture.fitting.silhouette_fit import (
     RefinedCapture,
-    Scene,
+    SilhouetteFit,
     moved_capture,
     posed_vertices,
     refine_capture,
@@ -35,25 +35,23 @@ from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 
-BY_JOINT = (
-    ("spine", 0.5),
-    ("hip", 0.6),
-    ("collar", 0.6),
-    ("foot", 0.6),
-    ("head", 1.2),
-    ("wrist", 1.2),
-)
-"""How much joints turn whose names hold a word, multiples of `StateStd.body_pose`: hands and heads
-most, the trunk least."""
-STD = StateStd(body_pose=8.0, global_orient=3.0, transl=0.03, betas=0.1)
-"""Degrees and metres by which somebody who means to stand still moves; the shape hardly changes."""
 CONFIG = dataclasses.replace(
-    usual_config(fitted=True, fixed_cameras=True), std=STD, by_joint=BY_JOINT
+    usual_config(fitted=True, fixed_cameras=True),
+    # degrees and metres by which somebody who means to stand still moves; the shape hardly changes
+    std=StateStd(body_pose=8.0, global_orient=3.0, transl=0.03, betas=0.1),
+    # hands and heads turn most, the trunk least
+    by_joint=(
+        ("spine", 0.5),
+        ("hip", 0.6),
+        ("collar", 0.6),
+        ("foot", 0.6),
+        ("head", 1.2),
+        ("wrist", 1.2),
+    ),
 )
+"""Settings of poses that stay near the one that photos share."""
 MEMORY = 2.0
 """Seconds after which a body that sways has forgotten most of where it was."""
-BLIND_ROUNDS = 3
-"""Rounds of the fit to keypoints alone, which has nothing to match anew."""
 LEAST_GAIN = 0.002
 """Least rise of the silhouettes' IoU, through poses that know keypoints alone, that shows a
 movement. Synthetic people whose photos are of one moment lose 0.012, with joints bent by 2 degrees
@@ -85,14 +83,11 @@ def find_movement(
         seconds: when each photo of a video was taken, rising; None: photos in no order.
     """
     start = with_own_poses(capture)
-    judge = Scene(start, keypoints, CONFIG)
+    judge = SilhouetteFit.of(start, keypoints, CONFIG)
     unmasked = dataclasses.replace(start, masks=None)
-    blind = Scene(
-        unmasked,
-        keypoints,
-        dataclasses.replace(CONFIG, iterations=BLIND_ROUNDS),
-        _memory(seconds),
-    )
+    # three rounds: a fit to keypoints alone has nothing to match anew
+    config = dataclasses.replace(CONFIG, iterations=3)
+    blind = SilhouetteFit.of(unmasked, keypoints, config, _memory(seconds))
     tried = moved_capture(start, blind.origin, blind.run()[0])
     ious = [judge.score(each).iou for each in (start, tried)]
     return Movement(*(np.nan if iou is None else iou for iou in ious))

@@ -12,11 +12,11 @@ What is minimised is half the square sum of these residuals, with X = R_v L_k, p
 
     pixels  sqrt(w) rho((f_v u - x) / noise_v)       rho(q) = q s / sqrt(s^2 + |q|^2), Geman and
                                                      McClure
-    world   sqrt(w) (X - mean_v(X) - W) / WORLD      W: the detector's 3D landmarks; means are
+    world   sqrt(w) (X - mean_v(X) - W) / std        W: the detector's 3D landmarks; means are
                                                      weighted by w
-    size    (log r(X) - log r(W)) / SIZE             r: the root of all views' weighted mean square
+    size    (log r(X) - log r(W)) / std              r: the root of all views' weighted mean square
                                                      distances from the mean
-    bones   (|left bone| - |right bone|) / BONES
+    bones   (|left bone| - |right bone|) / std       each kind has its own std, see `STD`
     focal   y_g, with f_v = f0_v exp(std_v y_g)      one y for each kind of camera
 
 A pixel depends on one landmark, one camera and one y. So the landmarks are eliminated (Schur
@@ -36,36 +36,39 @@ from humangs_jax.core.array_types import Float, Int
 
 NEAR = 0.05
 """Metres: depths are clamped to at least this."""
-WORLD = 0.15
-"""Std of the detector's 3D landmarks, metres, shared errors included: pixels decide where several
-views see them.
-"""
-BONES = 0.01
-"""Std of the difference of left and right bones, metres."""
-SIZE = 0.01
-"""Std of the logarithm of the person's size against the detector's 3D landmarks: what keeps the
-scale.
-"""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Std:
+    """Standard deviations of what is known besides the pixels."""
+
+    world: float = 0.15
+    """Of the detector's 3D landmarks, metres, shared errors included: pixels decide where several
+    views see them."""
+    bones: float = 0.01
+    """Of the difference of left and right bones, metres."""
+    size: float = 0.01
+    """Of the logarithm of the person's size against the detector's 3D landmarks: what keeps the
+    scale."""
+
+
+STD = _Std()
+
+
 ROBUST_SCALES = (40.0, 6.0)
 """Robust scales of pixels, standard deviations, one search after the other: the start is off by
 tens of them.
 """
-STEPS = 60
-"""Steps of Levenberg and Marquardt for each robust scale, at most, rejected ones included."""
 EXACT = 1e-9
 """Relative decrease of the cost that ends the search for a result."""
 COARSE = 1e-3
 """Relative decrease of the cost that ends the search where costs are only compared."""
-DAMPING = 1e-3
-"""Share of the diagonal of the normal equations that is added to it at first."""
-STILL = 1e-6
-"""Added to that diagonal: what no residual moves stays where it is."""
-FURTHEST = 5.0
+_STILL = 1e-6
+"""Added to the diagonal of the normal equations: what no residual moves stays where it is."""
+_FURTHEST = 5.0
 """Largest logarithm of the change of a depth in one step, and of a focal length in all, as
 multiples of e.
 """
-ALTERNATIONS = 20
-"""Alternations of turns and mean shape: a mean of ten photos is still by then."""
 VIEW = 9
 """Unknowns of a view: turn, place, and the mean of its turned landmarks."""
 
@@ -125,13 +128,14 @@ def align_views(
     if len(worlds) == 1:
         return shape, rotations
     total = np.maximum(weights.sum(0), 1e-9)[:, None]
-    for _ in range(ALTERNATIONS):
-        rotations = turns_onto(shape, worlds, weights)
+    # alternations of turns and mean shape: a mean of ten photos is still by then
+    for _ in range(20):
+        rotations = _turns_onto(shape, worlds, weights)
         shape = np.einsum("ck,cba,ckb->ka", weights, rotations, worlds) / total
     return shape, rotations
 
 
-def turns_onto(
+def _turns_onto(
     shape: Float[np.ndarray, "k 3"],
     worlds: Float[np.ndarray, "c k 3"],
     weights: Float[np.ndarray, "c k"],
@@ -234,11 +238,13 @@ def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
     def log_radius(points: Float[np.ndarray, "c k 3"]) -> float:
         return 0.5 * np.log(np.sum(share * points**2) + 1e-12)
 
-    size = (log_radius(centered) - log_radius(evidence.world)) / SIZE
+    size = (log_radius(centered) - log_radius(evidence.world)) / STD.size
     lengths = np.linalg.norm(_bones(evidence, rig), axis=-1)
     return Rows(
-        seen=np.concatenate([root * errors, root * (centered - evidence.world) / WORLD], axis=-1),
-        tied=np.append(size, (lengths[:, 0] - lengths[:, 1]) / BONES),
+        seen=np.concatenate(
+            [root * errors, root * (centered - evidence.world) / STD.world], axis=-1
+        ),
+        tied=np.append(size, (lengths[:, 0] - lengths[:, 1]) / STD.bones),
         focal=_factors(evidence, rig),
     )
 
@@ -275,7 +281,7 @@ def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
 
     # a view's mean is an unknown, so the world residual depends on turn and mean, and not on place
     pixels = by_error @ by_point
-    world = np.broadcast_to(root * np.eye(3) / WORLD, (c, k, 3, 3))
+    world = np.broadcast_to(root * np.eye(3) / STD.world, (c, k, 3, 3))
     none = np.zeros((c, k, 2, 3))
     zoom = evidence.focal_std[:, None, None] * (pixel_errors(evidence, rig) + evidence.points)
     by_focal = np.concatenate([(by_error @ zoom[..., None])[..., 0], np.zeros((c, k, 3))], axis=-1)
@@ -302,10 +308,10 @@ def _tied(
     share = _shares(evidence)
     centered = turned - np.sum(share * turned, axis=1, keepdims=True)
     square = np.sum(share * centered**2) + 1e-12
-    size = np.sum((share * centered) @ rig.rotations, axis=0) / square / SIZE
+    size = np.sum((share * centered) @ rig.rotations, axis=0) / square / STD.size
     bones = np.zeros((len(evidence.bones), *rig.landmarks.shape))
     vectors = _bones(evidence, rig)
-    unit = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9) / BONES
+    unit = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9) / STD.bones
     rows = np.arange(len(bones))
     for side, sign in ((0, 1.0), (1, -1.0)):
         bones[rows, evidence.bones[:, side, 0]] += sign * unit[:, side]
@@ -361,7 +367,7 @@ class Step:
 def moved(evidence: Evidence, rig: Rig, step: Step) -> Rig:
     """A rig after a step."""
     turns, sideways = step.views[:, :3], step.views[:, 3:5]
-    deeper = np.clip(step.views[:, 5:6], -FURTHEST, FURTHEST)
+    deeper = np.clip(step.views[:, 5:6], -_FURTHEST, _FURTHEST)
     depth = rig.places[:, 2:] * np.exp(deeper)  # never behind the camera
     factors = (_factors(evidence, rig) + step.focal)[evidence.kinds]
     aside = (rig.places[:, :2] / rig.places[:, 2:] + sideways) * depth
@@ -369,7 +375,7 @@ def moved(evidence: Evidence, rig: Rig, step: Step) -> Rig:
         landmarks=rig.landmarks + step.landmarks,
         rotations=Rotation.from_rotvec(turns).as_matrix() @ rig.rotations,
         places=np.concatenate([aside, depth], axis=1),
-        focal=evidence.focal * np.exp(np.clip(evidence.focal_std * factors, -FURTHEST, FURTHEST)),
+        focal=evidence.focal * np.exp(np.clip(evidence.focal_std * factors, -_FURTHEST, _FURTHEST)),
     )
 
 
@@ -398,8 +404,10 @@ def _descend(evidence: Evidence, rig: Rig, scale: float, tolerance: float) -> tu
     """
     rows = residuals(evidence, rig, scale)
     normal = normal_equations(evidence, rows, derivatives(evidence, rig, scale))
-    damping, growth = DAMPING, 2.0
-    for _ in range(STEPS):
+    # the share of the diagonal of the normal equations that is added to it at first
+    damping, growth = 1e-3, 2.0
+    # steps of Levenberg and Marquardt at most, rejected ones included
+    for _ in range(60):
         step, expected = solve(normal, damping)
         trial = moved(evidence, rig, step)
         after = residuals(evidence, trial, scale)
@@ -501,8 +509,8 @@ def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
     # the damped blocks, named as above
     k, ties, m = len(normal.landmarks), len(normal.tied_rows), len(normal.by_cameras)
     diagonal = np.einsum("kaa->ka", normal.landmarks)
-    damped = damping * diagonal + STILL
-    damped_cameras = damping * np.diag(normal.cameras) + STILL
+    damped = damping * diagonal + _STILL
+    damped_cameras = damping * np.diag(normal.cameras) + _STILL
     D = normal.landmarks + damped[..., None] * np.eye(3)
     F = np.concatenate([normal.between, np.moveaxis(normal.tied, 0, 2)], axis=2)
     K = np.zeros((m + ties, m + ties))

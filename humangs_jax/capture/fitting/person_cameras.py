@@ -37,22 +37,30 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
 
-LEVEL = 4.0
-"""Standard deviation of the roll of a camera, degrees."""
-UPRIGHT = 15.0
-"""Standard deviation of the lean of a body, degrees."""
-BONES_STD = 0.01
-"""Metres by which joints may differ from those of a scaled person."""
-STATURE_STD = 0.001
-"""Metres by which the stature may differ from that of a scaled person."""
-STATURE = 1.52
-"""Stature over trunk, thigh and shin together, of the shipped body's mean person."""
-SHARES = {("shoulder", "hip"): 0.36, ("hip", "knee"): 0.315, ("knee", "ankle"): 0.325}
+
+@dataclasses.dataclass(frozen=True)
+class _Std:
+    """Standard deviations of what places the person in the world."""
+
+    level: float = 4.0
+    """Of the roll of a camera, degrees."""
+    upright: float = 15.0
+    """Of the lean of a body, degrees."""
+    bones: float = 0.01
+    """Of joints from those of a scaled person, metres."""
+    stature: float = 0.001
+    """Of the stature from that of a scaled person, metres."""
+
+
+_STD = _Std()
+
+
+_SHARES = {("shoulder", "hip"): 0.36, ("hip", "knee"): 0.315, ("knee", "ankle"): 0.325}
 """Shares of trunk, thigh and shin in their sum, of the same person: what of it a photo does not
 show."""
-LEAST_TRUNK = 2
+_LEAST_TRUNK = 2
 """Landmarks of shoulders and hips, of the four, without which a photo says nothing of a pose."""
-TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
+_TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -168,12 +176,12 @@ def _check(seen: PersonViews, height: float | None) -> None:
 
 def _little_shown(seen: PersonViews) -> dict[int, str]:
     """The views that show too little of the person for a pose, and why."""
-    trunk = [seen.names.index(name) for name in TRUNK if name in seen.names]
+    trunk = [seen.names.index(name) for name in _TRUNK if name in seen.names]
     found = {}
     for view, known in enumerate(known_landmarks(seen)):
         if known.sum() < FEWEST:
             found[view] = _few_landmarks(int(known.sum()))
-        elif len(trunk) == len(TRUNK) and known[trunk].sum() < LEAST_TRUNK:
+        elif len(trunk) == len(_TRUNK) and known[trunk].sum() < _LEAST_TRUNK:
             found[view] = "neither shoulders nor hips are seen in it"
     return found
 
@@ -223,7 +231,7 @@ def _in_world(
     body = body / np.linalg.norm(body)
     # y up: across the images' x axes, and along the body; least squares of both
     level = rotations[:, 0]  # images' x axes: horizontal if the cameras are level
-    precision = level.T @ level / LEVEL**2 + np.eye(3) / UPRIGHT**2
+    precision = level.T @ level / _STD.level**2 + np.eye(3) / _STD.upright**2
     up = np.linalg.solve(precision, body)
     up /= np.linalg.norm(up)
     # x to the person's left, horizontal; z is then to the front
@@ -235,14 +243,16 @@ def _in_world(
     world_from_rig = np.stack([left, up, np.cross(left, up)])
     # metres: the stature is estimated from the lengths of trunk and legs
     lengths = _lengths(known, names)
-    shares = sum(SHARES[part] for part in lengths)
+    shares = sum(_SHARES[part] for part in lengths)
     total = sum(lengths.values()) / shares if lengths else 0.0
-    scale = 1.0 if height is None or not lengths else height / (STATURE * total)
+    # the stature over the sum, of the shipped body's mean person
+    stature = 1.52
+    scale = 1.0 if height is None or not lengths else height / (stature * total)
     # the origin under the hips, on the lowest landmark, or below the lowest joint that is seen by
     # the length of the parts that are not
     turned = scale * points @ world_from_rig.T
     middle = scale * world_from_rig @ shown.get("hip", known.mean(axis=0))
-    unseen = sum(share for (_, end), share in SHARES.items() if end not in shown)
+    unseen = sum(share for (_, end), share in _SHARES.items() if end not in shown)
     heights = scale * known @ up
     joints = [scale * place @ up for place in shown.values()]
     ground = min(heights.min(), min(joints, default=np.inf) - scale * total * unseen)
@@ -265,7 +275,7 @@ def _lengths(
 ) -> dict[tuple[str, str], float]:
     """The lengths of those of trunk, thigh and shin whose ends are among the names."""
     found = {}
-    for first, last in SHARES:
+    for first, last in _SHARES:
         if first == "shoulder":
             length = np.linalg.norm(
                 middle_of(points, names, first) - middle_of(points, names, last)
@@ -316,13 +326,13 @@ def scaled_to_height(capture: Capture, height: float) -> Capture:
         "jn,nas->jas", np.asarray(capture.body.joint_regressor, np.float64), directions
     )
     rows = [
-        (bones - bones[:1]).reshape(-1, len(betas)) / BONES_STD,
-        (directions[top, 1] - directions[bottom, 1])[None] / STATURE_STD,
+        (bones - bones[:1]).reshape(-1, len(betas)) / _STD.bones,
+        (directions[top, 1] - directions[bottom, 1])[None] / _STD.stature,
         np.eye(len(betas)),
     ]
     wanted = [
-        (scale - 1) * (joints - joints[:1]).ravel() / BONES_STD,
-        [(height - float(heights[top] - heights[bottom])) / STATURE_STD],
+        (scale - 1) * (joints - joints[:1]).ravel() / _STD.bones,
+        [(height - float(heights[top] - heights[bottom])) / _STD.stature],
         np.zeros(len(betas)),
     ]
     betas = betas + np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]

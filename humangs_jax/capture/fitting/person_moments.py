@@ -36,7 +36,7 @@ USUAL_FOCAL = 29.0
 """Focal length of a telephone's main camera, mm, 35-mm equivalent."""
 USUAL_STD = 0.2
 """Standard deviation of the logarithm of a focal length that is supposed."""
-EXIF_STD = 0.03
+_EXIF_STD = 0.03
 """Standard deviation of the logarithm of a focal length that EXIF says."""
 SEEN = 0.1
 """Least visibility of a landmark that counts."""
@@ -44,38 +44,45 @@ FEWEST = 6
 """Least number of such landmarks in a photo."""
 SMALLEST = 16.0
 """Pixels: a person who is smaller in a photo is a point."""
-LEAST_ANGLE = 4.0
-"""Degrees between the directions from which photos see the person; below it they are taken one by
-one.
-"""
-CLEARLY = 0.7
-"""A view is mirrored if the cost is then less than this share of what it is without."""
-ONE_MOMENT = 0.02
-"""Rms distance of the landmarks from the person's points, a share of the person's size in the
-photo, up to which the photos show one moment. Measured on a man in a laboratory: 7 moments, four
-cameras each, 0.007 to 0.014; photos of several moments 0.045 to 0.073, with one photo of another
-moment among four 0.033."""
-DOUBTFUL = 0.012
-"""The same distance above which mirrorings are also tried from the other end, all views mirrored.
-Detections of one moment with an error of 3 pixels of 900 leave 0.004 to 0.007, a mirrored view 0.02
-and more."""
-FEWEST_WITHOUT = 4
-"""Photos from which on one may be left out because it contradicts the others."""
-MOMENT_WITHOUT = 0.015
-"""The distance of `ONE_MOMENT` up to which the others are then of one moment: three of four photos
-of several moments leave 0.021 or more.
-"""
-FAR = 0.2
-"""Share of the person's size; errors above count as this one."""
-DECIDING = 8
-"""Photos that decide between one moment and several, at most; others are compared with what these
-say.
-"""
-ANOTHER_MOMENT = 0.03
-"""Rms distance of the landmarks of one such photo, a share of the person's size, above which it
-shows another moment.
-"""
-BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
+
+
+@dataclasses.dataclass(frozen=True)
+class _OneMoment:
+    """When photos are of one moment. Distances are rms over the person's size in the photo."""
+
+    most_error: float = 0.02
+    """Rms distance of the landmarks from the person's points, a share of the person's size in the
+    photo, up to which the photos show one moment. Measured on a man in a laboratory: 7 moments,
+    four cameras each, 0.007 to 0.014; photos of several moments 0.045 to 0.073, with one photo of
+    another moment among four 0.033."""
+    doubtful: float = 0.012
+    """The same distance above which mirrorings are also tried from the other end, all views
+    mirrored. Detections of one moment with an error of 3 pixels of 900 leave 0.004 to 0.007, a
+    mirrored view 0.02 and more."""
+    without_one: float = 0.015
+    """The distance of `most_error` up to which the others are then of one moment: three of four
+    photos of several moments leave 0.021 or more."""
+    fewest: int = 4
+    """Photos from which on one may be left out because it contradicts the others."""
+    other: float = 0.03
+    """Rms distance of the landmarks of one such photo, a share of the person's size, above which it
+    shows another moment."""
+    deciding: int = 8
+    """Photos that decide between one moment and several, at most; others are compared with what
+    these say."""
+    mirrored: float = 0.7
+    """A view is mirrored if the cost is then less than this share of what it is without."""
+    least_angle: float = 4.0
+    """Degrees between the directions from which photos see the person; below it they are taken one
+    by one."""
+    far: float = 0.2
+    """Share of the person's size; errors above count as this one."""
+
+
+ONE_MOMENT = _OneMoment()
+
+
+_BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
 """Ends of the bones whose left and right have one length."""
 
 
@@ -156,7 +163,7 @@ class Trial:
     def of_view(self, view: int) -> float:
         """Rms distance of the landmarks of one photo, a share of the person's size in it."""
         seen = self.evidence.weights[view] > SEEN
-        return float(np.sqrt(np.mean(np.minimum(self._shares[view][seen], FAR) ** 2)))
+        return float(np.sqrt(np.mean(np.minimum(self._shares[view][seen], ONE_MOMENT.far) ** 2)))
 
     @property
     def _shares(self) -> Float[np.ndarray, "c k"]:
@@ -189,9 +196,9 @@ def explain(seen: PersonViews) -> Explanation:
     # a few photos decide
     chosen = _different(seen)
     trial, views = best_trial(seen.select(chosen)), chosen
-    if trial.error > ONE_MOMENT and len(chosen) >= FEWEST_WITHOUT:
+    if trial.error > ONE_MOMENT.most_error and len(chosen) >= ONE_MOMENT.fewest:
         trial, views = _without_one(seen, chosen) or (trial, chosen)
-    if trial.error > ONE_MOMENT:
+    if trial.error > ONE_MOMENT.most_error:
         return Explanation(None, every)
 
     # the others have to agree, but for one
@@ -199,18 +206,18 @@ def explain(seen: PersonViews) -> Explanation:
         trial, views = _with_others(
             seen, trial, views, [view for view in every if view not in chosen]
         )
-    if len(views) < len(every) - 1 or trial.error > ONE_MOMENT:
+    if len(views) < len(every) - 1 or trial.error > ONE_MOMENT.most_error:
         return Explanation(None, every)
 
     # from one side the landmarks of one photo decide nothing about the others
     angle = _angle(trial.rig)
-    if len(every) > 1 and angle < LEAST_ANGLE:
+    if len(every) > 1 and angle < ONE_MOMENT.least_angle:
         which = ", ".join(seen.photos[view] for view in views)
         if len(views) == len(every):
             which = "all photos"
         side = (
             f"{which} are from one side (directions differ by {angle:.1f} degrees, expected"
-            f" {LEAST_ANGLE:.0f} or more)"
+            f" {ONE_MOMENT.least_angle:.0f} or more)"
         )
         return Explanation(None, every, (f"{side}: each photo stands for itself",))
 
@@ -229,10 +236,10 @@ def _without_one(
         for rest in under_bar(rests, "cameras without one photo")
     ]
     best = int(np.argmin([trial.error for trial in trials]))
-    if trials[best].error >= MOMENT_WITHOUT:
+    if trials[best].error >= ONE_MOMENT.without_one:
         return None
     found = best_trial(seen.select(rests[best]))
-    return (found, rests[best]) if found.error <= ONE_MOMENT else None
+    return (found, rests[best]) if found.error <= ONE_MOMENT.most_error else None
 
 
 def _with_others(
@@ -246,23 +253,23 @@ def _with_others(
         pair = seen.select([*views, view])
         tries = [_try(pair, np.append(trial.mirrored, flip)) for flip in (False, True)]
         best = min(tries, key=lambda each: each.cost)
-        if best.of_view(-1) < ANOTHER_MOMENT:
+        if best.of_view(-1) < ONE_MOMENT.other:
             mirrored[view] = bool(best.mirrored[-1])
     used = tuple(sorted(mirrored))
     return _polished(_try(seen.select(used), np.asarray([mirrored[view] for view in used]))), used
 
 
 def _different(seen: PersonViews) -> tuple[int, ...]:
-    """Up to `DECIDING` photos, from sides that differ: always the one that is farthest from all
-    that were chosen.
+    """The photos that decide, from sides that differ: always the one that is farthest from all that
+    were chosen.
     """
     count = len(seen.photos)
-    if count <= DECIDING:
+    if count <= ONE_MOMENT.deciding:
         return tuple(range(count))
     _, start = evidence_of(seen, np.zeros(count, bool))
     towards = _directions(start)
     chosen = [int(np.argmax(seen.visibility.sum(1)))]
-    while len(chosen) < DECIDING:
+    while len(chosen) < ONE_MOMENT.deciding:
         nearest = np.max(towards @ towards[chosen].T, axis=1)
         nearest[chosen] = np.inf
         chosen.append(int(np.argmin(nearest)))
@@ -284,7 +291,7 @@ def best_trial(seen: PersonViews) -> Trial:
     found = _try(seen, np.zeros(views, bool))
     if views > 1:
         found = _least(seen, found)
-        if found.error > DOUBTFUL:
+        if found.error > ONE_MOMENT.doubtful:
             other = _least(seen, _try(seen, np.ones(views, bool)))
             found = min(found, other, key=lambda each: each.cost)
         shown = np.any(known_landmarks(seen), axis=0)
@@ -300,7 +307,7 @@ def _least(seen: PersonViews, start: Trial) -> Trial:
         flips = [start.mirrored ^ (views == v) for v in views]
         trials = [_try(seen, flip) for flip in under_bar(flips, "cameras with a view mirrored")]
         best = min(trials, key=lambda each: each.cost)
-        if not best.cost < CLEARLY * start.cost:
+        if not best.cost < ONE_MOMENT.mirrored * start.cost:
             return start
         start = best
 
@@ -325,7 +332,8 @@ def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray,
     numbers = 2 * (weights > SEEN).sum()
     left = max(numbers - 3 * shown.sum() - 6 * views + 7, numbers / 4)
     # as many far outliers as a detector has count no more than near ones
-    return float(np.sqrt(np.sum((weights > SEEN) * np.minimum(errors, FAR) ** 2) / left))
+    near = np.minimum(errors, ONE_MOMENT.far)
+    return float(np.sqrt(np.sum((weights > SEEN) * near**2) / left))
 
 
 def _angle(rig: Rig) -> float:
@@ -358,7 +366,7 @@ def _focal_lengths(
     usual = USUAL_FOCAL / DIAGONAL_35MM
     if known.any():
         usual = np.median((seen.focal / diagonals)[known])
-    std = np.where(known, EXIF_STD, USUAL_STD)
+    std = np.where(known, _EXIF_STD, USUAL_STD)
     cameras = [
         () if own else tuple(sorted(size)) for own, size in zip(known, seen.sizes, strict=True)
     ]
@@ -411,7 +419,7 @@ def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Ev
 
 def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
     rows = []
-    for a, b in BONES:
+    for a, b in _BONES:
         ends = [[f"{side}_{a}", f"{side}_{b}"] for side in ("left", "right")]
         if all(name in names for side in ends for name in side):
             rows.append([[names.index(name) for name in side] for side in ends])

@@ -20,18 +20,39 @@ from humangs_jax.core.progress import text_table
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import few
 
-ROWS = 24
-"""Views in the printed table; of more, those that fit worst."""
-NAMED = 5
-"""Items that are listed by name; the others are counted."""
-LABELS = {
+
+@dataclasses.dataclass(frozen=True)
+class _Worth:
+    """What in a fit is worth a line."""
+
+    outliers: float = 0.3
+    """Share of the keypoints of a view: fits tolerate more, but a detector that errs this often saw
+    something else."""
+    off: float = 4.0
+    """Multiple of the expected noise: a view with this median error, 2 % of the person's height,
+    shows another pose or camera."""
+    beyond_limit: float = np.rad2deg(0.05)
+    """Degrees beyond a joint's limit that are no violation: limits are rough."""
+    far_beyond: float = 10.0
+    """Degrees beyond a joint's limit from which on there is a warning."""
+    std: float = 0.03
+    """Metres: a joint whose std exceeds this is undetermined."""
+    determined: float = 0.1
+    """A joint of whose rotation a smaller share is determined is undetermined: a mean over axes, of
+    which knees and fingers have one that turns."""
+    named: int = 5
+    """Items that are listed by name; the others are counted."""
+    rows: int = 24
+    """Views in the printed table; of more, those that fit worst."""
+
+
+WORTH_A_LINE = _Worth()
+
+
+_LABELS = {
     "keypoint_error_px": ("keypoints, median error", "{:.2f} px"),
     "silhouette_iou": ("silhouette IoU", "{:.3f}"),
     "loss": ("loss", "{:.4f}"),
-    "scan_outside_median_mm": ("scan outside of the skin, median", "{:.1f} mm"),
-    "scan_outside_5_mm": ("scan outside of the skin, 5 % below", "{:.1f} mm"),
-    "scan_outside_95_mm": ("scan outside of the skin, 95 % below", "{:.1f} mm"),
-    "scan_near_body": ("share of the scan near the body", "{:.0%}"),
 }
 """How errors are printed."""
 
@@ -87,14 +108,12 @@ class Violation:
 class FitReport:
     """What came of a fit."""
 
-    fitted: Literal["keypoints", "refinement", "scan"]
+    fitted: Literal["keypoints", "refinement"]
     """What the body was fitted to."""
     kept: bool = True
     """False if the start was better and stays."""
-    start: str = ""
-    """Where a fit to a scan began: "landmarks" or "search"."""
     errors: dict[str, Change] = dataclasses.field(default_factory=dict)
-    """Errors by name, see `LABELS`."""
+    """Errors by name, see `_LABELS`."""
     views: tuple[ViewReport, ...] = ()
     """A row for each view."""
     moved: dict[str, float] = dataclasses.field(default_factory=dict)
@@ -123,7 +142,7 @@ class FitReport:
         """A table of views, then errors, notes and warnings."""
         lines = _view_rows(self.views) if self.views else []
         for key, change in self.errors.items():
-            label, form = LABELS[key]
+            label, form = _LABELS[key]
             start = "" if change.before is None else f"{form.format(change.before)} -> "
             lines.append(f"{label}: {start}{form.format(change.after)}")
         lines += self.notes
@@ -145,7 +164,7 @@ def _plain(value: Any) -> Any:
 def _view_rows(views: Sequence[ViewReport]) -> list[str]:
     # of many views only those that fit worst, in their order
     errors = [view.median if view.iou_after is None else 1 - view.iou_after for view in views]
-    worst = np.argsort(-np.nan_to_num(errors, nan=np.inf), kind="stable")[:ROWS]
+    worst = np.argsort(-np.nan_to_num(errors, nan=np.inf), kind="stable")[: WORTH_A_LINE.rows]
     masks = views[0].iou_after is not None
     rows = [["view", "keypoints", "median error", "90 % below", "outliers"]]
     if masks:
@@ -162,38 +181,20 @@ def _view_rows(views: Sequence[ViewReport]) -> list[str]:
             rows.append([view.name, "no mask"])
     # views that are not shown are counted
     lines = text_table(rows)
-    if len(views) > ROWS:
-        lines.append(f"...  {len(views) - ROWS} more that fit better")
+    if len(views) > WORTH_A_LINE.rows:
+        lines.append(f"...  {len(views) - WORTH_A_LINE.rows} more that fit better")
     return lines
 
 
 # What points to a mistake
 # --------------------------------------------------------------------------------------------
 
-MANY_OUTLIERS = 0.3
-"""Share of the keypoints of a view: fits tolerate more, but a detector that errs this often saw
-something else.
-"""
-OFF = 4.0
-"""Multiple of the expected noise: a view with this median error, 2 % of the person's height, shows
-another pose or camera.
-"""
-SLIGHTLY_BEYOND = np.rad2deg(0.05)
-"""Degrees beyond a joint's limit that are no violation: limits are rough."""
-FAR_BEYOND = 10.0
-"""Degrees beyond a joint's limit from which on there is a warning."""
-UNSURE = 0.03
-"""Metres: a joint whose std exceeds this is undetermined."""
-UNDECIDED = 0.1
-"""A joint of whose rotation a smaller share is determined is undetermined: a mean over axes, of
-which knees and fingers have one that turns.
-"""
 
 _FINGERS = {
     side: [f"{side}_{finger}{i}" for finger in FINGERS for i in (1, 2, 3)]
     for side in ("left", "right")
 }
-GROUPS = {
+_GROUPS = {
     "left hand": _FINGERS["left"],
     "right hand": _FINGERS["right"],
     "eyes": ["left_eye", "right_eye"],
@@ -208,7 +209,7 @@ def limit_violations(joint_names: tuple[str, ...], poses: BodyPose) -> tuple[Vio
     """Violations of joint limits in a batch of poses, by frame."""
     prior, rotations = pose_prior(joint_names), np.asarray(poses.rotations)
     beyond = np.rad2deg(np.maximum(prior.lower - rotations, rotations - prior.upper))
-    found = np.argwhere(beyond > SLIGHTLY_BEYOND)
+    found = np.argwhere(beyond > WORTH_A_LINE.beyond_limit)
     return tuple(
         Violation(int(m), joint_names[j], "xyz"[axis], float(beyond[m, j, axis]))
         for m, j, axis in found
@@ -224,14 +225,14 @@ def undetermined_joints(
 
     Arguments: joint_std: metres. determined: shares.
     """
-    unknown = (joint_std > UNSURE) | (determined < UNDECIDED)
+    unknown = (joint_std > WORTH_A_LINE.std) | (determined < WORTH_A_LINE.determined)
     counts = {
         name: count
         for name, count in zip(joint_names, unknown.sum(0).tolist(), strict=True)
         if count
     }
     found = []
-    for group, members in GROUPS.items():
+    for group, members in _GROUPS.items():
         if all(name in counts for name in members):
             found.append((group, max(counts.pop(name) for name in members)))
     found += counts.items()
@@ -249,14 +250,20 @@ def keypoint_warnings(
     swaps: Sequence[Swap],
 ) -> tuple[str, ...]:
     """What points to a mistake. expected: noise of the keypoints of each frame, pixels."""
-    found = [str(swap) for swap in swaps[:NAMED]]
-    if len(swaps) > NAMED:
-        found.append(f"{len(swaps) - NAMED} more views or pairs of views seem exchanged")
+    found = [str(swap) for swap in swaps[: WORTH_A_LINE.named]]
+    if len(swaps) > WORTH_A_LINE.named:
+        found.append(
+            f"{len(swaps) - WORTH_A_LINE.named} more views or pairs of views seem exchanged"
+        )
     # views without keypoints, with another body or camera than the rest, and with a detector that
     # errs
     blind = [view for view in views if not view.keypoints]
-    off = [view for view in views if view.keypoints and view.median > OFF * expected[view.frame]]
-    wild = [view for view in views if view not in off and view.outliers > MANY_OUTLIERS]
+    off = [
+        view
+        for view in views
+        if view.keypoints and view.median > WORTH_A_LINE.off * expected[view.frame]
+    ]
+    wild = [view for view in views if view not in off and view.outliers > WORTH_A_LINE.outliers]
     if blind:
         found.append(f"no keypoints in {_names(blind)}")
     if off:
@@ -271,11 +278,11 @@ def keypoint_warnings(
     # joints far beyond their limits, a line for each joint and axis
     far: dict[tuple[str, str], list[Violation]] = {}
     for each in violations:
-        if each.degrees > FAR_BEYOND:
+        if each.degrees > WORTH_A_LINE.far_beyond:
             far.setdefault((each.joint, each.axis), []).append(each)
     for (joint, axis), of in far.items():
         worst = max(each.degrees for each in of)
-        frames = few([str(each.frame) for each in of], NAMED)
+        frames = few([str(each.frame) for each in of], WORTH_A_LINE.named)
         found.append(
             f"{joint} is {worst:.0f} degrees beyond its limit about {axis}, in frame {frames}"
         )
@@ -283,7 +290,7 @@ def keypoint_warnings(
 
 
 def _names(views: Sequence[ViewReport]) -> str:
-    return f"view {few([view.name for view in views], NAMED)}"
+    return f"view {few([view.name for view in views], WORTH_A_LINE.named)}"
 
 
 def _span(views: Sequence[ViewReport], field: str, form: str) -> str:

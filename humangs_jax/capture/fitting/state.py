@@ -1,12 +1,11 @@
-"""One state and one solver for every fit: shape, poses and, where a fit moves them, cameras,
-clothing and the scale of a scan.
+"""One state and one solver for every fit: shape, poses and, where a fit moves them, cameras and
+clothing.
 
 A state holds deviations from an `Origin` in units of their expected size, so that zeros are the
 origin, solvers take steps of one length in all directions, and the square of a number is its prior.
 
     keypoints    betas, the pose of every frame               origin: the mean shape in its usual
                                                               pose
-    scan         betas, one pose, log_scale                   origin: the same
     refinement   betas, poses, cameras, clothing              origin: a capture
 
 The root turns by global_orient after the origin's rotation, because sums of rotation vectors near
@@ -117,10 +116,8 @@ def solve(
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
 """The rotation vector of the mirrored rotation."""
-UNLIMITED = np.pi
+_UNLIMITED = np.pi
 """Radians: the limit of a component that has no other."""
-LIMIT_STIFFNESS = 20.0
-"""Standard deviations per radian beyond a joint's limit: 3 degrees count as much as one."""
 
 
 Vector = tuple[float, float, float]
@@ -142,8 +139,8 @@ class Range(NamedTuple):
 _UNKNOWN = Range(
     (0.0, 0.0, 0.0),
     (0.3, 0.3, 0.3),
-    (-UNLIMITED, -UNLIMITED, -UNLIMITED),
-    (UNLIMITED, UNLIMITED, UNLIMITED),
+    (-_UNLIMITED, -_UNLIMITED, -_UNLIMITED),
+    (_UNLIMITED, _UNLIMITED, _UNLIMITED),
 )
 _SPINE = Range((0.03, 0.0, 0.0), (0.2, 0.15, 0.15), (-0.5, -0.5, -0.5), (0.8, 0.5, 0.5))
 _NECK = Range((0.0, 0.0, 0.0), (0.25, 0.3, 0.2), (-0.8, -0.9, -0.6), (0.8, 0.9, 0.6))
@@ -151,7 +148,7 @@ _THUMB = Range((0.1, 0.15, -0.05), (0.3, 0.3, 0.3), (-0.8, -0.9, -1.0), (0.8, 1.
 _FINGER = Range((0.0, 0.0, -0.35), (0.1, 0.1, 0.5), (-0.4, -0.4, -1.9), (0.4, 0.4, 0.4))
 _KNUCKLE = Range((0.0, 0.0, -0.3), (0.15, 0.2, 0.5), (-0.5, -0.6, -1.8), (0.5, 0.6, 0.6))
 
-RANGES = {
+_RANGES = {
     "pelvis": _UNKNOWN._replace(std=(1.0, 1.0, 1.0)),
     "spine1": _SPINE,
     "spine2": _SPINE,
@@ -202,7 +199,7 @@ def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
     """
     rows = []
     for name in joint_names:
-        row = np.asarray(RANGES.get(name.replace("right_", "left_", 1), _UNKNOWN))
+        row = np.asarray(_RANGES.get(name.replace("right_", "left_", 1), _UNKNOWN))
         if name.startswith("right_"):
             row = row * np.stack([MIRROR, np.ones(3), MIRROR, MIRROR])
             row[2:] = np.sort(row[2:], axis=0)
@@ -217,12 +214,11 @@ def limit_residuals(
     rows = np.asarray(joints, int)
     turned = rotations[rows]
     beyond = jnp.maximum(prior.lower[rows] - turned, turned - prior.upper[rows])
-    return LIMIT_STIFFNESS * jnp.maximum(beyond, 0.0)
+    # 20 standard deviations per radian: 3 degrees count as much as one
+    return 20.0 * jnp.maximum(beyond, 0.0)
 
 
-LOG_SCALE_STD = 0.05
-"""Unit of `FitState.log_scale`."""
-RADIANS = math.pi / 180
+_RADIANS = math.pi / 180
 """Per degree."""
 SAME = 1e-4
 """Relative difference of focal lengths, and radians and metres of cameras, below which two are the
@@ -293,8 +289,6 @@ class FitState:
     """Deviations of the cameras."""
     clothing: Float[Array, " b"] | None = None
     """Thickness of clothes on the segments of the root and of the free joints, (a + 1,)."""
-    log_scale: Float[Array, ""] | None = None
-    """Logarithm of the metres per unit of a scan, (), in units of `LOG_SCALE_STD`."""
     places: Float[Array, "g 3"] | None = None
     """Deviations of the places of groups of landmarks, (g, 3), see `LandmarkModel.moved`."""
 
@@ -351,7 +345,7 @@ def usual_origin(prior: PosePrior, joints: tuple[int, ...], coefficients: int) -
 
 
 def zero_state(origin: Origin) -> FitState:
-    """The state of the origin, without the scale of a scan."""
+    """The state of the origin."""
     frames, a = origin.pose.translation.shape[:-1], len(origin.joints)
     cameras = None
     views = origin.cameras
@@ -395,7 +389,7 @@ def pose_of(origin: Origin, state: FitState) -> BodyPose:
     rotations = rotations.at[..., np.asarray(origin.joints, int), :].add(
         origin.body_pose_std * state.body_pose
     )
-    turn = quaternion.from_axis_angle(RADIANS * origin.std.global_orient * state.global_orient)
+    turn = quaternion.from_axis_angle(_RADIANS * origin.std.global_orient * state.global_orient)
     root = quaternion.multiply(turn, quaternion.from_axis_angle(origin.pose.rotations[..., 0, :]))
     rotations = rotations.at[..., 0, :].set(quaternion.to_axis_angle(root))
     translation = origin.pose.translation + origin.std.transl * state.transl
@@ -405,7 +399,7 @@ def pose_of(origin: Origin, state: FitState) -> BodyPose:
 def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitState:
     """The state of a shape and a pose, whose other joints are taken to be as in the origin.
 
-    No cameras, clothing or scale.
+    No cameras and no clothing.
     """
     joints, start = np.asarray(origin.joints, int), origin.pose
     conjugate = quaternion.from_axis_angle(-start.rotations[..., 0, :])
@@ -413,7 +407,7 @@ def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitSt
     turned = pose.rotations[..., joints, :] - start.rotations[..., joints, :]
     return FitState(
         betas=(betas - origin.betas) / origin.std.betas,
-        global_orient=quaternion.to_axis_angle(turn) / (RADIANS * origin.std.global_orient),
+        global_orient=quaternion.to_axis_angle(turn) / (_RADIANS * origin.std.global_orient),
         transl=(pose.translation - start.translation) / origin.std.transl,
         body_pose=turned / origin.body_pose_std,
     )
@@ -432,7 +426,7 @@ def cameras_of(
     if moved is None:
         return start.K, start.cam_from_world
     turn = quaternion.matrix_from_axis_angle(
-        RADIANS * std.camera_rotation * moved.rotations[start.camera]
+        _RADIANS * std.camera_rotation * moved.rotations[start.camera]
     )
     center = (
         transform.invert_rigid(start.cam_from_world)[:, :3, 3]
@@ -457,11 +451,6 @@ def clothing_thickness(
     return origin.std.clothing * jnp.matmul(
         weights, state.clothing[origin.segment], precision=EXACT
     )
-
-
-def scale_of(state: FitState) -> Float[Array, ""]:
-    """Metres per unit of a scan's frame; 1 if the state has no scale."""
-    return jnp.ones(()) if state.log_scale is None else jnp.exp(LOG_SCALE_STD * state.log_scale)
 
 
 def segments(parents: tuple[int, ...], joints: tuple[int, ...]) -> Int[np.ndarray, " j"]:

@@ -32,29 +32,25 @@ from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.pytree import replace
 
-LEAST_GAIN = 0.1
-"""Agreement of n keypoints has to grow by `LEAST_GAIN` + `CHANCE` / sqrt(n) of what is attainable.
-"""
-CHANCE = 0.8
-"""See `LEAST_GAIN`. By chance, without an exchange, 17 keypoints with 20 % of outliers and three
-times the expected noise gain up to 0.26; 67 keypoints gain nothing.
-"""
-MANY = 5
-"""With this many views or more the right ones outvote an exchange: only exchanges that look better
-at once are tried.
-"""
-ALIKE = 0.9
-"""Another exchange with this share of the gain explains as much: in a ring of evenly spaced cameras
-several are equivalent.
-"""
-HANDS_SHARE = 0.3
-"""Hands are exchanged if their roots are nearer to the other wrists than this share of the distance
-from their own.
-"""
-SAME_CAMERA = 1e-3
-"""Share of the focal length, and metres, by which a camera that stands still may differ between
-frames.
-"""
+
+@dataclasses.dataclass(frozen=True)
+class _Clear:
+    """When an exchange explains a disagreement clearly."""
+
+    least_gain: float = 0.1
+    """Agreement of n keypoints has to grow by this + `chance` / sqrt(n) of what is attainable."""
+    chance: float = 0.8
+    """By chance, without an exchange, 17 keypoints with 20 % of outliers and three times the
+    expected noise gain up to 0.26; 67 keypoints gain nothing."""
+    many: int = 5
+    """With this many views or more the right ones outvote an exchange: only exchanges that look
+    better at once are tried."""
+    alike: float = 0.9
+    """Another exchange with this share of the gain explains as much: in a ring of evenly spaced
+    cameras several are equivalent."""
+
+
+_CLEAR = _Clear()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +122,8 @@ def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[
     rows = [keypoints.set.names.index(name) for name in wanted]
     hands, wrists = np.split(keypoints.points[:, rows], 2, axis=1)
     own, other = (np.linalg.norm(hands - at, axis=-1).sum(1) for at in (wrists, wrists[:, ::-1]))
-    exchanged = (keypoints.confidences[:, rows] > 0).all(1) & (other < HANDS_SHARE * own)
+    # roots of exchanged hands are plainly nearer to the other wrists
+    exchanged = (keypoints.confidences[:, rows] > 0).all(1) & (other < 0.3 * own)
     return tuple(Swap("hands", (names[view],)) for view in np.flatnonzero(exchanged))
 
 
@@ -164,7 +161,7 @@ def given(frames: int, views: int) -> Order:
     return Order(np.tile(np.arange(views), (frames, 1)), np.zeros((frames, views), bool))
 
 
-def arranged(
+def _arranged(
     observations: Observations, mirror: Int[np.ndarray, " k"], order: Order
 ) -> Observations:
     """The keypoints of m frames in an order. mirror: index of each keypoint's mirror image."""
@@ -265,17 +262,19 @@ class _Search:
     ) -> None:
         self.observations, self.mirror = observations, mirror
         self.cameras, self.order = cameras, order
-        seen = arranged(observations, mirror, order)
+        seen = _arranged(observations, mirror, order)
         found = jax.tree.map(np.asarray, agreements(seen, mirror))
         self.confidences = np.asarray(seen.confidences)
         self.total, self.views = found.own.sum(-1), (self.confidences > 0).any(-1)
         # with many views, only what looks better at once is worth a trial
         count, own = self.views.sum(-1)[:, None], np.diagonal(found.crossed, axis1=1, axis2=2)
-        self.sides = self.views & (count > 1) & ((count < MANY) | (found.mirrored > own))
+        self.sides = self.views & (count > 1) & ((count < _CLEAR.many) | (found.mirrored > own))
         self.several = self.views & (count > 2)
         better = found.crossed + found.crossed.swapaxes(1, 2) > own[:, :, None] + own[:, None]
         self.pairs = (
-            self.several[:, :, None] & self.several[:, None] & ((count < MANY)[..., None] | better)
+            self.several[:, :, None]
+            & self.several[:, None]
+            & ((count < _CLEAR.many)[..., None] | better)
         )
 
     def gains(
@@ -286,7 +285,7 @@ class _Search:
     ) -> Float[np.ndarray, " e"]:
         """(e,) agreement that an exchange adds in each of its frames."""
         order = self.order.exchanged(frames, a, b)
-        own = agreements(arranged(self.observations, self.mirror, order), self.mirror).own
+        own = agreements(_arranged(self.observations, self.mirror, order), self.mirror).own
         return (np.asarray(own).sum(-1) - self.total)[frames]
 
     def is_clear(self, trial: _Trial, of: Bool[np.ndarray, " k"]) -> bool:
@@ -302,7 +301,7 @@ class _Search:
             return float(sum(values[trial.frames, slot].sum() for slot in slots))
 
         attainable, count = total((self.confidences * shared).sum(-1)), total(shared.sum(-1))
-        least = LEAST_GAIN + CHANCE / max(count, 1) ** 0.5
+        least = _CLEAR.least_gain + _CLEAR.chance / max(count, 1) ** 0.5
         return trial.gain / max(attainable, 1e-6) > least
 
     def flips(self) -> dict[int, _Trial]:
@@ -361,7 +360,7 @@ def _cameras(
         assert trial.b is not None
         return tuple(names[v] for v in sorted(views[trial.frames[0], [trial.a[0], trial.b[0]]]))
 
-    alike = [each for each in tried if each is not best and each.gain > ALIKE * best.gain]
+    alike = [each for each in tried if each is not best and each.gain > _CLEAR.alike * best.gain]
     others = [
         " and ".join(named(each)) for each in alike if np.array_equal(each.frames, best.frames)
     ]
@@ -392,5 +391,6 @@ def _camera_numbers(
         np.asarray(x, np.float64)[there] for x in (observations.K, observations.cam_from_world)
     )
     numbers = np.full(views.shape, -1)
-    numbers[there] = camera_numbers(*matrices, SAME_CAMERA)
+    # a camera stands still up to a thousandth of the focal length, and a millimetre
+    numbers[there] = camera_numbers(*matrices, 1e-3)
     return numbers

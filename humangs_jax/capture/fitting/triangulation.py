@@ -1,10 +1,8 @@
-"""Points in space from several views, similarities between points, and which people in several
-views are the same person.
+"""Points in space from several views, and which people in several views are the same person.
 
 A pixel is a ray. The point with the least weighted sum of squared distances to the rays solves 3 x
 3 equations. Weights of focal length over distance turn metres into pixels (Hartley and Zisserman,
 Multiple View Geometry, 12.2). Robustly: from the pair of views that most views agree with.
-Similarities are in float64 on the host.
 
 Landmarks of one person triangulate: seen from other cameras they fall on that person's landmarks,
 within a few hundredths of the person's size. Those of two people do not, nor do those of a person
@@ -27,15 +25,11 @@ from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.geometry.transform import EXACT
 
-RIDGE = 1e-6
-"""Share of the weights that pulls towards the cameras: parallel rays leave the distance open."""
-REWEIGHTED = 3
-"""Iterations that weight the rays by the distance of the last point."""
 PAIRS_AT_ONCE = 16
 """Pairs of views whose proposals are compared with all views at once: memory does not grow with the
 number of pairs.
 """
-MARGIN = 6.0
+_MARGIN = 6.0
 """A view agrees with a point within this many standard deviations of the noise."""
 
 
@@ -50,7 +44,8 @@ def triangulate(
     origins, directions = _rays(observations)
     focal = observations.K[:, 0, 0]
     points = _nearest(origins, directions, weights)
-    for _ in range(REWEIGHTED):
+    # rays are weighted by the distance of the last point
+    for _ in range(3):
         distance = jnp.sum(directions * (points - origins[:, None]), axis=-1)
         pixels_per_metre = focal[:, None] / jnp.maximum(jnp.abs(distance), 0.1)
         points = _nearest(origins, directions, weights * jnp.square(pixels_per_metre))
@@ -94,7 +89,7 @@ def agreement(observations: Observations, points: Float[Array, "k 3"]) -> Float[
     """
     errors = reprojection_errors(observations, points)
     return observations.confidences * jnp.maximum(
-        1 - jnp.square(errors / (MARGIN * observations.noise)), 0.0
+        1 - jnp.square(errors / (_MARGIN * observations.noise)), 0.0
     )
 
 
@@ -129,128 +124,62 @@ def _nearest(
     center = jnp.mean(origins, axis=0)  # against rounding far from the world's origin
     across = jnp.eye(3) - directions[..., :, None] * directions[..., None, :]
     scale = weights / jnp.maximum(jnp.sum(weights, axis=0), 1e-12)
-    matrix = jnp.einsum("ck,ckab->kab", scale, across, precision=EXACT) + RIDGE * jnp.eye(3)
+    # the ridge pulls towards the cameras: parallel rays leave the distance open
+    matrix = jnp.einsum("ck,ckab->kab", scale, across, precision=EXACT) + 1e-6 * jnp.eye(3)
     vector = jnp.einsum("ck,ckab,cb->ka", scale, across, origins - center, precision=EXACT)
     return jnp.linalg.solve(matrix, vector[..., None])[..., 0] + center
-
-
-# Similarities
-# --------------------------------------------------------------------------------------------------
-
-ITERATIONS = 10
-"""Iterations that reweight the points by their distances."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Similarity:
-    """x -> scale rotation x + translation."""
-
-    scale: float
-    """Factor of lengths."""
-    rotation: Float[np.ndarray, "3 3"]
-    """Proper rotation, (3, 3)."""
-    translation: Float[np.ndarray, "3"]
-    """Shift after scale and rotation, (3,)."""
-
-    def __call__(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
-        return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
-
-    def after(self, first: "Similarity") -> "Similarity":
-        """The composition: first `first`, then this one."""
-        return Similarity(
-            self.scale * first.scale,
-            self.rotation @ first.rotation,
-            self(np.asarray(first.translation, np.float64)),
-        )
-
-    def inverse(self) -> "Similarity":
-        back = self.rotation.T
-        return Similarity(1 / self.scale, back, -(back @ self.translation) / self.scale)
-
-    def matrix(self) -> Float[np.ndarray, "4 4"]:
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
-        return matrix
-
-
-def align_points(
-    source: Float[np.ndarray, "k 3"],
-    target: Float[np.ndarray, "k 3"],
-    weights: Float[np.ndarray, " k"],
-) -> Similarity:
-    """The similarity from source to target whose weighted square distances are least (Umeyama 1991,
-    eq. 40 to 43).
-
-    Raises: ValueError if fewer than three points have a weight, or they lie on a line.
-    """
-    share = weights / max(weights.sum(), 1e-30)
-    mean_source, mean_target = share @ source, share @ target
-    x, y = source - mean_source, target - mean_target
-    extent = np.linalg.svd(np.sqrt(share)[:, None] * x, compute_uv=False)
-    if (weights > 0).sum() < 3 or extent[1] < 1e-6 * extent[0]:
-        raise ValueError("expected at least three points that are not on one line")
-    u, values, vt = np.linalg.svd(y.T @ (share[:, None] * x))
-    signs = np.asarray([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * signs) @ vt
-    scale = float((values * signs).sum() / (share @ (x * x).sum(axis=1)))
-    return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
-
-
-def align_robustly(
-    source: Float[np.ndarray, "k 3"],
-    target: Float[np.ndarray, "k 3"],
-    weights: Float[np.ndarray, " k"],
-    std: float,
-) -> Similarity:
-    """The same with Cauchy weights: points farther off than `std`, in units of the target, count
-    less.
-
-    Raises: see `align_points`.
-    """
-    found = align_points(source, target, weights)
-    for _ in range(ITERATIONS):
-        away = np.linalg.norm(found(source) - target, axis=1) / std
-        found = align_points(source, target, weights / (1 + away * away))
-    return found
 
 
 # Who is who
 # --------------------------------------------------------------------------------------------------
 
-AGREE = 0.06
-"""Median distance of landmarks from the triangulated points, a share of the person's size in the
-photo, up to which a view shows the same person. Cameras that are off by a degree make 0.02 of it.
-"""
-CLEARLY = 0.5
-"""Sides are exchanged if the distance is then less than this share of what it is without."""
-RATHER = 0.8
-"""The same where the views do not agree without an exchange."""
-FARTHEST = 1.0
-"""Metres between a person's places in two frames that follow each other, where several views show
-where they are.
-"""
-SHORTER = 0.3
-"""How much shorter the ways of people between two frames have to be than if two of them were
-exchanged, a share of the longest way.
-"""
-FAR = 3.0
-"""Multiple of the longest way from which on all ways count as equally long."""
-NEAR = 0.5
-"""How far people go in the photo of one camera from one frame to the next, a share of their size in
-it.
-"""
-RESIZED = 1.5
-"""The most by which a person's size in the photo of one camera changes from one frame to the next,
-a factor.
-"""
-STILL_DEGREES = 10.0
-"""A view that has turned by no more than this since the last frame is one camera's."""
-STILL_METRES = 0.3
-"""A view that has moved by no more than this since the last frame is one camera's."""
-SEEN = 0.3
-"""Least visibility of a landmark that counts."""
-FEWEST = 6
-"""Least number of landmarks that two views share to be compared."""
+
+@dataclasses.dataclass(frozen=True)
+class _SamePerson:
+    """When people in views of one moment are one person."""
+
+    agree: float = 0.06
+    """Median distance of landmarks from the triangulated points, a share of the person's size in
+    the photo, up to which a view shows the same person. Cameras that are off by a degree make 0.02
+    of it."""
+    clearly: float = 0.5
+    """Sides are exchanged if the distance is then less than this share of what it is without."""
+    rather: float = 0.8
+    """The same where the views do not agree without an exchange."""
+    seen: float = 0.3
+    """Least visibility of a landmark that counts."""
+    fewest: int = 6
+    """Least number of landmarks that two views share to be compared."""
+
+
+_SAME_PERSON = _SamePerson()
+
+
+@dataclasses.dataclass(frozen=True)
+class _SameWay:
+    """When people in two frames that follow each other are one person."""
+
+    farthest: float = 1.0
+    """Metres between a person's places in two frames that follow each other, where several views
+    show where they are."""
+    near: float = 0.5
+    """How far people go in the photo of one camera from one frame to the next, a share of their
+    size in it."""
+    resized: float = 1.5
+    """The most by which a person's size in the photo of one camera changes from one frame to the
+    next, a factor."""
+    shorter: float = 0.3
+    """How much shorter the ways of people between two frames have to be than if two of them were
+    exchanged, a share of the longest way."""
+    far: float = 3.0
+    """Multiple of the longest way from which on all ways count as equally long."""
+    still_degrees: float = 10.0
+    """A view that has turned by no more than this since the last frame is one camera's."""
+    still_metres: float = 0.3
+    """A view that has moved by no more than this since the last frame is one camera's."""
+
+
+_SAME_WAY = _SameWay()
 
 
 class Seen(NamedTuple):
@@ -305,7 +234,7 @@ def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
             error = max(_error(views[i], each, points, known) for i, each in ((v, first), (w, row)))
             trials.append((error, points, known))
         flipped = _is_exchanged(trials[0][0], trials[1][0])
-        if trials[flipped][0] < AGREE:
+        if trials[flipped][0] < _SAME_PERSON.agree:
             groups.append(
                 _gathered(views, flipped_order, {(v, p): False, (w, q): flipped}, *trials[flipped])
             )
@@ -340,7 +269,7 @@ def _gathered(
             flipped = _is_exchanged(plain, exchanged)
             trials.append((exchanged if flipped else plain, (v, p), flipped))
         best = min(trials, default=None)
-        if best is not None and best[0] < AGREE:
+        if best is not None and best[0] < _SAME_PERSON.agree:
             error, key, flipped = best
             group[key] = flipped
             errors.append(error)
@@ -352,7 +281,11 @@ def _is_exchanged(plain: float, exchanged: float) -> bool:
 
     Left and right of a small or thin person hardly differ: then nothing is exchanged.
     """
-    most = CLEARLY * plain if plain < AGREE else min(AGREE, RATHER * plain)
+    most = (
+        _SAME_PERSON.clearly * plain
+        if plain < _SAME_PERSON.agree
+        else min(_SAME_PERSON.agree, _SAME_PERSON.rather * plain)
+    )
     return exchanged < most
 
 
@@ -383,7 +316,7 @@ def _triangulated(
     views: Sequence[Seen], rows: dict[int, Float[np.ndarray, "k 3"]]
 ) -> tuple[Float[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
     """Points by linear least squares, and which of them all views see."""
-    known = np.logical_and.reduce([row[:, 2] >= SEEN for row in rows.values()])
+    known = np.logical_and.reduce([row[:, 2] >= _SAME_PERSON.seen for row in rows.values()])
     equations = []
     for v, row in rows.items():
         xy = (row[:, :2] - views[v].K[:2, 2]) / np.diag(views[v].K)[:2]
@@ -404,8 +337,8 @@ def _error(
     """Median distance of landmarks from points over the size of the person; infinite behind the
     camera or with few in common.
     """
-    seen = known & (row[:, 2] >= SEEN)
-    if seen.sum() < FEWEST:
+    seen = known & (row[:, 2] >= _SAME_PERSON.seen)
+    if seen.sum() < _SAME_PERSON.fewest:
         return float("inf")
     local = points[seen] @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
     if np.median(local[:, 2]) <= 0:
@@ -413,13 +346,16 @@ def _error(
     pixels = local @ view.K.T
     depths = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
     distances = np.linalg.norm(pixels[:, :2] / depths - row[seen, :2], axis=-1)
-    size = np.ptp(row[row[:, 2] >= SEEN, :2], axis=0).max()
+    size = np.ptp(row[row[:, 2] >= _SAME_PERSON.seen, :2], axis=0).max()
     return float(np.median(np.nan_to_num(distances, nan=np.inf))) / max(float(size), 1e-9)
 
 
 def comparable(first: Float[np.ndarray, "k 3"], second: Float[np.ndarray, "k 3"]) -> bool:
     """Tells whether two views see enough of the same landmarks to say that they show two people."""
-    return int(((first[:, 2] >= SEEN) & (second[:, 2] >= SEEN)).sum()) >= FEWEST
+    return (
+        int(((first[:, 2] >= _SAME_PERSON.seen) & (second[:, 2] >= _SAME_PERSON.seen)).sum())
+        >= _SAME_PERSON.fewest
+    )
 
 
 def in_order_of_time(
@@ -442,7 +378,9 @@ def in_order_of_time(
         ways = np.asarray(
             [[np.linalg.norm(match.center - center) for match in matches] for center in centers]
         )
-        chosen = dict(_plainly_shortest(ways.reshape(len(people), len(matches)), FARTHEST))
+        chosen = dict(
+            _plainly_shortest(ways.reshape(len(people), len(matches)), _SAME_WAY.farthest)
+        )
         if shown is not None:
             # those that are left are compared in the photos of one camera
             free = [j for j in range(len(people)) if j not in chosen]
@@ -452,7 +390,9 @@ def in_order_of_time(
                 before = people[j][last[j]]
                 assert before is not None
                 costs[row, column] = _moved_in_photos(shown[last[j]], before, shown[f], matches[i])
-            chosen |= {free[row]: left[column] for row, column in _plainly_shortest(costs, NEAR)}
+            chosen |= {
+                free[row]: left[column] for row, column in _plainly_shortest(costs, _SAME_WAY.near)
+            }
         for j, person in enumerate(people):
             person.append(matches[chosen[j]] if j in chosen else None)
         # matches that continue nobody are new people
@@ -474,7 +414,7 @@ def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tu
     plainly longer.
     """
     # longer ways, and those that are not known, are all as unlikely
-    ways = np.fmin(ways, FAR * longest)
+    ways = np.fmin(ways, _SAME_WAY.far * longest)
     rows, columns = linear_sum_assignment(ways)
     pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
     without_match = sorted(set(range(len(ways))) - set(rows.tolist()))
@@ -486,7 +426,7 @@ def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tu
         # whoever has no match now, or is nobody's match, could have this one
         longer += [ways[m, i] - ways[j, i] for m in without_match]
         longer += [ways[j, k] - ways[j, i] for k in of_nobody]
-        if ways[j, i] < longest and min(longer, default=np.inf) >= SHORTER * longest:
+        if ways[j, i] < longest and min(longer, default=np.inf) >= _SAME_WAY.shorter * longest:
             chosen.append((j, i))
     return chosen
 
@@ -507,7 +447,7 @@ def _moved_in_photos(
         place, size = _box(before[v].people[p])
         other, other_size = _box(now[w].people[q])
         larger, smaller = max(size, other_size), min(size, other_size)
-        if larger > RESIZED * smaller:
+        if larger > _SAME_WAY.resized * smaller:
             moved.append(float("inf"))
         else:
             moved.append(float(np.linalg.norm(other - place)) / max(larger, 1e-9))
@@ -520,13 +460,15 @@ def _stands_still(before: Seen, now: Seen) -> bool:
     turn = first[:, :3] @ second[:, :3].T
     degrees = np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
     way = first[:, :3].T @ first[:, 3] - second[:, :3].T @ second[:, 3]
-    return bool(degrees <= STILL_DEGREES and np.linalg.norm(way) <= STILL_METRES)
+    return bool(
+        degrees <= _SAME_WAY.still_degrees and np.linalg.norm(way) <= _SAME_WAY.still_metres
+    )
 
 
 def _box(row: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "2"], float]:
     """The middle of the landmarks that are seen, pixels, and the longer side of the box around
     them.
     """
-    seen = row[row[:, 2] >= SEEN, :2]
+    seen = row[row[:, 2] >= _SAME_PERSON.seen, :2]
     seen = seen if len(seen) else row[:, :2]
     return np.median(seen, axis=0), float(np.ptp(seen, axis=0).max())

@@ -30,9 +30,9 @@ from humangs_jax.capture.keypoints.keypoints import (
     SETS_BY_COUNT,
     DetectedImage,
     Detections,
+    KeypointFile,
     Keypoints,
     KeypointSet,
-    Source,
     detections_of,
     triples,
     with_hands,
@@ -53,16 +53,16 @@ FORMAT = "humangs-people"
 """Name of the format in its files."""
 VERSION = 1
 """Version of the format that is written and read."""
-DECIMALS = 4
+_DECIMALS = 4
 """Decimals of numbers in the file: a ten-thousandth of a pixel, a tenth of a millimetre."""
 
 
-def recognizes_own(source: Source) -> bool:
+def recognizes_own(source: KeypointFile) -> bool:
     """Whether a file is one of ours; npz archives are taken for one."""
     return source.path.suffix.lower() == ".npz" or _is_people_file(source.json)
 
 
-def read_own(source: Source, format: SourceFormat) -> Detections:
+def read_own(source: KeypointFile, format: SourceFormat) -> Detections:
     """The keypoints of one person, or all people, with confidence 0 where they are not in the
     image. Raises: CaptureError.
     """
@@ -189,11 +189,11 @@ def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
 
 def _described(person: SeenPerson) -> dict[str, Any]:
     def rounded(values: np.ndarray) -> list:
-        return np.round(values, DECIMALS).tolist()
+        return np.round(values, _DECIMALS).tolist()
 
     hands = {} if person.hands is None else {"hands": rounded(person.hands)}
     return {
-        "presence": round(person.presence, DECIMALS),
+        "presence": round(person.presence, _DECIMALS),
         "pixels": rounded(person.points[:, :2]),
         "visibility": rounded(person.points[:, 2]),
         "world": rounded(person.world),
@@ -250,25 +250,21 @@ def _own_person(person: Any, count: int, path: Path, field: str) -> SeenPerson |
 # OpenPose's --write_json
 # -----------------------------------------------------------------------------------------------
 
-SUFFIX = "_keypoints"
-"""What OpenPose adds to the name of the image."""
-HANDS_OF_OPENPOSE = {"hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21}
-"""Keys of the hands, and how many points they have. The face, if it is there, is not read."""
 BODY = "pose_keypoints_2d"
 """Key of the body."""
-BODY_POINTS = (25, 18)
+_BODY_POINTS = (25, 18)
 """Points of the body in the models BODY_25 and BODY_25B, and in COCO."""
-OTHER_MODELS = {15: "MPI", 135: "BODY_135", 20: "an animal of ControlNet"}
+_OTHER_MODELS = {15: "MPI", 135: "BODY_135", 20: "an animal of ControlNet"}
 """Models with other numbers of points, which are refused by name."""
 
 
-def recognizes_openpose(source: Source) -> bool:
+def recognizes_openpose(source: KeypointFile) -> bool:
     """Whether a file is a JSON object with people, or a list of such."""
     frames = source.json if isinstance(source.json, list) else [source.json]
     return bool(frames) and all(isinstance(frame, dict) and "people" in frame for frame in frames)
 
 
-def read_openpose(source: Source, format: SourceFormat) -> Detections:
+def read_openpose(source: KeypointFile, format: SourceFormat) -> Detections:
     """The people of one image, or of the frames of a video, which programs with nodes write as a
     list. Raises: CaptureError.
     """
@@ -286,7 +282,8 @@ def read_openpose(source: Source, format: SourceFormat) -> Detections:
         )
         if not any(person.any() for person in people):
             people = ()
-        name: str | int = source.name.removesuffix(SUFFIX)
+        # what OpenPose adds to the name of the image
+        name: str | int = source.name.removesuffix("_keypoints")
         if len(frames) > 1:
             name = i if source.alone else f"{name}/{i}"
         images.append(DetectedImage(name, source.path, people, _canvas(frame, source.path)))
@@ -310,20 +307,22 @@ def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np
     count, rest = divmod(len(body), 3)
     if not rest and count in SETS_BY_COUNT:
         return triples(body, file, f"{field}.{BODY}")
-    if rest or (count and count not in BODY_POINTS):
+    if rest or (count and count not in _BODY_POINTS):
         found = f"{count} points"
         if rest:
             found = f"{len(body)} numbers"
-        elif count in OTHER_MODELS:
-            found += f" of {OTHER_MODELS[count]}"
-        known = ", ".join(map(str, sorted((*BODY_POINTS, *SETS_BY_COUNT))))
+        elif count in _OTHER_MODELS:
+            found += f" of {_OTHER_MODELS[count]}"
+        known = ", ".join(map(str, sorted((*_BODY_POINTS, *SETS_BY_COUNT))))
         hint = " (OpenPose: --model_pose BODY_25)" if own else ""
         raise CaptureError(
             file,
             f"{field}.{BODY}",
             f"expected {known} points of x, y, confidence, got {found}{hint}",
         )
-    return _parts(person, {BODY: count or BODY_POINTS[0], **HANDS_OF_OPENPOSE}, file, field)
+    # keys and their numbers of points. The face, if it is there, is not read
+    hands = {"hand_left_keypoints_2d": 21, "hand_right_keypoints_2d": 21}
+    return _parts(person, {BODY: count or _BODY_POINTS[0], **hands}, file, field)
 
 
 def _parts(
@@ -344,18 +343,13 @@ def _parts(
 # EasyMocap's annots
 # --------------------------------------------------------------------------------------------------
 
-EASYMOCAP_HANDS = ("handl2d", "handr2d")
-"""Keys of the left and the right hand."""
-MOST_PEOPLE = 64
-"""People are in the order of their IDs; beyond this many an ID is no count."""
 
-
-def recognizes_easymocap(source: Source) -> bool:
+def recognizes_easymocap(source: KeypointFile) -> bool:
     """Whether a file is a JSON object with annots."""
     return isinstance(source.json, dict) and isinstance(source.json.get("annots"), list)
 
 
-def read_easymocap(source: Source, format: SourceFormat) -> Detections:
+def read_easymocap(source: KeypointFile, format: SourceFormat) -> Detections:
     """The people of one image: person I is the one with that personID, where these are small
     numbers. Raises: CaptureError.
     """
@@ -366,10 +360,12 @@ def read_easymocap(source: Source, format: SourceFormat) -> Detections:
         person = _part(entry, "keypoints", None, file, field)
         # BODY_25, perhaps with hands
         if len(person) == 25:
-            hands = [_part(entry, key, 21, file, field) for key in EASYMOCAP_HANDS]
+            # keys of the left and the right hand
+            hands = [_part(entry, key, 21, file, field) for key in ("handl2d", "handr2d")]
             person = np.concatenate([person, *hands])
         number = entry.get("personID", i)
-        counted = type(number) is int and 0 <= number < MOST_PEOPLE and number not in people
+        # people are in the order of their IDs; beyond this many an ID is no count
+        counted = type(number) is int and 0 <= number < 64 and number not in people
         people[number if counted else len(people)] = person
     first = next(iter(people.values()), np.zeros((0, 3)))
     found = tuple(people.get(i, np.zeros_like(first)) for i in range(max(people, default=-1) + 1))
@@ -396,7 +392,7 @@ def _part(
 # COCO
 # --------------------------------------------------------------------------------------------------
 
-COCO_PARTS = {
+_COCO_PARTS = {
     "keypoints": 17,
     "foot_kpts": 6,
     "face_kpts": 68,
@@ -404,13 +400,9 @@ COCO_PARTS = {
     "righthand_kpts": 21,
 }
 """COCO-WholeBody's, in the order of its 133 points."""
-HIDDEN_CONFIDENCE = 0.5
-"""Confidence of points that an annotator guessed behind something else."""
-LARGEST_VISIBILITY = 2
-"""COCO's visibility of a point that is seen; 1 is hidden, 0 not annotated."""
 
 
-def recognizes_coco(source: Source) -> bool:
+def recognizes_coco(source: KeypointFile) -> bool:
     """Whether a file has annotations, or a list of results that name their image."""
     if isinstance(source.json, dict):
         return "annotations" in source.json
@@ -420,7 +412,7 @@ def recognizes_coco(source: Source) -> bool:
     )
 
 
-def read_coco(source: Source, format: SourceFormat) -> Detections:
+def read_coco(source: KeypointFile, format: SourceFormat) -> Detections:
     """The images of a file, those of results in the order in which they first appear.
 
     Raises: CaptureError.
@@ -483,7 +475,7 @@ def _whole_body(entries: list[Any]) -> bool:
     confidence 0.
     """
     return any(
-        isinstance(entry, dict) and len(COCO_PARTS.keys() & entry.keys()) > 1 for entry in entries
+        isinstance(entry, dict) and len(_COCO_PARTS.keys() & entry.keys()) > 1 for entry in entries
     )
 
 
@@ -492,7 +484,7 @@ def _coco_person(
 ) -> Float[np.ndarray, "k 3"]:
     (keypoints,) = members(entry, file, field, keypoints=list)
     if whole:
-        return _parts(entry, COCO_PARTS, file, field)
+        return _parts(entry, _COCO_PARTS, file, field)
     return triples(keypoints, file, f"{field}.keypoints")
 
 
@@ -504,13 +496,13 @@ def _by_visibility(
     Fractions occur in COCO-WholeBody, where any value above 0 means reliable.
     """
     visibility = person[:, 2]
-    if not np.isnan(visibility).all() and (
-        np.nanmin(visibility) < 0 or np.nanmax(visibility) > LARGEST_VISIBILITY
-    ):
+    # COCO's visibility of a point that is seen; 1 is hidden, 0 not annotated
+    if not np.isnan(visibility).all() and (np.nanmin(visibility) < 0 or np.nanmax(visibility) > 2):
         raise CaptureError(
             file, field, f"expected visibilities 0, 1 or 2, got {np.nanmax(np.abs(visibility)):g}"
         )
-    confidence = np.where(visibility == 1, HIDDEN_CONFIDENCE, np.where(visibility > 0, 1.0, 0.0))
+    # confidence of points that an annotator guessed behind something else
+    confidence = np.where(visibility == 1, 0.5, np.where(visibility > 0, 1.0, 0.0))
     return np.column_stack([person[:, :2], np.where(np.isnan(visibility), np.nan, confidence)])
 
 
@@ -529,11 +521,11 @@ def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
 # MMPose's inferencer and demo scripts
 # ----------------------------------------------------------------------------------
 
-PREFIX = "results_"
+_PREFIX = "results_"
 """What the demo scripts put before the name of the image."""
 
 
-def recognizes_mmpose(source: Source) -> bool:
+def recognizes_mmpose(source: KeypointFile) -> bool:
     """Whether a file has a list of instances or frames; an empty list may be anybody's."""
     entries = _entries(source)
     if not isinstance(entries, list):
@@ -543,9 +535,9 @@ def recognizes_mmpose(source: Source) -> bool:
     )
 
 
-def read_mmpose(source: Source, format: SourceFormat) -> Detections:
+def read_mmpose(source: KeypointFile, format: SourceFormat) -> Detections:
     """The image of a file, or the frames of a video. Raises: CaptureError."""
-    name, file, entries = source.name.removeprefix(PREFIX), source.path, _entries(source)
+    name, file, entries = source.name.removeprefix(_PREFIX), source.path, _entries(source)
     if not any(isinstance(entry, dict) and "frame_id" in entry for entry in entries):
         return detections_of([DetectedImage(name, file, _people(entries, file, "instances"))])
     images = []
@@ -556,7 +548,7 @@ def read_mmpose(source: Source, format: SourceFormat) -> Detections:
     return detections_of(images)
 
 
-def _entries(source: Source) -> Any:
+def _entries(source: KeypointFile) -> Any:
     return source.json.get("instance_info") if isinstance(source.json, dict) else source.json
 
 

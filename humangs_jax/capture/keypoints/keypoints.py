@@ -26,7 +26,13 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.body.landmarks import Place, both_sides, mirrored_name, place, plain_places
+from humangs_jax.body.landmarks import (
+    LandmarkDefinition,
+    both_sides,
+    mirrored_name,
+    place,
+    plain_places,
+)
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, checked_json, file_numbers
 from humangs_jax.data.formats import KEYPOINTS
@@ -35,15 +41,19 @@ SIDES = ("left", "right")
 """The person's left and right."""
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 """Fingers in the order of OpenPose's hands."""
-FINGER_JOINTS = ("1", "2", "3", "tip")
-"""Points of a finger, from the palm to the tip."""
-FACE_POINTS = 68
+_FACE_POINTS = 68
 """Number of 300-W's landmarks of the face."""
 
 _FOOT = ("big_toe", "small_toe", "heel")
 _FEET = tuple(f"{side}_{part}" for side in SIDES for part in _FOOT)
-_PAIRS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-_COCO = ("nose", *(f"{side}_{part}" for part in _PAIRS for side in SIDES))
+_COCO = (
+    "nose",
+    *(
+        f"{side}_{part}"
+        for part in ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+        for side in SIDES
+    ),
+)
 _BODY_25 = (
     *("nose", "neck"),
     *(f"{side}_{part}" for side in ("right", "left") for part in ("shoulder", "elbow", "wrist")),
@@ -64,7 +74,7 @@ class KeypointSet:
     """Names of the k points."""
     mirror: tuple[int, ...]
     """Index of each point's mirror image; a point in the middle of the body is its own."""
-    places: tuple[Place, ...] = ()
+    places: tuple[LandmarkDefinition, ...] = ()
     """Places on the body of points that may lie elsewhere than `body.landmarks` has them: where the
     detector is known to see them, or a fit has found that it does.
     """
@@ -93,14 +103,18 @@ class KeypointSet:
 
 
 def hand_names(side: str) -> tuple[str, ...]:
-    """The 21 points of one hand, in the order of OpenPose and COCO-WholeBody."""
+    """The 21 points of one hand, from the palm to the tips, in the order of OpenPose and
+    COCO-WholeBody.
+    """
     return (
         f"{side}_hand_root",
-        *(f"{side}_{finger}_{joint}" for finger in FINGERS for joint in FINGER_JOINTS),
+        *(f"{side}_{finger}_{joint}" for finger in FINGERS for joint in ("1", "2", "3", "tip")),
     )
 
 
-def _keypoint_set(name: str, names: tuple[str, ...], places: tuple[Place, ...] = ()) -> KeypointSet:
+def _keypoint_set(
+    name: str, names: tuple[str, ...], places: tuple[LandmarkDefinition, ...] = ()
+) -> KeypointSet:
     return KeypointSet(
         name,
         names,
@@ -117,7 +131,7 @@ COCO_WHOLEBODY_133 = _keypoint_set(
     (
         *_COCO,
         *_FEET,
-        *(f"face_{i}" for i in range(FACE_POINTS)),
+        *(f"face_{i}" for i in range(_FACE_POINTS)),
         *hand_names("left"),
         *hand_names("right"),
     ),
@@ -143,7 +157,7 @@ HALPE_136 = _keypoint_set(
     "halpe136",
     (
         *HALPE_26.names,
-        *(f"face_{i}" for i in range(FACE_POINTS)),
+        *(f"face_{i}" for i in range(_FACE_POINTS)),
         *hand_names("left"),
         *hand_names("right"),
     ),
@@ -264,9 +278,6 @@ OpenPose's 67 are not in it: its files keep body and hands apart.
 # Keypoints
 # --------------------------------------------------------------------------------------------------
 
-HALF_PIXEL = 0.5
-"""Every tool that we read counts pixels: the centre of the first one is at 0. Ours is at 0.5."""
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Keypoints:
@@ -314,8 +325,10 @@ class Detections:
     """What the points are; None if no image has a person."""
     images: tuple[DetectedImage, ...]
     """The images."""
-    offset: float = HALF_PIXEL
-    """Pixels to add to x and y so that pixel centres are at +0.5."""
+    offset: float = 0.5
+    """Pixels to add to x and y so that pixel centres are at +0.5: every tool that we read has the
+    centre of the first pixel at 0.
+    """
     warnings: tuple[str, ...] = ()
     """Problems of the files, a line each."""
     tool: str = ""
@@ -323,7 +336,7 @@ class Detections:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Source:
+class KeypointFile:
     """What a reader of a format gets."""
 
     path: Path

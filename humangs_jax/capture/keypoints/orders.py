@@ -37,7 +37,7 @@ class Order(NamedTuple):
     """
 
 
-ORDERS = {
+_ORDERS = {
     25: (
         Order("BODY_25", OPENPOSE_67.names[:25], OPENPOSE_67),
         Order("BODY_25B", OPENPOSE_67B.names[:25], OPENPOSE_67B),
@@ -48,34 +48,42 @@ ORDERS = {
     ),
 }
 """By the number of points, the usual one first."""
-_CHAIN = (
-    ("ear", "shoulder", "elbow", "wrist"),
-    ("shoulder", "hip", "knee", "ankle", "heel"),
-    ("ankle", "big_toe", "small_toe"),
-)
-BONES = (
+_BONES = (
     *(("nose", f"{side}_eye") for side in SIDES),
     *((f"{side}_eye", f"{side}_ear") for side in SIDES),
     *(
         (f"{side}_{a}", f"{side}_{b}")
         for side in SIDES
-        for chain in _CHAIN
+        for chain in (
+            ("ear", "shoulder", "elbow", "wrist"),
+            ("shoulder", "hip", "knee", "ankle", "heel"),
+            ("ankle", "big_toe", "small_toe"),
+        )
         for a, b in itertools.pairwise(chain)
     ),
     *((f"left_{part}", f"right_{part}") for part in ("shoulder", "hip")),
 )
 """Pairs of points that are near each other on a person."""
-CLEARLY_SHORTER = 1.15
-"""How much longer the bones must be on average in any other order. 99 % of single people in random
-poses, seen from anywhere, with errors of 1 % of their height, have more."""
-LONGEST_BONES = 0.36
-"""Mean length of bones above which no order is known, sizes of a person. Of people in random poses
-it is 0.13 to 0.3, where only the trunk is seen 0.25 to 0.35; of points without an order 0.52.
-"""
-FEWEST_BONES = 6
-"""Bones of all people together below which no order is known."""
-CONFIDENT = 0.1
-"""Points of less confidence are not asked."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Known:
+    """When points tell which order they have."""
+
+    shorter: float = 1.15
+    """How much longer the bones must be on average in any other order. 99 % of single people in
+    random poses, seen from anywhere, with errors of 1 % of their height, have more."""
+    longest: float = 0.36
+    """Mean length of bones above which no order is known, sizes of a person. Of people in random
+    poses it is 0.13 to 0.3, where only the trunk is seen 0.25 to 0.35; of points without an order
+    0.52."""
+    fewest: int = 6
+    """Bones of all people together below which no order is known."""
+    confident: float = 0.1
+    """Points of less confidence are not asked."""
+
+
+KNOWN = _Known()
 
 
 def in_order(detections: Detections, count: int) -> Detections:
@@ -84,12 +92,12 @@ def in_order(detections: Detections, count: int) -> Detections:
 
     A warning says which order was found, where it is not the usual one, or that none was.
     """
-    orders = ORDERS[count]
+    orders = _ORDERS[count]
     people = [person for image in detections.images for person in image.people]
     lengths = [_mean_bone(people, order.points, count) for order in orders]
     best = int(np.argmin(lengths))
     others = min(length for i, length in enumerate(lengths) if i != best)
-    known = lengths[best] <= LONGEST_BONES and others >= CLEARLY_SHORTER * lengths[best]
+    known = lengths[best] <= KNOWN.longest and others >= KNOWN.shorter * lengths[best]
     order = orders[best] if known else orders[0]
     warnings = detections.warnings
     usual = known and best == 0 and count == 25
@@ -108,7 +116,7 @@ def in_order(detections: Detections, count: int) -> Detections:
 def _said(order: Order, known: bool, count: int) -> str:
     if known:
         return f"{count} points in the order of {order.name}, by where they lie"
-    others = " or ".join(each.name for each in ORDERS[count] if each is not order)
+    others = " or ".join(each.name for each in _ORDERS[count] if each is not order)
     return (
         f"the order of the {count} points is not clear from where they lie: taken for {order.name},"
         f" not {others}"
@@ -120,14 +128,14 @@ def _mean_bone(
 ) -> float:
     """Mean length of the bones in an order, in sizes of their person; infinite for too few."""
     index = {name: i for i, name in enumerate(names)}
-    pairs = np.asarray([[index[a], index[b]] for a, b in BONES if a in index and b in index])
+    pairs = np.asarray([[index[a], index[b]] for a, b in _BONES if a in index and b in index])
     lengths: list[float] = []
     for person in people:
         points = person[:count]
-        seen = np.isfinite(points).all(axis=1) & (points[:, 2] > CONFIDENT)
+        seen = np.isfinite(points).all(axis=1) & (points[:, 2] > KNOWN.confident)
         both = pairs[seen[pairs].all(axis=1)]
         if len(both):
             size = float(np.ptp(points[seen, :2], axis=0).max())
             bones = np.linalg.norm(points[both[:, 0], :2] - points[both[:, 1], :2], axis=1)
             lengths += (bones / max(size, 1e-6)).tolist()
-    return float(np.mean(lengths)) if len(lengths) >= FEWEST_BONES else np.inf
+    return float(np.mean(lengths)) if len(lengths) >= KNOWN.fewest else np.inf

@@ -17,8 +17,9 @@ from humangs_jax.capture.keypoints.keypoints import (
     OPENPOSE_67,
     DetectedImage,
     Detections,
+    KeypointFile,
     Keypoints,
-    Source,
+    KeypointSet,
 )
 from humangs_jax.capture.keypoints.orders import in_order
 from humangs_jax.core.array_types import Float
@@ -28,38 +29,36 @@ from humangs_jax.data.formats import KEYPOINTS
 from humangs_jax.io.images import PHOTO_SUFFIXES
 from humangs_jax.io.reading import check_limit, reading, walk
 
-NORMALIZED = 2.0
-"""If no coordinate of any view reaches this many pixels, they are no pixels but shares of the
-image.
-"""
-OVERSHOOT = 1.1
-"""Heat maps overshoot 1 a little (1.02 is common) and undershoot 0. Larger scores are of another
-scale, such as the maxima of SimCC heads (RTMPose, RTMW, DWPose), and are divided by the largest of
-the file.
-"""
-LARGEST_SCORE = 20.0
-"""Numbers beyond this are no scores."""
-SMALLEST_CONFIDENCE = -1.0
-"""Numbers below this are no confidences, see `OVERSHOOT`."""
-CLEAR_CONFIDENCE = 0.3
-"""Mean confidence above which a detection is a person; others are a detector's ghosts."""
-CLEAR_SHARE = 0.25
-"""Share of the points of `TRUNK_AND_LIMBS` that a person has more of."""
-TRUNK_AND_LIMBS = frozenset(COCO_17.names)
+_TRUNK_AND_LIMBS = frozenset(COCO_17.names)
 """Points that tell people from ghosts. Hands, face and feet do not count: detectors leave them out
 where they are small, or were not asked for them.
 """
-FAR_OUTSIDE = 0.5
-"""Detectors extrapolate a little beyond the image.
 
-Points further out than this share of its size mean nothing.
-"""
-LARGEST_PIXEL = 1e6
-"""Coordinates beyond it mean nothing, and are not to become inf in float32."""
-UNSORTED = {OPENPOSE_67.name: 25, OPENPOSE_60.name: 18}
-"""Sets whose files may be of another one with as many points, and their points of the body."""
-IMAGE_SUFFIXES = (*PHOTO_SUFFIXES, ".bmp", ".tif", ".tiff")
-"""Suffixes of images that detectors read, and that names in their files may have."""
+
+@dataclasses.dataclass(frozen=True)
+class _Plausible:
+    """Which numbers can be pixels and scores of keypoints."""
+
+    least_extent: float = 2.0
+    """Pixels: if no coordinate of any view reaches this, they are shares of the image."""
+    largest_pixel: float = 1e6
+    """Coordinates beyond it mean nothing, and are not to become inf in float32."""
+    outside: float = 0.5
+    """Detectors extrapolate a little beyond the image. Points further out than this share of its
+    size mean nothing.
+    """
+    overshoot: float = 1.1
+    """Heat maps overshoot 1 a little (1.02 is common) and undershoot 0. Larger scores are of
+    another scale, such as the maxima of SimCC heads (RTMPose, RTMW, DWPose), and are divided by the
+    largest of the file.
+    """
+    largest_score: float = 20.0
+    """Numbers beyond this are no scores."""
+    smallest_score: float = -1.0
+    """Numbers below this are no scores."""
+
+
+_PLAUSIBLE = _Plausible()
 
 
 def read_detections(path: Path) -> Detections:
@@ -82,7 +81,7 @@ def read_detections(path: Path) -> Detections:
     amount = 0
     for file in files:
         name = file.relative_to(path).with_suffix("").as_posix() if path.is_dir() else file.stem
-        source = Source(file, name, alone=len(files) == 1)
+        source = KeypointFile(file, name, alone=len(files) == 1)
         amount += _amount(source.json)
         check_limit("people", amount, "people and images")
         format = KEYPOINTS.of_content(source)
@@ -101,8 +100,10 @@ def read_detections(path: Path) -> Detections:
     if known is None:
         return Detections(None, tuple(images))
     detections = dataclasses.replace(known[2], images=tuple(images))
-    count = UNSORTED.get(detections.set.name if detections.set else "")
-    if count is None or files[0].suffix == ".npz":  # ours tells which order it has
+    # OpenPose's files do not tell the order of their points of the body; our npz files do
+    unsorted = {OPENPOSE_67.name: 25, OPENPOSE_60.name: 18}
+    count = unsorted.get(detections.set.name if detections.set else "")
+    if count is None or files[0].suffix == ".npz":
         return detections
     return in_order(detections, count)
 
@@ -156,86 +157,114 @@ def read_keypoints(
 def _read(
     path: Path, names: Sequence[str], width: int, height: int, person: int | None
 ) -> Keypoints:
+    """Does what `read_keypoints` says, once its arguments are checked."""
     detections = read_detections(path)
-    kind = detections.set
-    if kind is None:
+    if detections.set is None:
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
-    # the image of each view; scores of another scale are divided by the largest
     images = _images_of_views(path, detections, names, width, height)
-    scores = np.concatenate([each[:, 2] for image in detections.images for each in image.people])
-    largest = float(scores[np.isfinite(scores)].max(initial=0.0))
-    largest = largest if largest > OVERSHOOT else 1.0
-    # the person of each view, or the only one; several need an answer from the user
-    body = np.asarray([name in TRUNK_AND_LIMBS for name in kind.names])
+    largest = _largest_score(detections)
+    people = [
+        _usable_people(image, name, detections.offset, largest, (width, height))
+        for image, name in zip(images, names, strict=True)
+    ]
+    chosen = _chosen_people(path, images, people, names, detections.set, person)
+    # points that cannot be used are counted: they may be all of them
     columns = max(each.shape[1] for image in detections.images for each in image.people)
-    raw, values = np.zeros((2, len(names), len(kind.names), columns))
-    most = 0
-    for view, (image, name) in enumerate(zip(images, names, strict=True)):
-        if image is None or not image.people:
-            continue
-        people = np.stack(image.people)
-        usable = _usable(people, largest, detections.offset, (width, height), image.file, name)
-        clear = sum(map(_is_clear, usable[:, body, 2]))
-        if person is None and clear > 1:
-            choice = "Person I is the I-th of each view, counted from 0 in the order of the file"
-            problem = (
-                f"{clear} people: expected one. {choice}; or crop the photos, or delete the others"
-                " from the file"
-            )
-            raise CaptureError(image.file, f"view {name}", problem)
-        which = int(usable[..., 2].sum(axis=1).argmax()) if person is None else person
-        if which < len(people):
-            raw[view], values[view] = people[which], usable[which]
-        most = max(most, len(people))
-    if person is not None and person >= most:
-        raise CaptureError(
-            path,
-            f"person {person}",
-            f"no view has this many people: expected 0 to {max(most - 1, 0)}",
-        )
-    # what cannot be used is counted, and refused if nothing is left
-    points, confidences = values[..., :2].astype(np.float32), values[..., 2].astype(np.float32)
-    missing = tuple(name for name, row in zip(names, confidences, strict=True) if not row.any())
+    raw, values = np.zeros((2, len(names), len(detections.set.names), columns))
+    for view, (image, usable, which) in enumerate(zip(images, people, chosen, strict=True)):
+        if image is not None and usable is not None and which is not None:
+            raw[view], values[view] = image.people[which], usable[which]
     finite = np.isfinite(raw).all(axis=-1)
     dropped = int((~finite).sum())
+    points, confidences = values[..., :2].astype(np.float32), values[..., 2].astype(np.float32)
     far = int((finite & (raw[..., 2] > 0) & (confidences == 0)).sum())
-    if not confidences.any():
+    _check_pixels(path, detections, points[confidences > 0], dropped, far)
+    # what the user should know
+    missing = tuple(name for name, row in zip(names, confidences, strict=True) if not row.any())
+    warnings = [*detections.warnings]
+    if missing:
+        warnings.append(f"no keypoints of {len(missing)} views: {few(missing)}")
+    shifted = _shifted(images, names)
+    if shifted:
+        counted = "frames and photos are counted from different numbers and were matched in order"
+        warnings.append(f"{counted}: {shifted}")
+    if largest > 1:
+        scale = "of another scale than [0, 1]: divided by that"
+        warnings.append(f"scores of up to {largest:.4g}, {scale}")
+    if dropped:
+        warnings.append(f"{dropped} keypoints are not finite numbers and are ignored")
+    if far:
+        where = "far outside of their photo and are ignored: of photos of another size?"
+        warnings.append(f"{far} keypoints lie {where}")
+    world = values[..., 3:].astype(np.float32) if columns > 3 else None
+    return Keypoints(points, confidences, detections.set, missing, world, tuple(warnings))
+
+
+def _largest_score(detections: Detections) -> float:
+    """The score that a confidence of 1 stands for: the largest, where scores are of another scale,
+    else 1.
+    """
+    scores = np.concatenate([each[:, 2] for image in detections.images for each in image.people])
+    largest = float(scores[np.isfinite(scores)].max(initial=0.0))
+    return largest if largest > _PLAUSIBLE.overshoot else 1.0
+
+
+def _chosen_people(
+    path: Path,
+    images: Sequence[DetectedImage | None],
+    people: Sequence[Float[np.ndarray, "_p k columns"] | None],
+    names: Sequence[str],
+    kind: KeypointSet,
+    person: int | None,
+) -> list[int | None]:
+    """Which of the people of each view is meant: the one with this number, or the only one who is
+    more than a ghost. None where nobody is.
+
+    Raises: CaptureError where several may be meant, or no view has this number.
+    """
+    body = np.asarray([name in _TRUNK_AND_LIMBS for name in kind.names])
+    chosen: list[int | None] = []
+    for image, name, usable in zip(images, names, people, strict=True):
+        if image is None or usable is None:
+            chosen.append(None)
+        elif person is not None:
+            chosen.append(person if person < len(usable) else None)
+        else:
+            clear = sum(map(_is_clear, usable[:, body, 2]))
+            if clear > 1:
+                choice = (
+                    "Person I is the I-th of each view, counted from 0 in the order of the file"
+                )
+                others = "or crop the photos, or delete the others from the file"
+                problem = f"{clear} people: expected one. {choice}; {others}"
+                raise CaptureError(image.file, f"view {name}", problem)
+            chosen.append(int(usable[..., 2].sum(axis=1).argmax()))
+    if person is not None and all(which is None for which in chosen):
+        most = max([1, *(len(usable) for usable in people if usable is not None)])
+        problem = f"no view has this many people: expected 0 to {most - 1}"
+        raise CaptureError(path, f"person {person}", problem)
+    return chosen
+
+
+def _check_pixels(
+    path: Path, detections: Detections, points: Float[np.ndarray, "n 2"], dropped: int, far: int
+) -> None:
+    """Whether there are usable points, and whether they are pixels. dropped, far: how many points
+    were left out.
+
+    Raises: CaptureError.
+    """
+    if not len(points):
         problem = (
             f"no point has a confidence above 0 (not finite: {dropped}, far outside of the photos:"
             f" {far})"
         )
         raise CaptureError(path, "", f"{problem}: expected keypoints of these photos")
-    if np.abs(points[confidences > 0]).max() < NORMALIZED:
-        problem = f"no coordinate exceeds {NORMALIZED:g}: expected pixels, not shares of the image"
+    least = _PLAUSIBLE.least_extent
+    if np.abs(points).max() < least:
+        problem = f"no coordinate exceeds {least:g}: expected pixels, not shares of the image"
         hint = " (OpenPose: --keypoint_scale 0)" if detections.tool else ""
         raise CaptureError(path, "", problem + hint)
-    # what the user should know
-    shifted = _shifted(images, names)
-    lines = (
-        (missing, f"no keypoints of {len(missing)} views: {few(missing)}"),
-        (
-            shifted,
-            (
-                "frames and photos are counted from different numbers and were matched in order:"
-                f" {shifted}"
-            ),
-        ),
-        (
-            largest > 1,
-            f"scores of up to {largest:.4g}, of another scale than [0, 1]: divided by that",
-        ),
-        (dropped, f"{dropped} keypoints are not finite numbers and are ignored"),
-        (
-            far,
-            (
-                f"{far} keypoints lie far outside of their photo and are ignored: of photos of"
-                " another size?"
-            ),
-        ),
-    )
-    world = values[..., 3:].astype(np.float32) if columns > 3 else None
-    said = (*detections.warnings, *(line for found, line in lines if found))
-    return Keypoints(points, confidences, kind, missing, world, said)
 
 
 def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> str:
@@ -294,31 +323,35 @@ def _images_of_views(
 
 
 def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
+    """Whether points of trunk and limbs are those of a person; others are a detector's ghosts."""
     present = confidences[confidences > 0]
-    return (
-        len(present) > CLEAR_SHARE * len(confidences) and float(present.mean()) > CLEAR_CONFIDENCE
-    )
+    # a person has more than a quarter of them, with a mean confidence of more than 0.3
+    return len(present) > 0.25 * len(confidences) and float(present.mean()) > 0.3
 
 
-def _usable(
-    people: Float[np.ndarray, "p k columns"],
-    largest: float,
-    offset: float,
-    size: tuple[int, int],
-    file: Path,
-    view: str,
-) -> Float[np.ndarray, "p k columns"]:
-    """Pixels with centres at +0.5, finite, and confidences in [0, 1], 0 for points that cannot be
-    used.
+def _usable_people(
+    image: DetectedImage | None, view: str, offset: float, largest: float, size: tuple[int, int]
+) -> Float[np.ndarray, "p k columns"] | None:
+    """The people of an image with pixel centres at +0.5, finite, and with confidences in [0, 1], 0
+    for points that cannot be used; None where there is nobody.
+
+    Arguments: offset: pixels that are added. largest: score of a confidence of 1. size: of the
+    photo, pixels.
+    Raises: CaptureError for scores that are none.
     """
+    if image is None or not image.people:
+        return None
+    people = np.stack(image.people)
     finite = np.logical_and.reduce(np.isfinite(people), axis=-1)
     known = people[np.isfinite(people[..., 2]), 2]
-    if known.size and (known.min() < SMALLEST_CONFIDENCE or known.max() > LARGEST_SCORE):
+    lowest, highest = _PLAUSIBLE.smallest_score, _PLAUSIBLE.largest_score
+    if known.size and (known.min() < lowest or known.max() > highest):
         got = f"{known.min():.4g} to {known.max():.4g}"
-        raise CaptureError(file, f"view {view}", f"expected confidences in [0, 1], got {got}")
-    values = np.where(finite[..., None], np.clip(people, -LARGEST_PIXEL, LARGEST_PIXEL), 0.0)
+        raise CaptureError(image.file, f"view {view}", f"expected confidences in [0, 1], got {got}")
+    most = _PLAUSIBLE.largest_pixel
+    values = np.where(finite[..., None], np.clip(people, -most, most), 0.0)
     values[..., :2] += offset
-    near = (np.abs(values[..., :2] / size - 0.5) <= 0.5 + FAR_OUTSIDE).all(axis=-1)
+    near = (np.abs(values[..., :2] / size - 0.5) <= 0.5 + _PLAUSIBLE.outside).all(axis=-1)
     values[..., 2] = np.where(near, np.clip(values[..., 2] / largest, 0, 1), 0)
     return values
 
@@ -343,44 +376,20 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     Raises: ValueError if two images are of one view, or a number could mean two views.
     """
     find = _finder(names)
-    # mere numbers in order, if there is one for every view
-    numbers = sorted({image for image in images if isinstance(image, int)})
-    of_names = sorted(number for number in map(_last_number, names) if number is not None)
-    one_for_each = (
-        len(numbers) == len(of_names) == len(names) and _no_gaps(numbers) and _no_gaps(of_names)
-    )
-    shift = of_names[0] - numbers[0] if one_for_each else 0
+    shift = _shift_of_numbers(images, names)
     found = {image: find(image + shift if isinstance(image, int) else image) for image in images}
-    # a number that could be of two views is refused
     for image, views in found.items():
         if len(views) > 1:
             both = " and ".join(repr(names[view]) for view in views[:2])
             raise ValueError(
                 f"image number {image} could be view {both}: expected file names instead of numbers"
             )
-    # frames of a video that are counted from the other number
-    videos: dict[str, list[tuple[int, str | int]]] = {}
-    for image in found:
-        if isinstance(image, int):
-            continue
-        prefix, number = _split_number(str(_stem(image)))
-        if number is not None:
-            videos.setdefault(prefix, []).append((number, image))
-    of_view = [_split_number(name)[0] for name in names]
-    for prefix, frames in videos.items():
-        counts = sorted(number for number, _ in frames)
-        matched_already = all(found[image] for _, image in frames)
-        if counts[0] > 1 or len(counts) < 2 or not _no_gaps(counts) or matched_already:
-            continue
-        moved = {image: find(f"{prefix}{number + 1 - 2 * counts[0]}") for number, image in frames}
-        prefixes = {of_view[view] for views in moved.values() for view in views}
-        all_of_one = all(len(views) == 1 for views in moved.values()) and len(prefixes) == 1
-        if all_of_one and sum(each in prefixes for each in of_view) == len(frames):
-            found |= moved
+    found |= _recounted_videos(found, names, find)
     # at most one image for a view
     owner: dict[int, str | int] = {}
-    matched = [found[image][0] if found[image] else None for image in images]
-    for image, view in zip(images, matched, strict=True):
+    matched: list[int | None] = []
+    for image in images:
+        view = found[image][0] if found[image] else None
         if view in owner:
             raise ValueError(
                 f"{owner[view]!r} and {image!r} are both for view {names[view]!r}: expected one"
@@ -388,7 +397,54 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
             )
         if view is not None:
             owner[view] = image
+        matched.append(view)
     return matched
+
+
+def _shift_of_numbers(images: Sequence[str | int], names: Sequence[str]) -> int:
+    """What to add to mere numbers so that they are the numbers in the views' names: 0, unless there
+    is one for every view and neither have gaps.
+    """
+    numbers = sorted({image for image in images if isinstance(image, int)})
+    of_names = sorted(number for number in map(_last_number, names) if number is not None)
+    one_for_each = len(numbers) == len(of_names) == len(names)
+    if one_for_each and _no_gaps(numbers) and _no_gaps(of_names):
+        return of_names[0] - numbers[0]
+    return 0
+
+
+def _recounted_videos(
+    found: dict[str | int, list[int]],
+    names: Sequence[str],
+    find: Callable[[str | int], list[int]],
+) -> dict[str | int, list[int]]:
+    """The views of frames of videos that are counted from 0 where photos are counted from 1, or the
+    other way round. found: views of images by their names.
+    """
+    videos: dict[str, list[tuple[int, str]]] = {}
+    for image in found:
+        if isinstance(image, int):
+            continue
+        prefix, number = _split_number(str(_stem(image)))
+        if number is not None:
+            videos.setdefault(prefix, []).append((number, image))
+    of_view = [_split_number(name)[0] for name in names]
+    recounted: dict[str | int, list[int]] = {}
+    for prefix, frames in videos.items():
+        counts = sorted(number for number, _ in frames)
+        matched_already = all(found[image] for _, image in frames)
+        if counts[0] > 1 or len(counts) < 2 or not _no_gaps(counts) or matched_already:
+            continue
+        # from 0 to 1, or from 1 to 0; then every photo of one video has to have a frame
+        step = 1 - 2 * counts[0]
+        moved: dict[str | int, list[int]] = {
+            image: find(f"{prefix}{number + step}") for number, image in frames
+        }
+        prefixes = {of_view[view] for views in moved.values() for view in views}
+        all_of_one = all(len(views) == 1 for views in moved.values()) and len(prefixes) == 1
+        if all_of_one and sum(each in prefixes for each in of_view) == len(frames):
+            recounted |= moved
+    return recounted
 
 
 def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
@@ -426,7 +482,9 @@ def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
 
 def _stem(image: str) -> PurePosixPath:
     path = PurePosixPath(image.replace("\\", "/"))
-    return path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+    # of images that detectors read
+    suffixes = (*PHOTO_SUFFIXES, ".bmp", ".tif", ".tiff")
+    return path.with_suffix("") if path.suffix.lower() in suffixes else path
 
 
 def _split_number(name: str) -> tuple[str, int | None]:

@@ -43,13 +43,11 @@ OUTER = (0.03, 0.97)
 """Quantiles of the coordinates between which a person's size is measured, so that outliers do not
 count.
 """
-NOISE_RANGE = (0.5, 8.0)
+_NOISE_RANGE = (0.5, 8.0)
 """Bounds of the noise that a fit finds, multiples of the expected noise."""
 PLACE_STD = 0.02
 """Metres: how far from where they are thought to be detectors see landmarks."""
-OPTICAL_AXIS = np.asarray([0.0, 0.0, 1.0])
-"""The direction in which a camera looks, in its axes."""
-WORLD_STD = 0.15
+_WORLD_STD = 0.15
 """Standard deviation of a detector's 3D landmarks, over the root mean square of their distances
 from their middle.
 """
@@ -152,7 +150,8 @@ def in_camera_axes(
     rays = np.concatenate(
         [np.where(total > 0, (middle - center) / focal, 0), np.ones_like(total)], axis=-1
     )
-    turns = smallest_turns(OPTICAL_AXIS, rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+    optical_axis = np.asarray([0.0, 0.0, 1.0])
+    turns = smallest_turns(optical_axis, rays / np.linalg.norm(rays, axis=-1, keepdims=True))
     return np.einsum("...ab,...kb->...ka", turns, world)
 
 
@@ -187,7 +186,7 @@ def found_noise(lengths: Array | np.ndarray, expected: Array | np.ndarray | np.f
             return np.asarray(expected)
     median = xp.nanmedian(lengths)
     found = xp.where(xp.isnan(median), expected, median / RAYLEIGH_MEDIAN)
-    return xp.clip(found, NOISE_RANGE[0] * expected, NOISE_RANGE[1] * expected)
+    return xp.clip(found, _NOISE_RANGE[0] * expected, _NOISE_RANGE[1] * expected)
 
 
 def in_cameras(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k 3"]:
@@ -227,15 +226,13 @@ def body_errors(
     return jax.vmap(errors)(seen, landmarks[frames])
 
 
-TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")
+_TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")
 """Landmarks that hardly depend on the pose."""
-LIMBS = 0.02
-"""Weight of the others: they count where the trunk is not seen."""
 
 
 def trunk_weights(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
-    """(k,) 1 for landmarks of the trunk, `LIMBS` for others."""
-    return np.asarray([1.0 if kind_of(name) in TRUNK else LIMBS for name in names], np.float32)
+    """(k,) 1 for landmarks of the trunk; others count, by 0.02, where the trunk is not seen."""
+    return np.asarray([1.0 if kind_of(name) in _TRUNK else 0.02 for name in names], np.float32)
 
 
 def keypoint_residuals(
@@ -280,7 +277,7 @@ def world_residuals(
 
     ours, theirs = centered(in_cameras(observations, landmarks)), centered(observations.world)
     errors = ours[..., 2] / size(ours) - theirs[..., 2] / size(theirs)
-    return _roots(weights) * robust(errors[..., None] / WORLD_STD, scale)[..., 0]
+    return _roots(weights) * robust(errors[..., None] / _WORLD_STD, scale)[..., 0]
 
 
 @pytree_dataclass

@@ -32,18 +32,25 @@ from humangs_jax.geometry.mesh import mesh_edges, unit
 from humangs_jax.network.maps import sample_bilinear
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
-PROBE = 1.5
-"""Pixels outside of a silhouette at which there must be no body."""
-NEAREST_EDGE = 0.05
-"""Metres: edges of faces nearer to the camera than this, or behind it, are no silhouette."""
-BORDER = 1.0
-"""Pixels from the image border within which nothing is a silhouette: the image ends there, not the
-person.
-"""
-SPECK = 0.03
-"""Contours shorter than this share of a mask's longest are noise."""
-SMOOTHING = 1.5
-"""Pixels: standard deviation of the blur whose gradient is a mask's normal."""
+
+@dataclasses.dataclass(frozen=True)
+class _Edges:
+    """Where silhouettes are."""
+
+    probe: float = 1.5
+    """Pixels outside of a silhouette at which there must be no body."""
+    nearest: float = 0.05
+    """Metres: edges of faces nearer to the camera than this, or behind it, are no silhouette."""
+    border: float = 1.0
+    """Pixels from the image border within which nothing is a silhouette: the image ends there, not
+    the person."""
+    speck: float = 0.03
+    """Contours shorter than this share of a mask's longest are noise."""
+    smoothing: float = 1.5
+    """Pixels: standard deviation of the blur whose gradient is a mask's normal."""
+
+
+_EDGES = _Edges()
 
 
 class MeshEdges(NamedTuple):
@@ -106,7 +113,7 @@ def look(
     seen = transform.apply(camera.cam_from_world, vertices)
     depths = seen[:, 2]
     pixels = (
-        seen[:, :2] / jnp.where(depths > NEAREST_EDGE, depths, 1.0)[:, None] * focal
+        seen[:, :2] / jnp.where(depths > _EDGES.nearest, depths, 1.0)[:, None] * focal
         + camera.K[:2, 2]
     )
     # a plane through the camera with normal n is the line n . (x / fx, y / fy, 1) = 0 of the image
@@ -126,7 +133,7 @@ def body_boundary(
     corners = view.pixels[faces]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     towards = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
-    before = (view.depths > NEAREST_EDGE)[faces].all(axis=1)
+    before = (view.depths > _EDGES.nearest)[faces].all(axis=1)
     first, second = mesh.faces.T
     # edges between a face that looks at the camera and one that looks away, and borders of the
     # mesh, unless they are behind the camera
@@ -136,7 +143,7 @@ def body_boundary(
     normals = unit(view.normals[ends].sum(axis=1))
     # of these, edges with no body beside them in the image: others are inside of the silhouette
     middles = view.pixels[ends].mean(axis=1)
-    outside = ~_covered(view.covered, middles + PROBE * normals) & inside_image(
+    outside = ~_covered(view.covered, middles + _EDGES.probe * normals) & _inside_image(
         middles, view.covered.shape
     )
     ends, normals = ends[outside], normals[outside]
@@ -164,21 +171,21 @@ def mask_boundary(
     # contours that are long enough, as pieces of lines
     steps = [np.linalg.norm(np.diff(contour, axis=0), axis=1) for contour in contours]
     longest = max((step.sum() for step in steps), default=0.0)
-    kept = [i for i, step in enumerate(steps) if step.sum() >= SPECK * longest]
+    kept = [i for i, step in enumerate(steps) if step.sum() >= _EDGES.speck * longest]
     none = np.zeros((0, 2))
     starts = np.concatenate([none, *(contours[i][:-1] for i in kept)])
     ends = np.concatenate([none, *(contours[i][1:] for i in kept)])
     lengths = (
         np.linalg.norm(ends - starts, axis=1)
-        * inside_image(starts, mask.shape)
-        * inside_image(ends, mask.shape)
+        * _inside_image(starts, mask.shape)
+        * _inside_image(ends, mask.shape)
     )
     if hidden is not None:
         lengths = lengths * ~_covered(hidden, starts)
     # points evenly along them; normals down the slope of the blurred mask
     segment, shares = _spread(lengths, count)
     positions = starts[segment] + shares[:, None] * (ends - starts)[segment]
-    down, right = np.gradient(gaussian(mask, SMOOTHING, mode="nearest"))
+    down, right = np.gradient(gaussian(mask, _EDGES.smoothing, mode="nearest"))
     column, row = np.floor(positions).astype(int).T
     return Boundary(
         positions.astype(np.float32),
@@ -186,12 +193,12 @@ def mask_boundary(
     )
 
 
-def inside_image(
+def _inside_image(
     positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]
 ) -> Bool[np.ndarray, "*p"]:
-    """Which positions are further than `BORDER` inside of an image of (height, width)."""
+    """Which positions are well inside of an image of (height, width), see `_EDGES`."""
     size = np.asarray([shape[1], shape[0]])
-    return np.all((positions > BORDER) & (positions < size - BORDER), axis=-1)
+    return np.all((positions > _EDGES.border) & (positions < size - _EDGES.border), axis=-1)
 
 
 def _covered(
@@ -218,8 +225,6 @@ def _spread(
 
 LOOKS = 129
 """Samples along a normal: half a pixel apart in the first round, less later."""
-FACING = 0.5
-"""Least cosine between the normals of two points that belong together (60 degrees)."""
 
 
 @pytree_dataclass
@@ -281,7 +286,7 @@ def _ends_of_mask(
     steps = np.linspace(-reach, reach, LOOKS)
     places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
     covered = np.asarray(coverage(from_host(mask), from_host(places, np.float32)))
-    seen = inside_image(places, mask.shape)
+    seen = _inside_image(places, mask.shape)
     if hidden is not None:
         seen &= ~_covered(hidden, places.reshape(-1, 2)).reshape(seen.shape)
     ends = (covered[:, :-1] >= 0.5) & (covered[:, 1:] < 0.5) & seen[:, :-1] & seen[:, 1:]
@@ -306,7 +311,8 @@ def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
     if not len(body.positions) or not len(mask.positions):
         return np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
     distances = np.linalg.norm(mask.positions[:, None] - body.positions, axis=-1)
-    distances = np.where(mask.normals @ body.normals.T > FACING, distances, np.inf)
+    # least cosine between the normals of two points that belong together (60 degrees)
+    distances = np.where(mask.normals @ body.normals.T > 0.5, distances, np.inf)
     nearest = np.argmin(distances, axis=1)
     found = distances[np.arange(len(nearest)), nearest] < reach
     return (
@@ -320,8 +326,10 @@ def distances(
     matches: Matches, pixels: Float[Array | np.ndarray, "p 2"]
 ) -> Float[Array | np.ndarray, " e"]:
     """How far points of the body are outside of their lines, pixels; negative inside."""
+    # term by term: XLA's CPU compiler (jaxlib 0.10.2) makes wrong Jacobians of `jnp.sum` over both
+    # under `jax.jacfwd`
     along = matches.normals * pixels[matches.points]
-    return along[:, 0] + along[:, 1] - matches.offsets  # not `jnp.sum`: see `scan.scan_residuals`
+    return along[:, 0] + along[:, 1] - matches.offsets
 
 
 def silhouette_residuals(

@@ -61,32 +61,13 @@ from humangs_jax.capture.fitting.state import (
 )
 from humangs_jax.capture.fitting.triangulation import reprojection_errors
 from humangs_jax.capture.keypoints.keypoints import Keypoints
-from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host, taken
 from humangs_jax.core.processes import Call
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.geometry.camera import Camera
-
-LEAST_NOISE = 0.7
-"""Pixels: silhouettes of masks are no better."""
-LM_UNKNOWNS = 400
-"""With more unknowns L-BFGS replaces least squares, whose Jacobian grows with rows times columns.
-"""
-PATIENCE = 6
-"""Steps of L-BFGS for one of least squares."""
-STEPS = 4
-"""Steps of the solver in a round."""
-LONGEST_SIDE = 512
-"""Pixels to which larger photos are shrunk."""
-REACH = (0.08, 0.015)
-"""How far points look in the first and the last round, shares of the person's height in the image.
-"""
-KEYPOINT_SCALE = 5.0
-"""Robust scale of keypoints, standard deviations."""
-BARE = 5.0
-"""Clothes have no negative thickness: it counts this much more than a positive one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,8 +82,14 @@ class CaptureRefineConfig:
     """Whether only shape and poses move."""
     iterations: int = 10
     """Number of matchings."""
+    longest_side: int = 512
+    """Pixels to which larger photos are shrunk."""
     points: int = 300
     """Points of a silhouette."""
+    reach: tuple[float, float] = (0.08, 0.015)
+    """How far these look for the mask in the first and the last matching, shares of the person's
+    height in the image.
+    """
     independent: float = 30.0
     """Number of independent equations that all points of a view count for."""
     robust_scales: tuple[float, float] = (1.0, 0.5)
@@ -114,17 +101,6 @@ class CaptureRefineConfig:
     """
     by_joint: tuple[tuple[str, float], ...] = ()
     """(word, factor): multiples of `std.body_pose` for joints whose names hold the word."""
-
-
-FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pose=8.0, betas=1.0)
-"""Where a fit to keypoints with calibrated cameras is off: shape and pose, more than cameras. Its
-keypoints hold the joints where clothes would pull them away."""
-FROM_PERSON = dataclasses.replace(FITTED, focal=0.05, camera_rotation=2.0, camera_center=0.08)
-"""The same with cameras that were found from the person."""
-SKIN = 0.001
-"""`StateStd.clothing` for masks of somebody without clothes, metres."""
-TIGHT = 0.015
-"""`StateStd.clothing` for masks of somebody in tight clothes, metres."""
 
 
 def usual_config(
@@ -141,15 +117,22 @@ def usual_config(
     """
     std, config = StateStd(), CaptureRefineConfig(fixed_cameras=fixed_cameras)
     if fitted:
-        std = FITTED if calibrated else FROM_PERSON
+        # such a fit is off in shape and pose, more than in cameras that are calibrated; its
+        # keypoints hold the joints where clothes would pull them away
+        std = StateStd(body_pose=8.0, betas=1.0)
+        if calibrated:
+            std = replace(std, focal=0.005, camera_rotation=1.0, camera_center=0.02)
+        else:
+            std = replace(std, focal=0.05, camera_rotation=2.0, camera_center=0.08)
         config = dataclasses.replace(config, independent=100.0)
     # the masks are believed, or cameras were fitted to these very keypoints
     if bare or tight or not calibrated:
         config = dataclasses.replace(config, keypoints_worse=math.inf)
+    # metres of clothes: 1.5 cm where they are tight, a millimetre where there are none
     if tight:
-        std = dataclasses.replace(std, clothing=TIGHT, betas=2.0, body_pose=10.0)
+        std = replace(std, clothing=0.015, betas=2.0, body_pose=10.0)
     if bare:
-        std = dataclasses.replace(std, clothing=SKIN)
+        std = replace(std, clothing=0.001)
         config = dataclasses.replace(config, robust_scales=(1.0, 1.0))
     return dataclasses.replace(config, std=std)
 
@@ -237,7 +220,7 @@ class Evidence:
     """Keypoints, a batch of v with one view each (c = 1); None without."""
 
 
-def evidence_residuals(
+def _evidence_residuals(
     model: LandmarkModel, origin: Origin, state: FitState, evidence: Evidence, independent: float
 ) -> dict[str, Float[Array, "..."]]:
     """Residuals of the views, in standard deviations, by kind: silhouettes (v, e) and keypoints (v,
@@ -249,7 +232,9 @@ def evidence_residuals(
     transforms, joints = jax.vmap(lambda pose: pose_joints(model, betas, pose))(poses)
     features = jax.vmap(pose_features)(poses.rotations)
 
-    def silhouette(points, matches, frame, K, matrix):
+    # silhouettes of each view: the points of the body's rim, out by the thickness of clothes
+    def silhouette_errors(points, matches, frame, K, matrix):
+        """Residuals of a view, (e,)."""
         posed = pose_points(points, betas, features[frame], transforms[frame])
         seen = jnp.matmul(posed, matrix[:3, :3].T, precision=EXACT) + matrix[:3, 3]
         focal, depth = jnp.stack([K[0, 0], K[1, 1]]), jnp.maximum(seen[:, 2:], NEAR)
@@ -261,26 +246,31 @@ def evidence_residuals(
         )
 
     views = evidence.points, evidence.matches, frame, K, cam_from_world
-    parts = {"silhouettes": jax.vmap(silhouette)(*views)}
+    parts = {"silhouettes": jax.vmap(silhouette_errors)(*views)}
+    if evidence.keypoints is None:
+        return parts
+
     # keypoints of each view alone, under the camera of the state
-    if evidence.keypoints is not None:
+    def landmarks(features, transforms, joints):
+        """Landmarks of a frame, (k, 3), metres."""
+        points = pose_points(model.points, betas, features, transforms)
+        return landmarks_from(model, joints, points)
 
-        def landmarks(features, transforms, joints):
-            points = pose_points(model.points, betas, features, transforms)
-            return landmarks_from(model, joints, points)
+    def keypoint_errors(seen, points):
+        """Residuals of a view; those beyond five standard deviations pull less and less."""
+        return keypoint_residuals(model, seen, points, 5.0)
 
-        def compare(own, points):
-            return keypoint_residuals(model, own, points, KEYPOINT_SCALE)
-
-        seen = replace(evidence.keypoints, K=K[:, None], cam_from_world=cam_from_world[:, None])
-        points = jax.vmap(landmarks)(features, transforms, joints)[frame]
-        parts["keypoints"] = jax.vmap(compare)(seen, points)
+    seen = replace(evidence.keypoints, K=K[:, None], cam_from_world=cam_from_world[:, None])
+    points = jax.vmap(landmarks)(features, transforms, joints)[frame]
+    parts["keypoints"] = jax.vmap(keypoint_errors)(seen, points)
     return parts
 
 
 def _counted(clothing: Float[Array, " b"]) -> Float[Array, " b"]:
-    """Thicknesses of clothes as their prior counts them."""
-    return jnp.where(clothing < 0, BARE * clothing, clothing)
+    """Thicknesses of clothes as their prior counts them: clothes have no negative one, which counts
+    five times.
+    """
+    return jnp.where(clothing < 0, 5.0 * clothing, clothing)
 
 
 def _as_motion(values: Float[Array, "m ..."], memory: Float[Array, " n"]) -> Float[Array, "m ..."]:
@@ -310,12 +300,13 @@ def solve_round(
             names = ("global_orient", "transl", "body_pose")
             motion = {name: _as_motion(getattr(y, name), memory) for name in names}
             counted = replace(counted, **motion)
-        return evidence_residuals(model, origin, y, evidence, independent), counted
+        return _evidence_residuals(model, origin, y, evidence, independent), counted
 
-    many = sum(leaf.size for leaf in jax.tree.leaves(state)) > LM_UNKNOWNS
-    if many:
-        return solve(residuals, state, PATIENCE * STEPS, method="lbfgs")[0]
-    return solve(residuals, state, STEPS, method="lm")[0]
+    # with more than 400 unknowns L-BFGS replaces least squares, whose Jacobian grows with rows
+    # times columns; six of its steps are worth one
+    if sum(leaf.size for leaf in jax.tree.leaves(state)) > 400:
+        return solve(residuals, state, 24, method="lbfgs")[0]
+    return solve(residuals, state, 4, method="lm")[0]
 
 
 # Iterations
@@ -336,55 +327,101 @@ class Score:
     """1 - iou plus the keypoints' error as a share of the person's height."""
 
 
-class Scene:
-    """What stays the same over the iterations: masks at the size that is looked at, keypoints, and
-    the origin.
+@dataclasses.dataclass(frozen=True, eq=False)
+class SilhouetteFit:
+    """What stays the same over the matchings of v photos: masks and keypoints at the size that is
+    looked at, and the origin of the state.
     """
 
-    def __init__(
-        self,
+    capture: Capture
+    """The start: photos at their size, with the body."""
+    config: CaptureRefineConfig
+    """Settings."""
+    memory: Float[Array, " n"] | None
+    """Correlations of each pose with the one before, (m - 1,); None: each stands for itself."""
+    cameras: Camera
+    """Cameras of the photos at the size that is looked at."""
+    masks: Float[np.ndarray, "v h w"]
+    """Masks at that size, (v, h, w), 0 to 1; zeros without masks."""
+    unknown: Bool[np.ndarray, "v h w"] | None
+    """Where masks say nothing, (v, h, w); None: they say something everywhere."""
+    hidden: list[Bool[np.ndarray, "h w"] | None]
+    """The same with a rim where the edge of a mask is that of whoever stands in front; None for a
+    view without any.
+    """
+    faces: Int[np.ndarray, "f 3"]
+    """Faces of the body."""
+    edges: silhouettes.MeshEdges
+    """Edges of these faces."""
+    boundaries: list[silhouettes.Boundary]
+    """Boundaries of the masks, away from whoever stands in front."""
+    model: LandmarkModel
+    """Landmarks of the keypoints on the body."""
+    keypoints: Observations | None
+    """Keypoints in pixels of the photos, which scores are in; None without any."""
+    observations: Observations | None
+    """Keypoints in pixels of the size that is looked at; None without any."""
+    scale: float
+    """Pixels of that size for one of the photos."""
+    height: float
+    """Height of the person, pixels of that size."""
+    origin: Origin
+    """Where the zeros of the state are."""
+
+    @classmethod
+    def of(
+        cls,
         capture: Capture,
         keypoints: Keypoints | None,
         config: CaptureRefineConfig,
         memory: Float[np.ndarray, " n"] | None = None,
-    ) -> None:
-        self.capture, self.config = capture, config
-        self.memory = None if memory is None else from_host(memory, np.float32)
-        # photos at the size that is looked at
-        small = max(capture.images.shape[1:3]) <= LONGEST_SIDE
-        looked_at = capture if small else capture.resized(LONGEST_SIDE)
-        empty = np.zeros(looked_at.images.shape[:3], np.float32)
-        self.cameras = looked_at.cameras
-        self.masks = empty if looked_at.masks is None else looked_at.masks
-        # silhouettes: the mesh's edges, and the masks' boundaries away from whoever stands in front
-        self.faces = np.asarray(capture.body.faces)
-        self.edges = silhouettes.body_edges(self.faces)
-        self.unknown = looked_at.unknown
-        self.hidden = _with_rim(looked_at.unknown, len(self.masks))
-        self.boundaries = [
-            silhouettes.mask_boundary(mask, config.points, hidden)
-            for mask, hidden in zip(self.masks, self.hidden, strict=True)
-        ]
-        # keypoints: in pixels of the photos for scores, in those that are looked at for the solver
-        self.scale = self.cameras.width / capture.cameras.width
+    ) -> "SilhouetteFit":
+        """Prepares the fit of a capture. memory: see `refine_capture`."""
+        small = max(capture.images.shape[1:3]) <= config.longest_side
+        looked_at = capture if small else capture.resized(config.longest_side)
+        cameras, masks = looked_at.cameras, looked_at.masks
+        if masks is None:
+            masks = np.zeros(looked_at.images.shape[:3], np.float32)
+        faces = np.asarray(capture.body.faces)
+        hidden = _with_rim(looked_at.unknown, len(masks))
         if keypoints is None:
-            self.model = landmark_model(capture.body, ())
-            self.keypoints = self.observations = None
+            model = landmark_model(capture.body, ())
+            in_photos = observations = None
         else:
             kind, photos = keypoints.set, capture.cameras
-            self.model = landmark_model(capture.body, kind.names, kind.places, kind.certainty)
-            self.keypoints = scaled_observations(photos, keypoints, photos)
-            self.observations = scaled_observations(self.cameras, keypoints, photos)
-        self.height = _person_height(self.masks, self.observations)
-        self.origin = capture_origin(capture, self.cameras, config)
+            model = landmark_model(capture.body, kind.names, kind.places, kind.certainty)
+            in_photos = scaled_observations(photos, keypoints, photos)
+            observations = scaled_observations(cameras, keypoints, photos)
+        return cls(
+            capture=capture,
+            config=config,
+            memory=None if memory is None else from_host(memory, np.float32),
+            cameras=cameras,
+            masks=masks,
+            unknown=looked_at.unknown,
+            hidden=hidden,
+            faces=faces,
+            edges=silhouettes.body_edges(faces),
+            boundaries=[
+                silhouettes.mask_boundary(mask, config.points, unseen)
+                for mask, unseen in zip(masks, hidden, strict=True)
+            ],
+            model=model,
+            keypoints=in_photos,
+            observations=observations,
+            scale=cameras.width / capture.cameras.width,
+            height=_person_height(masks, observations),
+            origin=capture_origin(capture, cameras, config),
+        )
 
     def run(self) -> tuple[FitState, float]:
-        """The state after all iterations, and the largest move of the last round, in expected
-        standard deviations.
+        """The state after all matchings, and the largest move of the last one, in expected standard
+        deviations.
         """
         config, state, move = self.config, start_state(self.origin, self.config), 0.0
-        first, last = REACH
+        first, last = config.reach
         for turn in range(config.iterations):
+            # points look less and less far
             share = turn / max(config.iterations - 1, 1)
             evidence = self.look(state, self.height * first * (last / first) ** share)
             before = state
@@ -445,6 +482,13 @@ class Scene:
             silhouettes.match(boundary, mask, other, reach, count, hidden)
             for boundary, mask, other, hidden in views
         ]
+        # the noise of keypoints is what a body finds: a detector's own bias is no evidence against
+        # the masks
+        keypoints = self.observations
+        if self.keypoints is not None and keypoints is not None:
+            errors = self._keypoint_errors(moved, self.keypoints) * np.float32(self.scale)
+            noise = found_noise(errors, np.asarray(keypoints.noise))
+            keypoints = replace(keypoints, noise=from_host(noise, np.float32))
         return Evidence(
             points=silhouettes.boundary_points(
                 self.capture.body, boundaries, count, len(self.origin.betas)
@@ -452,25 +496,18 @@ class Scene:
             matches=jax.tree.map(lambda *leaves: from_host(np.stack(leaves)), *matches),
             noise=from_host(_noise(boundaries, matches), np.float32),
             scales=from_host(reach * np.asarray(self.config.robust_scales), np.float32),
-            keypoints=self._keypoints(moved),
+            keypoints=keypoints,
         )
 
-    def _keypoints(self, capture: Capture) -> Observations | None:
-        """The keypoints, with the noise that a body finds: a detector's own bias is no evidence
-        against the masks.
+    def _keypoint_errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
+        """Distances of a body from these keypoints, pixels of the photos; NaN where there is
+        none.
         """
-        if self.keypoints is None or self.observations is None:
-            return None
-        errors = self._errors(capture, self.keypoints) * np.float32(self.scale)
-        noise = found_noise(errors, np.asarray(self.observations.noise))
-        return replace(self.observations, noise=from_host(noise, np.float32))
-
-    def _errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
-        """Errors of the keypoints in pixels of the photos; NaN where there is none."""
+        cameras = capture.cameras
         seen = replace(
             seen,
-            K=np.asarray(capture.cameras.K)[:, None],
-            cam_from_world=np.asarray(capture.cameras.cam_from_world)[:, None],
+            K=np.asarray(cameras.K)[:, None],
+            cam_from_world=np.asarray(cameras.cam_from_world)[:, None],
         )
         betas = from_host(capture.betas)
         errors = body_errors(
@@ -498,27 +535,20 @@ class Scene:
         loss = 0.0 if iou is None else 1 - iou
         keypoints = None
         if self.keypoints is not None:
-            errors = self._errors(capture, self.keypoints)
+            errors = self._keypoint_errors(capture, self.keypoints)
             if np.isfinite(errors).any():
                 keypoints = float(np.nanmedian(errors))
                 loss += keypoints * self.scale / self.height
         return Score(ious, iou, keypoints, loss)
 
 
-HIDDEN_RIM = 3
-"""Pixels around what is unknown where the edge of a mask is that of whoever stands in front."""
-
-
 def _with_rim(
     unknown: Bool[np.ndarray, "v h w"] | None, views: int
 ) -> list[Bool[np.ndarray, "h w"] | None]:
-    """What is unknown of each view and its rim; None for a view without any."""
+    """What is unknown of each view and a rim of three pixels; None for a view without any."""
     if unknown is None:
         return [None] * views
-    return [
-        ndimage.binary_dilation(each, iterations=HIDDEN_RIM) if each.any() else None
-        for each in unknown
-    ]
+    return [ndimage.binary_dilation(each, iterations=3) if each.any() else None for each in unknown]
 
 
 def overlap(
@@ -550,7 +580,7 @@ def _noise(
     boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]
 ) -> float:
     """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a
-    body that is not yet there.
+    body that is not yet there. At least 0.7: silhouettes of masks are no better.
     """
     found = [np.zeros(0)]
     for boundary, own in zip(boundaries, matches, strict=True):
@@ -560,7 +590,7 @@ def _noise(
     distances = np.abs(np.concatenate(found))
     if not len(distances):
         return 1.0
-    return max(NORMAL_MAD * float(np.median(distances)), LEAST_NOISE)
+    return max(NORMAL_MAD * float(np.median(distances)), 0.7)
 
 
 def _person_height(
@@ -580,19 +610,6 @@ def _person_height(
         sizes = [np.ptp(points[seen], axis=0).max() for points, seen in pairs if seen.any()]
     return float(np.median(sizes)) if sizes else float("nan")
 
-
-LEAST_GAIN = 0.02
-"""Share of the loss that a kept change removes where keypoints are known."""
-LEAST_GAIN_OF_MASKS = 0.2
-"""The same by masks alone. Masks of clothes are fitted a little better by wrong bodies, which
-keypoints would show: for four people who started at the truth, by up to 0.15.
-"""
-LEAST_DIFFERENCE = 0.005
-"""Least decrease of the loss that is kept: less than half a percent of the silhouettes is rounding
-of pixels.
-"""
-LEAST_IOU = 0.6
-"""Bodies in clothes overlap masks by more than this; less means that the start was too far off."""
 
 DEFAULT_CONFIG = CaptureRefineConfig()
 
@@ -634,10 +651,10 @@ def refine_capture(
             "none shows anybody, and there are no keypoints: refinement needs one or the other",
         )
     # the start stays unless the result is clearly better
-    scene = Scene(capture, keypoints, config, memory)
-    state, move = scene.run()
-    tried = moved_capture(capture, scene.origin, state)
-    before, found = scene.score(capture), scene.score(tried)
+    fit = SilhouetteFit.of(capture, keypoints, config, memory)
+    state, move = fit.run()
+    tried = moved_capture(capture, fit.origin, state)
+    before, found = fit.score(capture), fit.score(tried)
     kept = _better(found, before, config.keypoints_worse)
     best, score = (tried, found) if kept else (capture, before)
     # what happened, in one line
@@ -652,10 +669,17 @@ def refine_capture(
 
 
 def _better(found: Score, before: Score, most_worse: float) -> bool:
-    known = found.keypoints is not None and before.keypoints is not None
-    least = LEAST_GAIN if known else LEAST_GAIN_OF_MASKS
-    worse = known and found.keypoints > most_worse * before.keypoints
-    return not worse and before.loss - found.loss > max(least * before.loss, LEAST_DIFFERENCE)
+    """Whether a change is kept. most_worse: see `CaptureRefineConfig.keypoints_worse`."""
+    if found.keypoints is None or before.keypoints is None:
+        # masks of clothes are fitted a little better by wrong bodies, which keypoints would show:
+        # for four people who started at the truth, by up to 0.15 of the loss
+        least = 0.2
+    elif found.keypoints > most_worse * before.keypoints:
+        return False
+    else:
+        least = 0.02
+    # less than half a percent of the silhouettes is rounding of pixels
+    return before.loss - found.loss > max(least * before.loss, 0.005)
 
 
 def _report(start: Capture, best: Capture, before: Score, after: Score, note: str) -> FitReport:
@@ -680,8 +704,9 @@ def _report(start: Capture, best: Capture, before: Score, after: Score, note: st
             notes.append(
                 "the displacement of body.npz is left out: it was made for the shape before"
             )
+    # bodies in clothes overlap masks by more than this
     warnings = []
-    if after.iou is not None and after.iou < LEAST_IOU:
+    if after.iou is not None and after.iou < 0.6:
         warnings.append(
             "body and masks do not agree: the start was too far off; `humangs check` shows why"
         )

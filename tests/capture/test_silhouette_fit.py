@@ -13,15 +13,7 @@ import trimesh
 
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.capture.fitting import refine as module
-from humangs_jax.capture.fitting.refine import (
-    CaptureRefineConfig,
-    Scene,
-    Score,
-    refine_capture,
-    start_state,
-    usual_config,
-)
+from humangs_jax.capture.fitting import silhouette_fit as module
 from humangs_jax.capture.fitting.residuals import silhouettes
 from humangs_jax.capture.fitting.residuals.silhouettes import (
     BodyView,
@@ -32,6 +24,14 @@ from humangs_jax.capture.fitting.residuals.silhouettes import (
     match,
     silhouette_residuals,
     view_body,
+)
+from humangs_jax.capture.fitting.silhouette_fit import (
+    CaptureRefineConfig,
+    Score,
+    SilhouetteFit,
+    refine_capture,
+    start_state,
+    usual_config,
 )
 from humangs_jax.capture.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.core.pytree import replace
@@ -275,7 +275,7 @@ def test_keypoints_of_long_narrow_photos_are_where_they_are():
     known = dataclasses.replace(known, points=known.points * np.float32([90 / SIZE, 600 / SIZE]))
     images = np.broadcast_to(np.float32(0), (VIEWS, 600, 90, 3))
     capture = dataclasses.replace(truth(), images=images, masks=None, cameras=cameras)
-    scene = Scene(capture, known, CONFIG)
+    scene = SilhouetteFit.of(capture, known, CONFIG)
     assert scene.score(capture).keypoints < 0.01
     width, height = scene.cameras.width, scene.cameras.height
     np.testing.assert_allclose(
@@ -292,7 +292,7 @@ def test_keypoints_weigh_by_the_noise_that_the_body_finds():
     biased = dataclasses.replace(known, points=known.points + np.float32(6.0))
     noises = []
     for each in (known, biased):
-        scene = Scene(truth(), each, CONFIG)
+        scene = SilhouetteFit.of(truth(), each, CONFIG)
         expected = scene.observations.noise
         noises.append(
             np.asarray(
@@ -460,7 +460,7 @@ def shapes_of(arguments):
 
 def test_what_is_compiled_ahead_is_what_a_refinement_calls(monkeypatch):
     unmasked = dataclasses.replace(augmented(), masks=None)
-    ahead = list(Scene(unmasked, keypoints(), CONFIG).calls())
+    ahead = list(SilhouetteFit.of(unmasked, keypoints(), CONFIG).calls())
     expected = {program.__name__: shapes_of(arguments) for program, arguments in ahead}
     called = {}
 
@@ -476,7 +476,7 @@ def test_what_is_compiled_ahead_is_what_a_refinement_calls(monkeypatch):
             if hasattr(holder, program.__name__):
                 note(holder, program.__name__, getattr(holder, program.__name__))
     note(module, "solve_round", lambda model, origin, evidence, state, *settings: state)
-    scene = Scene(augmented(), keypoints(), dataclasses.replace(CONFIG, iterations=1))
+    scene = SilhouetteFit.of(augmented(), keypoints(), dataclasses.replace(CONFIG, iterations=1))
     state, _ = scene.run()
     scene.score(module.moved_capture(augmented(), scene.origin, state))
     assert set(expected) == set(called) and len(expected) == 6
