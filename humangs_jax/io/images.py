@@ -10,10 +10,8 @@ who imports photos decides. HEIC photos come upright: their format turns them, n
 """
 
 import contextlib
-import functools
 import importlib
 import io
-import logging
 import struct
 import warnings
 from collections.abc import Generator, Iterable
@@ -24,30 +22,18 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt, UInt8
 from humangs_jax.io.atomic import write_bytes
-from humangs_jax.io.color_spaces import (
-    Encoding,
-    by_tables,
-    is_srgb,
-    of_code_points,
-    of_gamma,
-    pixels_in_srgb,
-    read_profile,
-)
 from humangs_jax.io.decoded import content_key, kept_photos
+from humangs_jax.io.image_colors import colors_in_srgb
 from humangs_jax.io.image_headers import (
     JPEG_START,
     check_png_chunks,
     is_webp,
     iso_kind,
     jpeg_scans,
-    nclx_colors,
     other_frame,
-    png_chunks,
     webp_size,
 )
 from humangs_jax.io.reading import InvalidFileError, check_limit, open_file, read_bytes, reading
-
-logger = logging.getLogger(__name__)
 
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")
 """Suffixes of the photos, masks and images that are read, the likelier original first."""
@@ -526,7 +512,7 @@ def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray,
         levels, most = _levels(image, data)
         colors = None
         if not as_stored:
-            colors = _colors_in_srgb(path, image, data, levels, most)
+            colors = colors_in_srgb(path, image, data, levels, most)
         pixels = levels.astype(np.float32) / np.float32(most)
     if colors is not None:
         if pixels.shape[-1] in (2, 4):
@@ -572,94 +558,3 @@ def _decoded(data: bytes, raw: str) -> UInt[np.ndarray, "h w c"]:
     with image_in(data) as image:
         image.tile = [(*tile[:3], raw) for tile in image.tile]
         return np.asarray(image).astype(np.uint16)
-
-
-# Colors
-# --------------------------------------------------------------------------------------------------
-
-
-def _colors_in_srgb(
-    path: str | Path, image: Any, data: bytes, levels: UInt[np.ndarray, "h w c"], most: int
-) -> Float[np.ndarray, "h w 3"] | None:
-    """Returns colors of a file that says how they are encoded; None where levels are in sRGB
-    already.
-    """
-    channels = 1 if levels.shape[-1] < 3 else 3
-    levels = levels[..., :channels]
-    try:
-        encoding = _encoding_in_header(image, data)
-        profile = image.info.get("icc_profile")
-        if encoding is None and profile:
-            found = read_profile(profile)
-            # photos in colors have profiles of colors; those in grey may have either
-            own = {"CMYK": ("CMYK",), "RGB": ("colors",), "RGBA": ("colors",), "P": ("colors",)}
-            if found.space not in own.get(image.mode, ("colors", "greys")):
-                raise InvalidFileError(f"it is one of {found.space}, and the photo is none")
-            if found.encoding is None:
-                return _by_tables(image, profile, levels, most)
-            encoding = found.encoding
-    except InvalidFileError as error:
-        _tell(f"{path}: its color profile is not used: {error}")
-        return None
-    if encoding is None or is_srgb(encoding):
-        return None
-    return pixels_in_srgb(levels, most, encoding)
-
-
-def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
-    """Reads the color encoding that a photo's header states; it wins over an ICC profile.
-
-    None if it states none. Of PNG's ways the newest wins.
-    """
-    if image.format == "PNG":
-        chunks = png_chunks(data)
-        points = chunks.get(b"cICP", b"")
-        if len(points) >= 2:
-            return of_code_points(points[0], points[1])
-        if b"iCCP" in chunks or b"sRGB" in chunks:
-            return None
-        return of_gamma(image.info.get("gamma"), image.info.get("chromaticity"))
-    if image.info.get("icc_profile"):
-        return None
-    points = None
-    if image.format == "AVIF":
-        points = nclx_colors(data)
-    nclx = image.info.get("nclx_profile")
-    if image.format == "HEIF" and isinstance(nclx, dict):
-        points = int(nclx.get("color_primaries", 1)), int(nclx.get("transfer_characteristics", 13))
-    if points is None:
-        return None
-    return of_code_points(*points)
-
-
-def _by_tables(
-    image: Any, profile: bytes, levels: UInt[np.ndarray, "h w c"], most: int
-) -> Float[np.ndarray, "h w 3"] | None:
-    """Converts colors by Little CMS, which has 8 bits here: where the file has 16, the lower ones
-    are added as they are.
-    """
-    from PIL import Image
-
-    if levels.shape[-1] == 1:
-        raise InvalidFileError("it is tables, and the photo is grey")
-    stored = levels
-    if most > 255:
-        stored = (levels >> 8).astype(np.uint8)
-    source = image
-    if image.mode != "CMYK":
-        source = Image.fromarray(stored)
-    converted = by_tables(source, profile)
-    if converted is source:
-        return None
-    colors = np.asarray(converted).astype(np.float32) / np.float32(255)
-    if most > 255:
-        colors += levels.astype(np.float32) / np.float32(most) - stored.astype(
-            np.float32
-        ) / np.float32(255)
-    return np.clip(colors, 0, 1)
-
-
-@functools.lru_cache(maxsize=1024)
-def _tell(line: str) -> None:
-    """Warn once: photos are read several times."""
-    logger.warning("%s", line)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageCms
 
-from humangs_jax.io import images
+from humangs_jax.io import image_colors
 from humangs_jax.io.color_spaces import (
     cube,
     in_srgb,
@@ -212,7 +212,7 @@ BROKEN = {
 @pytest.mark.parametrize("kind", ["JPEG", "WEBP"])
 @pytest.mark.parametrize("what", BROKEN)
 def test_a_profile_that_cannot_be_used_is_one_warning(what, kind, tmp_path, caplog):
-    images._tell.cache_clear()
+    image_colors._tell.cache_clear()
     image = Image.fromarray(np.repeat(np.repeat(COLORS, 8, 0), 8, 1))
     options = {"quality": 95} if kind == "JPEG" else {"lossless": True}
     image.save(tmp_path / "plain", kind, **options)
