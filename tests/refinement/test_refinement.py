@@ -229,6 +229,10 @@ def test_specks_of_a_mask_do_not_widen_the_crops():
         crop_to_person(prepare_capture(dataclasses.replace(capture, masks=masks))),
     )
     assert crops.images.shape[1:3] != capture.images.shape[1:3]
+    # the whole person is in each
+    np.testing.assert_allclose(
+        np.sum(crops.masks, axis=(1, 2)), capture.masks.sum(axis=(1, 2)), rtol=0.01
+    )
     np.testing.assert_array_equal(specked.images, crops.images)
     np.testing.assert_array_equal(specked.cameras.K, crops.cameras.K)
 
