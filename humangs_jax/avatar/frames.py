@@ -341,9 +341,8 @@ def motion_views(
     """
     poses, count = motion_poses(avatar, motion), len(motion.translations)
     azimuths = turn * np.arange(count) / count
-    return poses, shot_cameras(
-        shot, tracked_points(avatar, poses), azimuths, FOLLOWING * motion.fps if follow else None
-    )
+    smoothing = FOLLOWING * motion.fps if follow else None
+    return poses, shot_cameras(shot, tracked_points(avatar, poses), azimuths, smoothing)
 
 
 def turntable_views(

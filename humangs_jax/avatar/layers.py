@@ -304,12 +304,11 @@ def _to_part(view: ExrView, half: bool) -> Any:
     if view.depth is not None:
         channels[DEPTH] = view.depth
     # OpenEXR writes strided arrays wrongly in silence and refuses every type but its own
-    kinds = {
-        name: np.float16 if half and not name.startswith(WIDE) else np.float32 for name in channels
-    }
+    narrow = {name for name in channels if half and not name.startswith(WIDE)}
     with np.errstate(over="ignore"):
         channels = {
-            name: np.ascontiguousarray(image, kinds[name]) for name, image in channels.items()
+            name: np.ascontiguousarray(image, np.float16 if name in narrow else np.float32)
+            for name, image in channels.items()
         }
     camera = {
         name: np.ascontiguousarray(getattr(view, name), np.float32)

@@ -63,12 +63,14 @@ def circle_cameras(
         whole = np.quantile(np.linalg.norm(means - (low + high) / 2, axis=1), NEARLY_ALL)
         if whole < COMPACT * radius:
             middle, radius = (low + high) / 2, max(radius, whole)
-    distance = ROOM * max(float(radius), 1e-3) / np.sin(np.arctan(min(shot.tangents)))
+    distance = shot.distance
+    if distance is None:
+        distance = ROOM * max(float(radius), 1e-3) / np.sin(np.arctan(min(shot.tangents)))
     # cameras stand around it in the world of the file, whose up axis may be another
     turn = world_matrix(form)
     cameras = orbit(
         from_host(middle @ turn, jnp.float32),
-        distance if shot.distance is None else shot.distance,
+        distance,
         jnp.radians(shot.azimuth + 360 / views * np.arange(views)).astype(jnp.float32),
         float(np.radians(shot.elevation)),
         intrinsics_from_fov(float(np.radians(shot.fov)), *shot.resolution),
@@ -86,7 +88,8 @@ def splat_images(
     """One image for each camera, in bounded memory; with alpha where the shot's background is
     transparent.
     """
-    config = SPLAT_PRESETS["exact" if shot.splat == "as_trained" else shot.splat]
+    preset = "exact" if shot.splat == "as_trained" else shot.splat
+    config = SPLAT_PRESETS[preset]
     drawn = (
         render_in_bands(gaussians, camera, config, jnp.zeros(3)) for camera in cameras.values()
     )

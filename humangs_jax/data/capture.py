@@ -242,7 +242,9 @@ def capture_from_arrays(
     if masks is not None:
         masks = in_unit_range(numbers(masks, source, "masks", (v, height, width)), source, "masks")
     K = numbers(K, source, "K")
-    K = numbers(np.broadcast_to(K, (v, 3, 3)) if K.shape == (3, 3) else K, source, "K", (v, 3, 3))
+    if K.shape == (3, 3):
+        K = np.broadcast_to(K, (v, 3, 3))
+    K = numbers(K, source, "K", (v, 3, 3))
     cam_from_world = numbers(cam_from_world, source, "cam_from_world", (v, 4, 4))
     cameras = [
         checked_camera(K[i], cam_from_world[i], width, height, source, f"view {i}")

@@ -296,8 +296,12 @@ def box_of(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
     """First row and the one after the last, then columns, of the True pixels; zeros if there are
     none.
     """
-    lines = [np.flatnonzero(inside.any(axis)) for axis in (1, 0)]
-    return np.asarray([(line[0], line[-1] + 1) if len(line) else (0, 0) for line in lines])
+    box = np.zeros((2, 2), int)
+    for i, axis in enumerate((1, 0)):
+        line = np.flatnonzero(inside.any(axis))
+        if len(line):
+            box[i] = line[0], line[-1] + 1
+    return box
 
 
 def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -215,7 +215,8 @@ def _split(name: str, capture: Capture, choice: Choice) -> Case:
     chosen, targets = choose_views(
         name, capture.frames, np.asarray(capture.cameras.cam_from_world), choice
     )
-    return Case(name, capture.select(targets), capture.select(chosen) if chosen else None)
+    inputs = capture.select(chosen) if chosen else None
+    return Case(name, capture.select(targets), inputs)
 
 
 def choose_views(

@@ -118,7 +118,9 @@ def body_key(body: BodyModel | str | Path | None) -> str | None:
     """A short checksum of a body that was given; None for the shipped one."""
     if body is None:
         return None
-    return (_tree_key(body) if isinstance(body, BodyModel) else _file_key(Path(body)))[:SHORT]
+    if isinstance(body, BodyModel):
+        return _tree_key(body)[:SHORT]
+    return _file_key(Path(body))[:SHORT]
 
 
 def networks_key(networks: Mapping[str, Any]) -> list[str]:

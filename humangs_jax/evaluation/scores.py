@@ -327,10 +327,9 @@ def _score_image(
     for crop in protocol.crops:
         if empty and not isinstance(crop, WholeFrame):
             continue
-        pair = [
-            image if mask is None else crop.cut(image, mask, protocol.behind)
-            for image in (predicted, truth)
-        ]
+        pair = [predicted, truth]
+        if mask is not None:
+            pair = [crop.cut(image, mask, protocol.behind) for image in pair]
         size, least = np.asarray(pair[0].shape[:2], np.int32), min(pair[0].shape[:2])
         pair = [_padded(image) for image in pair]
         if crop is protocol.crops[0] and least >= window.size:

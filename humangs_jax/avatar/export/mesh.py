@@ -220,7 +220,7 @@ def write_mesh_glb(
         "scene": 0,
         "scenes": [{"nodes": [skeleton - 1, skeleton]}],
         "nodes": [
-            *_joint_nodes(avatar, mesh),
+            *joint_nodes(avatar, _floor(mesh)),
             _armature(avatar, up),
             {"name": "body", "mesh": 0, "skin": 0},
         ],
@@ -277,15 +277,20 @@ def _floor(mesh: BodyMesh) -> Float[np.ndarray, "3"]:
     return np.asarray([0, mesh.vertices[:, 1].min(), 0], np.float32)
 
 
-def _joint_nodes(avatar: Avatar, mesh: BodyMesh) -> list[dict[str, Any]]:
-    """Every joint at its place relative to its parent's; the root so that T-pose stands on 0."""
+def joint_nodes(avatar: Avatar, floor: Float[np.ndarray, "3"]) -> list[dict[str, Any]]:
+    """Every joint at its place relative to its parent's; the root so that T-pose stands on 0.
+
+    floor: what lies on 0 then, metres.
+    """
     joints = np.asarray(avatar.rest_joints, np.float64)
     nodes = []
     for j, (name, parent) in enumerate(zip(avatar.joint_names, avatar.parents, strict=True)):
-        place = joints[j] - (joints[parent] if parent >= 0 else _floor(mesh))
-        node = {"name": name, "translation": place.tolist()}
+        origin = joints[parent] if parent >= 0 else floor
+        node: dict[str, Any] = {"name": name, "translation": (joints[j] - origin).tolist()}
         children = [i for i, p in enumerate(avatar.parents) if p == j]
-        nodes.append(node | ({"children": children} if children else {}))
+        if children:
+            node["children"] = children
+        nodes.append(node)
     return nodes
 
 

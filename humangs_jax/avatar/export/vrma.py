@@ -15,7 +15,7 @@ import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import Up
-from humangs_jax.avatar.export.mesh import continuous, tracks_of
+from humangs_jax.avatar.export.mesh import continuous, joint_nodes, tracks_of
 from humangs_jax.body.joints import FINGERS, JOINT_NAMES
 from humangs_jax.body.motion import Motion
 from humangs_jax.geometry import quaternion
@@ -66,12 +66,7 @@ def write_vrma(
     joints = np.asarray(avatar.rest_joints, np.float64)
     # the skeleton at rest stands on the ground
     sole = np.asarray([0, float(np.asarray(avatar.rest_vertices)[:, 1].min()), 0])
-    nodes: list[dict[str, Any]] = []
-    for j, parent in enumerate(avatar.parents):
-        place = joints[j] - (joints[parent] if parent >= 0 else sole)
-        node: dict[str, Any] = {"name": avatar.joint_names[j], "translation": place.tolist()}
-        children = [i for i, p in enumerate(avatar.parents) if p == j]
-        nodes.append(node | ({"children": children} if children else {}))
+    nodes = joint_nodes(avatar, sole)
 
     times = writer.array("SCALAR", np.arange(len(motion.translations)) / motion.fps, bounds=True)
     rotations, names = np.asarray(motion.rotations), _bone_names()
