@@ -22,7 +22,7 @@ from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import COMPILING, bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import upright_world
+from humangs_jax.data.views import turned_world, world_up
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov
 from humangs_jax.io.reading import check_limit
@@ -371,10 +371,12 @@ def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
         raise ValueError(
             f"the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}"
         )
-    poses = capture.poses[np.asarray(capture.frames)]
-    return upright_world(
-        poses, capture.cameras, lambda: np.asarray(avatar.rest_joints)[avatar.parents.index(-1)]
-    )
+    poses, cameras = capture.poses[np.asarray(capture.frames)], capture.cameras
+    up = world_up(np.asarray(poses.rotations)[:, 0], cameras)
+    if up == "y":
+        return poses, cameras
+    pelvis = np.asarray(avatar.rest_joints)[avatar.parents.index(-1)]
+    return turned_world(poses, cameras, up, pelvis)
 
 
 def capture_renderings(

@@ -80,18 +80,22 @@ def add_skirt(
     Arguments: body: one of `data.views.gaussian_body`, whose vertices come first. capture: with
     masks. displacement: of the body.
     """
-    hem = (
-        find_hem(body, capture) if body.texels is None else None
-    )  # a map of the surface has no place for it
+    # a map of the surface has no place for it
+    if body.texels is not None:
+        return None
+    hem = find_hem(body, capture)
     if hem is None:
         return None
     worn, count = with_tube(body, hem), len(body.template)
+
+    # the skirt moves to the edges of the masks, and the body stays where it is
     rest, faces = shaped(worn, capture.betas), np.asarray(worn.faces)
     moved = np.concatenate([displacement, np.zeros((len(rest) - count, 3))])
     held = np.where(np.arange(len(rest)) < count, HELD, 0.0)
-    moved[count:] = to_edges(masked_views(worn, rest, capture), rest + moved, faces, held, REACH)[
-        count:
-    ]
+    views = masked_views(worn, rest, capture)
+    moved[count:] = to_edges(views, rest + moved, faces, held, REACH)[count:]
+
+    # how far its vertices are apart, beside those of the body
     sides = np.sqrt(vertex_areas(rest + moved, faces))
     if body.relative_vertex_spacing is None:
         own = np.ones(count)
@@ -213,12 +217,11 @@ def _along(
     joints: Float[np.ndarray, "j 3"], legs: Int[np.ndarray, "2 3"], levels: Float[np.ndarray, " r"]
 ) -> Float[np.ndarray, "2 r 3"]:
     """Points on the lines from hip to knee to ankle."""
-    return np.stack(
-        [
-            np.stack([np.interp(levels, [0, 0.5, 1], joints[leg, i]) for i in range(3)], axis=1)
-            for leg in legs
-        ]
-    )
+    lines = np.zeros((len(legs), len(levels), 3))
+    for side, leg in enumerate(legs):
+        for axis in range(3):
+            lines[side, :, axis] = np.interp(levels, [0, 0.5, 1], joints[leg, axis])
+    return lines
 
 
 def _radii(
@@ -253,17 +256,13 @@ def _tube(body: BodyModel, levels: Float[np.ndarray, " r"]) -> sparse.csr_array:
     vertices, faces = np.asarray(body.template, float), np.asarray(body.faces)
     joints = np.asarray(body.joint_regressor, float) @ vertices
     names = [name for leg in LEGS for name in leg] + list(TRUNK)
-    own = (
-        np.asarray(body.skinning_weights)[:, [name in names for name in body.joint_names]].sum(
-            axis=1
-        )
-        > 0.5
-    )
+    of_legs = [name in names for name in body.joint_names]
+    own = np.asarray(body.skinning_weights)[:, of_legs].sum(axis=1) > 0.5
     faces = faces[own[faces].all(axis=1)]  # no hands
+
+    # directions from the left leg, from the back over the left to the front
     turns = np.linspace(0, np.pi, HALF)
-    outwards = np.stack(
-        [np.sin(turns), 0 * turns, -np.cos(turns)], axis=1
-    )  # of the left leg, from the back
+    outwards = np.stack([np.sin(turns), 0 * turns, -np.cos(turns)], axis=1)
     shares = np.arange(1, GAP + 1) / (GAP + 1)
     loops = []
     for origins in np.moveaxis(_along(joints, legs, levels), 1, 0):

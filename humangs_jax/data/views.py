@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -354,23 +354,6 @@ def _window(
         rows, columns
     ]
     return window
-
-
-def upright_world(
-    poses: BodyPose, cameras: Camera, pelvis: Callable[[], Float[np.ndarray, "3"]]
-) -> tuple[BodyPose, Camera]:
-    """Poses and cameras of some views in a world whose y axis points up; the same objects if theirs
-    does.
-
-    On the host. See `world_up`.
-
-    Arguments: poses, cameras: batches of one length. pelvis: the root joint in T-pose, metres,
-    where it is needed.
-    """
-    up = world_up(np.asarray(poses.rotations)[:, 0], cameras)
-    if up == "y":
-        return poses, cameras
-    return turned_world(poses, cameras, up, pelvis())
 
 
 def world_up(roots: Float[np.ndarray, "v 3"], cameras: Camera) -> str:
