@@ -174,8 +174,8 @@ def preprocess(
         else:
             due[name] = path
     tasks = {name: (out / name, name, path, settings, progress) for name, path in due.items()}
-    body_file = None if body.file == DEFAULT_BODY else body.file
-    load = functools.partial(FileBody.load, body_file)
+    model_file = None if body.file == DEFAULT_BODY else body.file
+    load = functools.partial(FileBody.load, model_file)
     scans, done = DATASETS[settings.kind].scans, 0  # photos of videos are decoded by threads
     try:
         with bar(total=len(due), desc="scans", shown=progress and scans) as shown:
