@@ -161,8 +161,10 @@ def avatar_from_photos(
     """
 
     def as_path(value):
+        """A path, or None for None."""
         return None if value is None else Path(value)
 
+    # the parts of the work are methods, which share these arguments
     run = FromPhotos(
         photos=Path(photos),
         out=Path(out),

@@ -86,12 +86,14 @@ def load_cameras(
         >>> cameras = hg.load_cameras("garden/sparse/0")
         >>> photo = hg.render(hg.load_gaussians("garden.ply"), cameras["DSC07956.JPG"]).rgb
     """
+    # cameras as captures have them, in the axes of the file unless y is to be up
     source = Path(path)
     folder = None if images is None else Path(images)
     with reading(source, "calibration", CaptureError):
         found = read_calibration(source, functools.partial(_size, source, folder), lenses)
         check_limit("views", len(found.cameras), "cameras")
         found = in_capture_convention(found, scale, found.up if y_up else "+y", found.pixel_centers)
+        # a name that several images have gets a number from the second one on
         cameras: dict[str, Camera] = {}
         for each in found.cameras:
             name, count = each.name, 1
