@@ -23,8 +23,8 @@ START_MARK = "start.json"
 # of its suffix before others. Suffixes are for files that are neither JSON nor text.
 # recognizes_NAME(source) -> bool            whether the content of a file is of this format; not
 # asked where `folder` is set
-# read_NAME(source, format) -> Calibration   or Detections; source: `cameras.Source`,
-# `keypoints.keypoints.Source`
+# read_NAME(source, format) -> Calibration   or Detections; source: `cameras.CalibrationFile`,
+# `keypoints.keypoints.KeypointFile`
 
 F = TypeVar("F", bound="SourceFormat")
 
