@@ -102,13 +102,15 @@ def _make_exportable(cls: type[Any]) -> None:
 def _static_bytes(values: tuple[Any, ...]) -> bytes:
     """Writes static fields as JSON.
 
-    Raises: TypeError for one that is more than numbers, texts and tuples of them.
+    Raises: TypeError if a field holds anything but numbers, texts and tuples of them.
     """
     return json.dumps(values).encode()
 
 
 def _static_values(data: bytes | bytearray) -> tuple[Any, ...]:
-    """Reads what `_static_bytes` wrote: lists were tuples, because static fields can be hashed."""
+    """Reads what `_static_bytes` wrote. Lists become tuples again, because static fields can be
+    hashed.
+    """
 
     def as_tuples(x):
         if isinstance(x, list):
@@ -119,7 +121,7 @@ def _static_values(data: bytes | bytearray) -> tuple[Any, ...]:
 
 
 SHORT = 80
-"""Characters of a value that is no array, from which on it is left out of a printed pytree."""
+"""A value that is no array is not printed in full if it has more characters than this."""
 
 
 def short_repr(tree: Any) -> str:
@@ -238,12 +240,15 @@ def _annotated_rank(annotation: Any) -> int | None:
 
 
 def shape_fault(tree: Any) -> str | None:
-    """Says what is wrong with the fields of a pytree dataclass, by their annotations: ".colors:
-    expected shape ...".
+    """Says which field of a pytree dataclass does not fit its annotation: ".colors: expected shape
+    ...". Returns None if all fit, or if the tree is no pytree dataclass.
 
-    Axes of one name have one size. In a batch they come behind its own axes, as many as most of the
-    arrays have. Arrays that are annotated as floating-point numbers hold no integers, and sizes
-    (static fields that are `int`) are whole numbers. None if all fit, or for anything else.
+    The rules:
+
+    - Axes with one name have one size.
+    - A batch has further axes in front. Most of the arrays say how many.
+    - An array that is annotated as floating-point numbers holds no integers.
+    - A static field that is an `int` holds a whole number.
     """
     cls, sizes = type(tree), dict[str, int]()
     if cls not in _PYTREES:
@@ -274,7 +279,7 @@ class _Field:
     """What an annotation says about a field of a pytree."""
 
     axes: tuple[str | int, ...] | None
-    """Names and sizes; None where it is not an array but a pytree."""
+    """Names and sizes of the axes. None if the field is a pytree and not an array."""
     floating: bool
     """It holds floating-point numbers."""
     optional: bool
@@ -282,8 +287,9 @@ class _Field:
 
 
 def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, int]) -> str | None:
-    """Says what is wrong with one array. sizes: of the axes that are known, to which those of this
-    array are added.
+    """Says what is wrong with one array; None if nothing is.
+
+    sizes: the known sizes of axes, by name. Those of this array are added to it.
     """
     axes = field.axes
     assert axes is not None
@@ -335,7 +341,7 @@ def _size_fault(tree: Any) -> str | None:
 
 @functools.cache
 def _annotated_fields(cls: Any) -> dict[str, _Field]:
-    """Returns the fields that are not static, without arrays of any shape."""
+    """Returns the fields that are not static. Arrays annotated with any shape are left out."""
     found = {}
     for field in dataclasses.fields(cls):
         if field.metadata.get("static"):

@@ -33,7 +33,7 @@ STEP = 0.0025
 WEAKNESS = 0.002
 """Weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette."""
 HELD = 20.0
-"""The same, for hands and head."""
+"""Weight of no displacement for hands and head."""
 HELD_JOINTS = ("head", "jaw", "eye", "wrist", "index", "middle", "pinky", "ring", "thumb")
 NEAR = 2.5
 """Pixels. A vertex may be on the body's silhouette if it is no farther from the edge."""
@@ -42,13 +42,13 @@ PROBE = 0.012
 silhouette.
 """
 LEAVES = 0.6
-"""It is on the silhouette if that move leaves it by this share of PROBE."""
+"""A vertex is on the silhouette if the move by PROBE takes it at least this share of PROBE
+outwards."""
 DRAWN = 0.5
 """Pixels by which polygons are drawn larger than they are."""
 WRAP = 0.07
-"""At last, vertices outside a mask move inwards by up to so many metres, until all masks contain
-them by the inset.
-"""
+"""In the last step, vertices outside a mask move inwards by up to this many metres, until all masks
+contain them by the inset."""
 WRAP_ROUNDS = 6
 """How often these moves are averaged over the neighbours."""
 OUTSIDE = 0.01
@@ -274,8 +274,8 @@ def _share_outside(
 def _targets(
     views: list[MaskedView], rest: Points, normals: Points, faces: Faces, how: OffsetFitConfig
 ) -> tuple[PerVertex, PerVertex]:
-    """For each vertex the number of photos that show it on the silhouette, and the sum of the
-    distances to the masks' edges.
+    """Returns for each vertex the number of photos that show it on the silhouette, and the sum of
+    its distances to the edges of the masks there, metres.
     """
     count, summed = np.zeros(len(rest)), np.zeros(len(rest))
     reach = np.arange(-how.inwards, how.outwards + STEP / 2, STEP)
@@ -299,8 +299,8 @@ def _targets(
 def _crossing(
     depths: Float[np.ndarray, "e r"], reach: Float[np.ndarray, " r"]
 ) -> tuple[Float[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
-    """Where the mask ends along each normal, nearest to its start: outwards from the inside,
-    inwards from the outside.
+    """Returns where the mask ends along each normal. It is the crossing nearest to the start:
+    outwards from a start inside the mask, inwards from one outside.
     """
     zero = int(np.argmin(np.abs(reach)))
     distance, found = np.zeros(len(depths)), np.zeros(len(depths), bool)
@@ -335,7 +335,7 @@ def _silhouette_distance(
 def silhouette(
     pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "h w"]:
-    """1 where triangles lie, larger by `DRAWN` than they are."""
+    """Draws triangles as 1 on 0. They are drawn `DRAWN` pixels larger than they are."""
     image = Image.new("L", (shape[1], shape[0]))
     pen = ImageDraw.Draw(image)
     for corners in (pixels[faces] - 0.5).reshape(-1, 6).tolist():
@@ -351,7 +351,7 @@ def _spread(
     held: PerVertex,
     reach: OffsetFitConfig,
 ) -> PerVertex:
-    """The smooth displacement that is nearest to the targets."""
+    """Returns the smooth displacement of the vertices that is nearest to their targets, metres."""
     areas = np.maximum(vertex_areas(vertices, faces), 1e-9)
     laplacian = _laplacian(vertices, faces)
     bending = reach.smoothness**4 * laplacian.T @ sparse.diags(1 / areas) @ laplacian
@@ -360,7 +360,9 @@ def _spread(
 
 
 def _laplacian(vertices: Points, faces: Faces) -> sparse.csr_array | sparse.csr_matrix:
-    """By the cotangents of the angles, none of them negative."""
+    """Returns the Laplacian of the mesh, weighted by cotangents of the angles. None of the weights
+    is negative.
+    """
     rows, columns, values = [], [], []
     for i in range(3):
         a, b, c = (faces[:, (i + k) % 3] for k in range(3))
@@ -384,7 +386,9 @@ def _outside(
     inset: tuple[float, float],
     free: Bool[np.ndarray, " n"],
 ) -> PerVertex:
-    """How far each vertex moves inwards until all masks contain it, smoothly."""
+    """Returns how far each vertex moves inwards until all masks contain it, metres. The moves are
+    smooth over the mesh.
+    """
     reach = np.arange(0, WRAP + STEP / 2, STEP)
     inside = np.full((len(rest), len(reach)), np.inf)
     for view in views:
@@ -406,6 +410,9 @@ def _outside(
 def at(
     image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "*b 2"]
 ) -> Float[np.ndarray, "*b"]:
-    """Bilinear; pixel centres at + 0.5."""
+    """Interpolates an image at pixels (x, y), bilinear.
+
+    The centre of the first pixel is (0.5, 0.5). Beyond the image its edge is repeated.
+    """
     x, y = pixels[..., 0] - 0.5, pixels[..., 1] - 0.5
     return ndimage.map_coordinates(image, [y, x], order=1, mode="nearest", prefilter=False)

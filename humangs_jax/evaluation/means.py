@@ -15,7 +15,7 @@ CONFIDENCE = 0.95
 RESAMPLES = 2000
 """Resamples of the bootstrap."""
 BLOCKS = 20
-"""In how many parts they are computed, for memory."""
+"""Number of parts in which the resamples are computed, to save memory."""
 
 
 class Scored(NamedTuple):
@@ -32,22 +32,22 @@ class Scored(NamedTuple):
 
 
 class Mean(NamedTuple):
-    """A mean and its interval of `CONFIDENCE`."""
+    """A mean of scores and its confidence interval, of probability `CONFIDENCE`."""
 
     mean: float
     """The mean."""
     low: float | None
-    """The lower end of the interval; None for a mean of one."""
+    """The lower end of the interval; None if the mean is of one value."""
     high: float | None
-    """The upper end; None for a mean of one."""
+    """The upper end of the interval; None if the mean is of one value."""
     count: int
-    """How many the mean is of."""
+    """How many values the mean is of."""
     over: str
-    """What they are: people, frames or images."""
+    """What the values belong to: people, frames or images."""
 
 
 def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
-    """Means of the scores of some images or people; None for what one of them lacks."""
+    """Means of the scores of some images or people. A score that one of them lacks is None."""
     listed = list(rows)
     lacking = {name for name in listed[0] for row in listed if row.get(name) is None}
     means = _known_means(listed)
@@ -55,8 +55,8 @@ def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
 
 
 def _known_means(rows: Sequence[Mapping[str, float | None]]) -> Row:
-    """Means of the scores over those that have them, such as images with patches; None for what
-    none has.
+    """Means of each score over the rows that have it: not all images have patches, for example. A
+    score that no row has is None.
     """
     means: Row = {}
     for name in rows[0]:

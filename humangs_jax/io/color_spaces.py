@@ -31,9 +31,8 @@ class Encoding(NamedTuple):
     bright: bool = False
     """Whether light may be far beyond white."""
     camera: bool = False
-    """Whether it stores the light before a camera, which is encoded as cameras do (BT.709), not as
-    screens show it.
-    """
+    """Whether the file stores light as it was before the camera. Such light is encoded as cameras
+    do (BT.709), not as screens show it."""
 
 
 # Curves
@@ -124,8 +123,8 @@ def _xyz(xy: tuple[float, float]) -> np.ndarray:
 
 
 def _to_xyz(primaries: tuple[tuple[float, float], ...], white: tuple[float, float]) -> np.ndarray:
-    """Returns the matrix from light of three primaries to XYZ whose white is that of ICC
-    profiles, D50.
+    """Returns the matrix from light of three primaries to XYZ. White becomes that of ICC profiles,
+    D50.
     """
     columns = np.stack([_xyz(each) for each in primaries], axis=1)
     matrix = columns * np.linalg.solve(columns, _xyz(white))
@@ -137,8 +136,8 @@ FROM_XYZ = np.linalg.inv(_to_xyz(SRGB, D65))
 
 
 def of_code_points(primaries: int, transfer: int) -> Encoding | None:
-    """Returns the encoding that numbers of H.273 name (PNG's cICP, nclx of HEIC and AVIF, videos);
-    None where that is sRGB's.
+    """Returns the encoding that two numbers of H.273 name. PNG's cICP, nclx of HEIC and AVIF, and
+    videos have them. None if it is sRGB's.
     """
     if primaries not in PRIMARIES and transfer not in CURVES:
         return None
@@ -148,8 +147,9 @@ def of_code_points(primaries: int, transfer: int) -> Encoding | None:
 
 
 def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Encoding | None:
-    """Returns the encoding of PNG's gAMA and cHRM (white, red, green, blue: x and y of each); None
-    where that is sRGB's.
+    """Returns the encoding that PNG's gAMA and cHRM describe; None if it is sRGB's.
+
+    chromaticities: x and y of white, red, green and blue, in this order.
     """
     curve, matrix = srgb_to_light, np.eye(3)
     # PNG files say 1 / 2.2 of sRGB; what programs write of videos (1 / 1.96) is shown as sRGB, too
@@ -170,7 +170,7 @@ def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> E
 
 
 def is_srgb(encoding: Encoding) -> bool:
-    """Says whether the file's values are sRGB already, to less than half a level of 8 bits."""
+    """Says whether the file's values are sRGB already, up to less than half a level of 8 bits."""
     steps = np.linspace(0, 1, 9)
     grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     return bool(np.abs(in_srgb(grid, encoding) - grid).max() < 0.5 / 255)
@@ -246,13 +246,13 @@ class Profile(NamedTuple):
     space: str
     """One of the values of `SPACES`."""
     encoding: Encoding | None
-    """The encoding of its colors; None: it is tables, for Little CMS."""
+    """The encoding of its colors. None: the profile consists of tables, which Little CMS reads."""
 
 
 def read_profile(data: bytes) -> Profile:
     """Reads an ICC profile.
 
-    Raises: InvalidFileError for one that is damaged, or of no photo.
+    Raises: InvalidFileError if the profile is damaged, or is not one of a photo.
     """
     # the header: size (profiles of presses have up to 3 MB), signature, kind of device and colors
     most = 4 << 20
@@ -290,8 +290,8 @@ def read_profile(data: bytes) -> Profile:
 
 
 def _within_white(curve: Curve) -> Curve:
-    """Bounds a curve of a file, whose formula may leave [0, 1], or the numbers, between the levels
-    that were looked at.
+    """Bounds the values of a curve to [0, 1]. The formula of a file may leave this range, or give
+    no number, between the levels that were tested.
     """
 
     def bounded(levels: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -320,8 +320,8 @@ def _of_colors(tags: dict[bytes, bytes]) -> Encoding:
 
 
 def _curve(tag: bytes) -> Curve:
-    """Reads the curve of a tag "curv" (a table, or an exponent) or "para" (numbers g, a to f of a
-    formula).
+    """Reads the curve of an ICC tag. The tag is "curv" (a table, or an exponent) or "para" (the
+    numbers g and a to f of a formula).
     """
     # "curv": no entry is the identity, one is an exponent, more are a table
     if tag[:4] == b"curv":
@@ -357,9 +357,9 @@ def _curve(tag: bytes) -> Curve:
 
 
 def by_tables(image: Any, profile: bytes) -> Any:
-    """Converts a PIL.Image whose profile is tables to sRGB.
+    """Converts a PIL.Image to sRGB with its ICC profile, for profiles that consist of tables.
 
-    Raises: InvalidFileError for one that cannot be used.
+    Raises: InvalidFileError if the profile cannot be used.
     """
     from PIL import ImageCms
 

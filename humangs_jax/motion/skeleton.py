@@ -136,8 +136,8 @@ _Source = Mapping[str, int]
 
 
 def _up_of(clip: Clip, source: _Source, scale: float, standing: bool) -> tuple[str, str]:
-    """The axis that is up, and a note about it: BVH does not tell, a rest pose in which people
-    stand does.
+    """Returns the axis that points up, and a note about it. A BVH file does not say which one it
+    is; a rest pose in which people stand shows it.
     """
     usual = "y"
     if standing:
@@ -221,8 +221,10 @@ def _pelvis_turns(
     turns: Float[np.ndarray, "m s 3 3"],
     places: Float[np.ndarray, "m s 3"],
 ) -> Float[np.ndarray, "m 3 3"]:
-    """(m, 3, 3) from the rest pose to the frames: of the joint, or of those that carry the hips if
-    these agree better with the trunk, turned so that the line of the hips is the file's.
+    """Rotations of the pelvis from the rest pose to the frames, (m, 3, 3).
+
+    They are those of the pelvis's joint, or of the joints that carry the hips if these agree better
+    with the trunk. They are then turned so that the line of the hips is the file's.
     """
     pelvis, left, right = (source[name] for name in ("pelvis", "left_hip", "right_hip"))
     rest_line, line = clip.rest[left] - clip.rest[right], places[:, left] - places[:, right]
@@ -231,8 +233,8 @@ def _pelvis_turns(
         return smallest_turns(unit(candidate @ rest_line), unit(line)) @ candidate
 
     def tilts(candidate, top):
-        """(m,) angle about the line of the hips from the rest pose's direction of a joint above to
-        the frame's.
+        """Angles (m,) about the line of the hips, between the direction of a joint above in the
+        rest pose and in each frame.
         """
         axis = unit(line)
 
@@ -294,10 +296,10 @@ def _mean(turns: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "3 3"]:
 def _untwist(
     turns: Float[np.ndarray, "m 3 3"], bone: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """The rotation about a bone that takes the mean twist about it out of rotations (m, 3, 3).
+    """The rotation about a bone that removes the mean twist about it from rotations (m, 3, 3).
 
-    The twist of a quaternion (w, v) about b is 2 arg(w + i v.b); the square has no sign and weighs
-    those less that swing far.
+    The twist of a quaternion (w, v) about b is 2 arg(w + i v.b). Its square does not depend on the
+    quaternion's sign, and rotations that swing far weigh less in the mean of the squares.
     """
     q = Rotation.from_matrix(turns).as_quat()
     twist = np.angle(np.sum((q[:, 3] + 1j * (q[:, :3] @ bone)) ** 2))
@@ -314,14 +316,17 @@ def _leg_length(places: Float[np.ndarray, "s 3"], index: _Source) -> float:
 
 
 def _feet(source: _Source) -> list[list[str]]:
-    """Our names of the joints that may touch the floor: of both sides by kind."""
+    """Returns the names of joints that may touch the floor and that the file has.
+
+    One list for each kind (ankle, foot), with its left and its right joint. Names are ours.
+    """
     present = [[name for name in kind if name in source] for kind in rules.FEET]
     return [found for found in present if found]
 
 
 def _soles(clip: Clip, source: _Source, joints: Float[np.ndarray, "j 3"]) -> dict[str, float]:
-    """How high the joints of the file's feet are above the lowest of them in a rest pose that
-    stands, in our metres.
+    """Returns the height of each joint of the file's feet above the lowest of them, in metres of
+    our body. The rest pose has to be one in which people stand.
     """
     axis, _ = nearest_axis(_spine(clip, source))
     scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.rest, source), 1e-9)
@@ -333,10 +338,12 @@ def _soles(clip: Clip, source: _Source, joints: Float[np.ndarray, "j 3"]) -> dic
 def _steps(
     heights: Float[np.ndarray, "m s"], source: _Source, soles: dict[str, float] | None
 ) -> Float[np.ndarray, " m"]:
-    """(m,) how high the feet are above the floor, which is where they are lowest.
+    """Returns the height of the lower foot above the floor in each frame, (m,).
 
-    soles: of each joint of the feet, how high it is when the foot stands; None: each kind as high
-    as in its lowest frame.
+    The floor is where the feet are lowest over all frames.
+
+    soles: the height of each joint of the feet when the foot stands. None: the height of its kind
+    of joint in the frame where that is lowest.
     """
     if soles is None:
         lowest = [
@@ -353,7 +360,7 @@ def _steps_of_body(
     moves: Float[np.ndarray, "m 3"],
     source: _Source,
 ) -> Float[np.ndarray, " m"]:
-    """(m,) how high the lowest joint of our feet is above its place in the T-pose."""
+    """Returns how high the lowest joint of our feet is above its place in the T-pose, (m,)."""
     places = {0: moves}
 
     def place(j):

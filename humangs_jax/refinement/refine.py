@@ -49,11 +49,10 @@ class Refinement:
     compile_seconds: float
     """The time of compilation, seconds."""
     loss: tuple[float, float]
-    """The loss of the avatar that came and of the one that is returned, over the photos that were
-    fitted.
-    """
+    """The loss of the avatar before, and of the one that is returned, over the photos that were
+    fitted."""
     psnr: tuple[float, float]
-    """The PSNR of the two over the crops, dB."""
+    """The PSNR of these two avatars over the crops, dB."""
     kept: bool
     """Whether the avatar has become better by that loss; if not, it is unchanged."""
     interrupted: bool = False
@@ -148,10 +147,11 @@ def refine_with_report(
     progress: bool = False,
     watch: Callable[[Avatar], None] | None = None,
 ) -> Refinement:
-    """`refine`, with the number of steps, the seconds and the gain. Arguments, errors: as there.
+    """Does what `refine` does, and also returns the number of steps, the seconds and the gain.
 
-    A number of steps repeats a run exactly on the same machine; `Refinement.planned` is that of a
-    run that was limited by its seconds.
+    Arguments and errors are those of `refine`. A run with a given number of steps can be repeated
+    exactly on the same machine. If the run was limited by seconds, `Refinement.planned` is the
+    number of steps that repeats it.
     """
     config = config or RefineConfig()
     if seconds is not None or steps is not None:
@@ -225,7 +225,9 @@ def refine_with_report(
 def calls_of_refine(
     avatar: Avatar, capture: Capture | PreparedCapture, config: RefineConfig
 ) -> Iterator[Call]:
-    """The long programs of a refinement, before it begins; none without iterations or masks."""
+    """The long programs of a refinement, so that they can be compiled before it begins. There are
+    none without iterations or masks.
+    """
     photos = prepare_capture(capture)
     if config.iterations and photos.capture.masks is not None:
         yield from calls_of_photos(avatar, crop_to_person(photos, config.image_size))

@@ -86,8 +86,8 @@ class Rendering(Batchable):
     differentiable; None unless `SplatConfig.visibility`.
     """
     features: Float[Array, "h w n"] | None = None
-    """Sums of the features by the weights of the colors, over 0, (h, w, n); None without features.
-    """
+    """Features summed with the weights of the colors, over a background of 0, (h, w, n). None
+    without features."""
     means2d: Float[Array, "g 2"] | None = None
     """Centres on the image, (g, 2), pixels; None unless `SplatConfig.means2d`."""
     radii: Float[Array, "g 2"] | None = None
@@ -316,9 +316,9 @@ def _own_in_batch(
 def with_background(
     gaussians: Gaussians, cameras: Camera, background: Background
 ) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
-    """Returns what is drawn, in float32 at least.
+    """Returns Gaussians, cameras and the background's color (3,), in float32 at least.
 
-    Raises: ValueError for a background that is no color.
+    Raises: ValueError if the background is no color.
     """
     return at_least_float32((gaussians, cameras, _color(background, gaussians.means.dtype)))
 
@@ -326,7 +326,7 @@ def with_background(
 def features_of(features: Float[Array, "g n"] | None, count: int) -> Float[Array, "g n"] | None:
     """Returns features in float32 at least.
 
-    Raises: ValueError for those of another number of Gaussians.
+    Raises: ValueError unless there is one row for each of `count` Gaussians.
     """
     if features is not None and features.shape[:1] != (count,):
         raise ValueError(f"features: expected shape ({count}, n), got {features.shape}")
@@ -334,7 +334,9 @@ def features_of(features: Float[Array, "g n"] | None, count: int) -> Float[Array
 
 
 def _color(background: object, dtype: np.dtype) -> Array:
-    """Returns a background as three numbers. Raises: ValueError for what is no color."""
+    """Returns a background as three numbers (3,), white for None. Raises: ValueError if it is no
+    color.
+    """
     if background is None:
         return from_host(np.ones(3), dtype)
     if isinstance(background, str):
@@ -359,7 +361,9 @@ def _color(background: object, dtype: np.dtype) -> Array:
 
 
 def _of_bytes(color: Any) -> bool:
-    """Says whether an array of integers is no color in [0, 1]. Traced values are not looked at."""
+    """Says whether an array of integers has a value above 1, as colors in bytes have. Traced values
+    are not looked at.
+    """
     if isinstance(color, Tracer) or jnp.issubdtype(color.dtype, jnp.inexact):
         return False
     return bool(np.any(np.asarray(color) > 1))
@@ -373,8 +377,8 @@ def draw(
     features: Float[Array, "g n"] | None = None,
     shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
-    """Does what `render` does with buffers that are decided, `config.max_pairs`: pure, and
-    without checks.
+    """Draws as `render` does, but with buffers of the size that `config.max_pairs` says. It is pure
+    and checks nothing.
     """
     gaussians, features = jax.tree.map(
         lambda leaf: _once_per_image(leaf, camera), (gaussians, features)
@@ -471,7 +475,7 @@ def _blank(
     config: SplatConfig,
     others: Array | None,
 ) -> Rendering:
-    """Returns the image of no Gaussians."""
+    """Returns the image that is drawn when there are no Gaussians."""
     count = 4 + 2 * config.distortion
     if others is not None:
         count += others.shape[1]
@@ -487,8 +491,8 @@ def _blank(
 
 
 def _powers(behind: Float[Array, " g"], visible: Array) -> Float[Array, "g 2"]:
-    """Returns z and its square, about the mean of what is drawn: small numbers have small
-    squares.
+    """Returns z and its square for each Gaussian. z is relative to the mean of what is drawn,
+    because small numbers have small squares.
     """
     count = jnp.maximum(jnp.sum(visible), 1)
     z = jnp.where(visible, behind - lax.stop_gradient(jnp.sum(behind) / count), 0.0)

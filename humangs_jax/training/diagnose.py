@@ -37,7 +37,7 @@ from humangs_jax.training.step import seed_numbers, subject_keys, subject_loss, 
 
 T = TypeVar("T")
 Named = dict[str, Any]
-"""Arrays, or `Leaf`s of them, by their paths in a pytree; "" for a bare array."""
+"""Arrays, or a `Leaf` for each, by path in a pytree; the path of a bare array is ""."""
 FAILED = ("skipped", "nonfinite")
 """Events of a run's log that a diagnosis looks for."""
 PARTS = (("encoder",), ("reader",), ("decoder",))
@@ -48,7 +48,7 @@ DEEPEST = 3
 
 @dataclasses.dataclass(frozen=True)
 class Leaf:
-    """Numbers of one array. All but `bad` and `first` are those of its finite entries."""
+    """Statistics of one array. All but `bad` and `first` count its finite entries only."""
 
     name: str
     """The path of the array in its pytree."""
@@ -82,7 +82,9 @@ class Leaf:
 
 @pytree_dataclass
 class StageReport:
-    """What went through a stage forward and back: arrays by name, or `Leaf`s of them."""
+    """What went through a stage, forward and back. Each field holds arrays by name, or a `Leaf` for
+    each array.
+    """
 
     name: str = static_field()
     """The name of the stage."""
@@ -102,7 +104,9 @@ class StageReport:
 
     @property
     def spoils(self) -> Leaf | None:
-        """A gradient that is not finite although all that came back to this stage are."""
+        """The first gradient that is not finite, although all gradients that came back to this
+        stage are finite. None if there is no such gradient.
+        """
         if _first_bad(self.returned):
             return None
         return _first_bad(self.gradients) or _first_bad(self.taken)
@@ -117,7 +121,7 @@ def _stored(name: str, tree: PyTree) -> StageReport:
 
 
 def _numbers(report: StageReport) -> StageReport:
-    """A report of arrays as one of `Leaf`s."""
+    """Replaces each array of a report by its `Leaf`."""
 
     def of(arrays):
         return {name: Leaf.of(name, np.asarray(x)) for name, x in arrays.items()}
@@ -129,8 +133,8 @@ def _numbers(report: StageReport) -> StageReport:
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """An array that is not finite: stored so (in the state or the batch), computed by a stage, or
-    sent back by it.
+    """An array that is not finite. It was stored (in the state or the batch), computed by a stage,
+    or sent back by a stage.
     """
 
     direction: Literal["stored", "forward", "backward"]
@@ -178,13 +182,13 @@ class Diagnosis:
 
     @property
     def gradient_norm(self) -> float:
-        """Euclidean norm of the finite part of this subject's gradient."""
+        """Euclidean norm of the finite entries of this subject's gradient."""
         return math.hypot(*(stage.gradient_norm for stage in self.stages))
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """All that was stored and is not finite; then the first stage to blame, going forward or
-        else going back.
+        """Everything stored that is not finite, then the first stage to blame. That is the first
+        one going forward, or else the first one going back.
         """
         stored = [
             Fault("stored", part.name, leaf)
@@ -205,7 +209,7 @@ class Diagnosis:
 
     @property
     def fault(self) -> Fault | None:
-        """Where it began, None if all is finite."""
+        """The first of `faults`, where the trouble began; None if all is finite."""
         return next(iter(self.faults), None)
 
     @property
@@ -275,10 +279,10 @@ class Diagnosis:
 
 class Recorder:
     """An interceptor for `nn.intercept_methods` that records the stages of one traced computation,
-    in the order of their ends.
+    in the order in which they end.
 
-    given: {stage: what it returned}. probes: {stage: (zeros added to what it takes, to what it
-    returns)}; None in a first run, which finds their `shapes`.
+    given: what each stage returned, by stage. probes: for each stage the zeros that are added to
+    what it takes and to what it returns. They are None in a first run, which finds their `shapes`.
     """
 
     def __init__(self, probes: dict[str, tuple[Named, Named]] | None = None):

@@ -15,13 +15,14 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import counted
 
 NEAR = 0.6
-"""Steps of a camera by which its frame may be off: half of one, and what clocks of phones shake."""
+"""How far a frame may be from its moment, in steps of its camera: half a step, and a little more
+because the clocks of phones are not steady."""
 _GAP = 1.5
-"""Steps between two frames, beyond which frames are missing between them."""
+"""If two frames are farther apart than this many steps, frames are missing between them."""
 _SAME_RATE = 0.01
-"""Share by which the steps of cameras of one rate differ."""
+"""Cameras have one rate if their steps differ by no more than this share."""
 _USUAL_STEP = 1 / 30
-"""Seconds between two frames, where no video tells."""
+"""Seconds between two frames, where no video says."""
 
 
 class Moments(NamedTuple):
@@ -40,8 +41,9 @@ class Moments(NamedTuple):
 
 
 def find_moments(times: Mapping[str, Float[np.ndarray, " n"]]) -> Moments:
-    """The moments of some cameras, of the seconds at which each has its frames (NaN where that is
-    not known).
+    """Finds the moments that several cameras show.
+
+    Arguments: times: seconds at which each camera has its frames; NaN where that is not known.
     """
     steps = {camera: _step(each) for camera, each in times.items()}
     known = [step for step in steps.values() if step is not None]
@@ -57,7 +59,7 @@ def find_moments(times: Mapping[str, Float[np.ndarray, " n"]]) -> Moments:
 
 
 def _step(times: Float[np.ndarray, " n"]) -> float | None:
-    """Seconds between two frames, None where times do not tell."""
+    """Seconds between two frames; None if the times do not say."""
     apart = np.diff(times)
     if not len(apart) or not np.isfinite(apart).all() or not (apart > 0).all():
         return None
@@ -67,8 +69,11 @@ def _step(times: Float[np.ndarray, " n"]) -> float | None:
 def _clock(
     times: Float[np.ndarray, " n"], step: float | None, slowest: float, first: float
 ) -> Float[np.ndarray, " n"]:
-    """Seconds after the first frame, or after the `first` one of all; a video that does not tell is
-    as fast as the slowest.
+    """Returns the time of each frame, in seconds.
+
+    Times count from the first frame of the video, or from `first` (the first frame of all videos)
+    if the video begins a little later. A video without times is taken to be as fast as the slowest
+    one.
     """
     if step is None:
         return np.arange(len(times)) * slowest
@@ -82,8 +87,8 @@ def _clock(
 def _all_moments(
     clocks: Mapping[str, Float[np.ndarray, " n"]], steps: Mapping[str, float]
 ) -> Float[np.ndarray, " m"]:
-    """The times of the slowest camera, with those that it lacks at its start, in its gaps and
-    behind its end.
+    """The times of the slowest camera, in seconds. Times at which it has no frame (before its
+    start, in its gaps, after its end) are added.
     """
     slowest = max(steps.values())
     slow = [camera for camera, step in steps.items() if step > (1 - _SAME_RATE) * slowest]
@@ -99,8 +104,9 @@ def _all_moments(
 
 
 def nearest(times: Float[np.ndarray, " n"], moments: Float[np.ndarray, " m"]) -> list[int | None]:
-    """The frame of a camera at each moment, None where the nearest one is too far, or nearer to
-    another moment.
+    """Returns the frame of a camera that is nearest to each moment, times in seconds.
+
+    None if that frame is too far from the moment, or nearer to another moment.
     """
     step = float(np.median(np.diff(times))) if len(times) > 1 else _USUAL_STEP
     found = np.searchsorted((times[1:] + times[:-1]) / 2, moments)
@@ -145,8 +151,10 @@ def _warnings(
     frames: Mapping[str, Sequence[int | None]],
     moments: Float[np.ndarray, " m"],
 ) -> tuple[str, ...]:
-    """A line for each camera that has no frame at a moment before its end, or that ends before
-    others.
+    """Warns of each camera that lacks frames.
+
+    One line if a camera has no frame at a moment before its video ends, and one if its video ends
+    before those of others. Clocks and moments are in seconds.
     """
     found = []
     for camera, numbers in frames.items():

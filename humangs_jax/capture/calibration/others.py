@@ -1,5 +1,5 @@
-"""What of photos does not show the person: masks of other people and of things in front that are
-given, and pixels of an imported photo that the camera has not seen.
+"""Where photos do not show the person: masks of other people and of things in front, and the pixels
+of an imported photo that the camera has not seen.
 
 A capture calls both unknown (docs/capture_format.md).
 """
@@ -28,7 +28,8 @@ from humangs_jax.io.images import PHOTO_SUFFIXES, orientation, read_grey
 
 
 def find_others(folder: Path | None, images: Path, photos: Sequence[Path]) -> dict[Path, Path]:
-    """The masks of others by photo, of those photos that have one; empty without a folder.
+    """Finds the masks of others in a folder, by photo. A photo without such a mask is not in the
+    result; without a folder the result is empty.
 
     Raises: CaptureError if no picture in the folder is named like a photo.
     """
@@ -50,8 +51,8 @@ def find_others(folder: Path | None, images: Path, photos: Sequence[Path]) -> di
 def others_as_shown(
     folder: Path | None, images: Path, photos: Sequence[Path]
 ) -> list[Bool[np.ndarray, "h w"] | None]:
-    """Where others are in front in each photo, as it is shown; None for a photo without a mask of
-    them.
+    """Where others stand in front, in each photo as it is shown. None for a photo without a mask of
+    others.
 
     Raises: see `find_others`; CaptureError for a mask of another size.
     """
@@ -65,7 +66,8 @@ def others_as_shown(
 def others_imported(
     mask: Path, photo: Photo, turn: Turn, camera: CalibratedCamera, canvas: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """Where others are in front in an imported photo: turned, undistorted and padded as it is.
+    """Where others stand in front, in an imported photo. The mask is turned, undistorted and padded
+    as the photo was.
 
     Raises: CaptureError for a mask of another size.
     """
@@ -81,14 +83,17 @@ def not_photographed(
     """Where an imported photo has pixels that the camera has not seen: those beyond a distorted
     lens, and those that were added to bring all photos to one size.
 
-    Arguments: size: width and height of the upright photo. canvas: those of what is written.
+    Arguments: size: width and height of the upright photo. canvas: width and height of the imported
+    photo.
     """
     width, height = size
     return _as_imported(np.ones((height, width), np.float32), camera, canvas) < MASK_THRESHOLD
 
 
 def is_cut_off(person: Bool[np.ndarray, "h w"], unseen: Bool[np.ndarray, "h w"]) -> bool:
-    """Tells whether the person reaches what the camera has not seen, and so may go on there."""
+    """Tells whether the person touches pixels that the camera has not seen. The person may then go
+    on there.
+    """
     # three pixels: a mask that ends so near to what the camera has not seen is cut off there
     near = ndimage.binary_dilation(unseen, iterations=3)
     return bool((person & near).any())
@@ -97,7 +102,11 @@ def is_cut_off(person: Bool[np.ndarray, "h w"], unseen: Bool[np.ndarray, "h w"])
 def _as_imported(
     share: Float[np.ndarray, "h w"], camera: CalibratedCamera, canvas: tuple[int, int]
 ) -> Float[np.ndarray, "height width"]:
-    """An upright mask as its photo is imported; 0 where the camera has not seen anything."""
+    """Undistorts and pads an upright mask as the import does with its photo. The mask is 0 where
+    the camera has not seen anything.
+
+    Arguments: canvas: width and height of the imported photo.
+    """
     if camera.distortion is not None:
         share = undistort(share, camera.K, camera.distortion, fill=0.0)
     height, width = share.shape

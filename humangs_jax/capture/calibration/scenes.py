@@ -62,9 +62,9 @@ NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9), _PARAMETERS, strict=True))
 
 
 def read_colmap(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """The registered images of a model, in the order of its file.
+    """Reads the images of a COLMAP model that are registered, in the order of its file.
 
-    Raises: CaptureError naming the file and, of text, the line.
+    Raises: CaptureError with the name of the file, and the line if the model is text.
     """
     # a model is text or binary; both are read into the same values
     text = any((source.path / name).is_file() for name in ("images.txt", "cameras.txt"))
@@ -146,7 +146,7 @@ def _pose(values: Sequence[float], file: Path, where: str) -> Float[np.ndarray, 
 
 
 def _lines(file: Path) -> Iterator[tuple[str, str]]:
-    """Where it is, and the line, of all but comments."""
+    """Yields where each line is ("line 3") and its text, without comments."""
     lines = enumerate(checked_text(file).splitlines(), 1)
     return ((f"line {number}", line) for number, line in lines if not line.startswith("#"))
 
@@ -206,9 +206,9 @@ def _text_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
 
 
 class _Bytes:
-    """Numbers of a file, little-endian, one after the other.
+    """Reads the numbers of a file one after the other, little-endian.
 
-    Raises: InvalidFileError where it ends before.
+    Raises: InvalidFileError if the file ends too early.
     """
 
     def __init__(self, file: Path):
@@ -222,11 +222,11 @@ class _Bytes:
         return self.data[self.at - size : self.at]
 
     def read(self, kinds: str) -> tuple[Any, ...]:
-        """Values of the kinds of `struct`."""
+        """Reads values of the types that `kinds` names, in the letters of `struct`."""
         return struct.unpack("<" + kinds, self.take(struct.calcsize("<" + kinds)))
 
     def name(self) -> str:
-        """Up to the next zero."""
+        """Reads text up to the next zero byte."""
         end = self.data.find(b"\0", self.at)
         size = (end if end >= 0 else len(self.data)) - self.at
         return self.take(size + 1)[:-1].decode("utf-8", "replace")
@@ -283,7 +283,10 @@ def recognizes_transforms(source: CalibrationFile) -> bool:
 
 
 def read_transforms(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """The cameras of `frames`, in their order. Raises: CaptureError naming the key."""
+    """Reads the cameras of `frames`, in their order.
+
+    Raises: CaptureError with the name of the key.
+    """
     values, file = source.json, source.path
     (frames,) = members(values, file, frames=list)
     if not frames:
@@ -316,9 +319,9 @@ def read_transforms(source: CalibrationFile, format: CameraFormat) -> Calibratio
 def _frame_camera(
     values: Mapping[str, Any], file: Path, prefix: str, photo_size: Callable[[str], tuple[int, int]]
 ) -> CalibratedCamera:
-    """The camera of one image, by its values and those of the whole file.
+    """Returns the camera of one image, from the values of its frame and of the whole file.
 
-    Raises: CaptureError.
+    Raises: CaptureError if values are missing or wrong.
     """
     (name,) = members(values, file, prefix.rstrip("."), file_path=str)
     lens = _frame_lens(values, file, prefix)
@@ -346,10 +349,10 @@ def _frame_camera(
 def _frame_intrinsics(
     values: Mapping[str, Any], size: tuple[int, int] | None, file: Path, prefix: str
 ) -> Float[np.ndarray, "3 3"]:
-    """A whole matrix, or focal lengths and the principal point: square pixels and a centred axis
-    where the file does not say otherwise.
+    """Returns K from a whole matrix, or from focal lengths and a principal point. Where the file
+    does not say otherwise, pixels are square and the principal point is the middle.
 
-    Raises: CaptureError for none of them.
+    Raises: CaptureError if there is neither.
     """
     for key in _MATRICES:
         if key in values and "fl_x" not in values:
@@ -372,10 +375,10 @@ def _frame_intrinsics(
 
 
 def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str, Any]:
-    """Fields of a `CalibratedCamera` for the lens. One that cannot be undistorted carries the
-    error, for those who ask for photos without lens distortion.
+    """Returns the fields of a `CalibratedCamera` that describe the lens. For a lens that cannot be
+    undistorted, they hold the error for those who ask for photos without distortion.
 
-    Raises: CaptureError for a model of cameras that is not read.
+    Raises: CaptureError if the model of the camera is not supported.
     """
     model, refusal = values.get("camera_model", "OPENCV"), None
     if model not in _CAMERA_MODELS:

@@ -66,11 +66,11 @@ class Crop(NamedTuple):
     side: float
     """Length of its sides, pixels."""
     angle: float
-    """Radians by which its upright is turned clockwise."""
+    """Angle in radians by which the crop's upward axis is turned clockwise."""
 
     @property
     def turn(self) -> Float[np.ndarray, "2 2"]:
-        """The rotation from the crop's axes to the photo's."""
+        """The rotation from the crop's axes to those of the photo."""
         c, s = np.cos(self.angle), np.sin(self.angle)
         return np.asarray([[c, -s], [s, c]])
 
@@ -215,7 +215,9 @@ class Networks:
 def sampled(
     photo: Float[np.ndarray, "h w 3"], crop: Crop, size: int, outside: float | None = None
 ) -> Float[np.ndarray, "size size 3"]:
-    """A crop of the photo, bilinear. outside: value beyond the photo; None: that of its edge."""
+    """Samples a crop of the photo, bilinear. outside: value beyond the photo; None: the value at
+    its edge.
+    """
     steps = np.arange(size) / size
     points = crop.to_photo(np.stack(np.meshgrid(steps, steps), axis=-1))
     return bilinear(photo, points, outside)
@@ -226,8 +228,8 @@ def bilinear(
     points: Float[np.ndarray, "a b 2"],
     outside: float | None = None,
 ) -> Float[np.ndarray, "a b *c"]:
-    """Values between pixels; whole numbers are pixels. outside: value beyond the image; None: that
-    of its edge.
+    """Interpolates an image at points (x, y); whole numbers are the middles of pixels. outside:
+    value beyond the image; None: the value at its edge.
     """
     height, width = image.shape[:2]
     x, y = points[..., 0], points[..., 1]
@@ -282,8 +284,8 @@ Window = tuple[slice, slice]
 
 
 def mask_window(found: Landmarks, width: int, height: int, margin: int = 0) -> Window:
-    """Returns the part of a photo that a crop reaches, and so many pixels around it; it may be
-    empty.
+    """Returns the part of a photo that a crop reaches, and `margin` pixels around it. The part may
+    be empty.
     """
     corners = found.crop.to_photo(np.asarray([[0.0, 0], [0, 1], [1, 0], [1, 1]]))
     left, top = (np.floor(corners.min(0)).astype(int) - margin).clip(0, [width, height]).tolist()
@@ -473,8 +475,8 @@ def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[L
 def _hidden_people(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], found: list[Landmarks], margin: float
 ) -> list[Landmarks]:
-    """The people that the detector finds once those found before are painted over; their masks
-    are without those.
+    """Finds the people that appear to the detector once those already found are painted over. The
+    masks of the new people leave out those of the people found before.
     """
     height, width = photo.shape[:2]
     painted, covered = _painted_over(photo, found, margin)
@@ -492,7 +494,10 @@ def _hidden_people(
 def _painted_over(
     photo: Float[np.ndarray, "h w 3"], found: list[Landmarks], margin: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The photo with the colors around the people in their place, and where that is."""
+    """Replaces people in a photo by the colors around them.
+
+    Also returns which pixels were replaced, (h, w).
+    """
     height, width = photo.shape[:2]
     covered = np.zeros((height, width), bool)
     for person in found:
@@ -503,7 +508,7 @@ def _painted_over(
 
 
 def _without(person: Landmarks, found: list[Landmarks]) -> Float[np.ndarray, "256 256"]:
-    """The mask of a person without what of the crop other people cover."""
+    """Returns the mask of a person without the pixels that other people cover."""
     steps = np.arange(LANDMARK_SIZE) / LANDMARK_SIZE
     pixels = person.crop.to_photo(np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2))
     mask = person.mask.ravel().copy()
@@ -550,10 +555,12 @@ def _people(
 def _settled(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], crop: Crop
 ) -> tuple[Landmarks, float]:
-    """Landmarks of a crop that they confirm, and how far they would still move it, a share of its
+    """Returns the landmarks of a person and how far they would still move the crop, a share of its
     side.
 
-    The landmark network knows hips and size better than the detector. It looks at least twice.
+    The crop is moved to what was found, and the network looks again, until the crop hardly moves.
+    It looks at a person at least twice: the landmark network knows hips and size better than the
+    detector does.
     """
     look, drift = networks.landmarks(photo, crop), np.inf
     for _ in range(SEARCH.most_looks - 1):
@@ -570,7 +577,9 @@ def _settled(
 def window_detections(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], shares: Sequence[float]
 ) -> list[Detection]:
-    """What the detector finds in the windows with these shares of the longer side."""
+    """What the detector finds in the windows whose sides are these shares of the photo's longer
+    side.
+    """
     height, width = photo.shape[:2]
     return [
         each for window in windows(width, height, shares) for each in networks.detect(photo, window)
@@ -580,8 +589,10 @@ def window_detections(
 def windows(
     width: int, height: int, shares: Sequence[float] = (*SEARCH.shares, *SEARCH.small_shares)
 ) -> list[Crop]:
-    """Upright squares that cover a photo: one around it, then smaller ones that overlap by half,
-    without those beside it.
+    """Returns the upright squares of a photo in which the detector looks, in pixels of the photo.
+
+    shares: sides of the squares over the longer side of the photo. A square of share 1 contains the
+    whole photo. Smaller ones cover it together, and neighbours overlap by half or more.
     """
     longest, found = max(width, height), []
     for share in shares:
@@ -592,8 +603,8 @@ def windows(
 
 
 def _starts(size: int, side: float) -> Float[np.ndarray, " n"]:
-    """Where windows begin along a photo: one in its middle if that covers it, else evenly spread
-    ones that overlap by half or more.
+    """Returns where windows of a side begin along a photo, both in pixels. One window lies in the
+    middle if it covers the photo. Otherwise windows are spread evenly and overlap by half or more.
     """
     if size <= side:
         return np.asarray([(size - side) / 2])
@@ -602,7 +613,7 @@ def _starts(size: int, side: float) -> Float[np.ndarray, " n"]:
 
 
 def distinct(detections: list[Detection], longest: int) -> list[Detection]:
-    """Detections of different people, of those given best first."""
+    """Keeps one detection of each person. The detections come with the best first."""
     kept: list[Detection] = []
     for detection in detections:
         side = detection.crop().side

@@ -321,7 +321,7 @@ class FittedCapture:
 
     @functools.cached_property
     def report(self) -> FitReport:
-        """How good it is. Made when asked for: it tries exchanges of views."""
+        """How good the fit is. Made only when asked for, because it tries exchanges of views."""
         report = examine(self.capture, self.record.keypoints, self.record).report
         notes, warnings = (*report.notes, *self.notes), (*report.warnings, *self.warnings)
         return dataclasses.replace(report, notes=notes, warnings=warnings)

@@ -57,7 +57,7 @@ from humangs_jax.geometry.transform import EXACT
 WINDOW, OVERLAP = 120, 24
 """Frames of a window, and those that it shares with the next."""
 _STEPS, _STEP_LENGTH = 120, 0.1
-"""Of gradient descent in a stage of a window: how many, and the length of the first in each
+"""Steps of gradient descent in each stage of a window, and the length of the first step in each
 unknown."""
 _ACCELERATION, _JERK = 10.0, 100.0
 """Expected standard deviations of a joint's acceleration, m/s^2, and jerk, m/s^3: those of people
@@ -84,7 +84,7 @@ _PRIOR = _MotionPrior()
 
 
 _LEVELS = ((30.0, 8.0), (10.0, 3.0), (5.0, 1.0))
-"""Of the stages of a motion: the robust scale of keypoints, and a multiple of the expected
+"""One row for each stage of a motion: the robust scale of keypoints, and the factor on the expected
 accelerations."""
 _FEET = ("left_heel", "left_foot_index", "right_heel", "right_foot_index")
 """Landmarks that stand still while a foot does."""
@@ -93,7 +93,7 @@ _LEAST_SEEN = 6
 _LEAST_VISIBLE = 0.3
 """Visibility of a keypoint from which on it counts for that."""
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
-"""Of the camera, in a world with y up and z towards it."""
+"""Turn between the axes of the camera and those of a world with y up and z towards the camera."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -117,9 +117,9 @@ class _Window:
     """What a window knows besides its keypoints, for `_solved`."""
 
     poses: BodyPose
-    """Where zeros of its unknowns are, a batch of frames."""
+    """Poses at which the unknowns are 0, a batch of frames."""
     betas: Float[Array, " s"]
-    """Where zeros of the shape are."""
+    """Shape at which its unknowns are 0."""
     smoother: Float[Array, "w w"]
     """S, see the module's head."""
     timed: Float[Array, " w"]
@@ -131,7 +131,7 @@ class _Window:
     height: Float[Array, "2"]
     """The person's height, metres, and how much it counts, 0 or 1."""
     tall: Float[Array, " s1"]
-    """The height of a body: of the mean one, then per unit of each coefficient, metres."""
+    """Height of the mean body, then what a unit of each coefficient adds, metres."""
     rate: Float[Array, ""]
     """Frames per second."""
     scales: Float[Array, "2"]
@@ -196,9 +196,9 @@ def fit_motion(
 
 
 def _observations(keypoints: Keypoints, K: Float[np.ndarray, "3 3"]) -> Observations:
-    """The keypoints of m frames, a view each, with the detector's depths.
+    """Returns the keypoints of m frames, a view for each frame, with the detector's depths.
 
-    Raises: ValueError if no frame shows the person, or depths are missing.
+    Raises: ValueError if no frame shows the person, or if depths are missing.
     """
     if keypoints.world is None:
         raise ValueError("expected keypoints of a detector that sees them in space, too")
@@ -271,7 +271,7 @@ def _steady(values: Float[np.ndarray, "m ..."], fps: float) -> Float[np.ndarray,
 def _turn(
     a: Float[np.ndarray, "k 3"], b: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]
 ) -> Rotation:
-    """The rotation about weighted middles that takes points a to b best."""
+    """The rotation about the weighted middles that brings points a closest to points b."""
     a, b = (x - np.average(x, axis=0, weights=weights) for x in (a, b))
     return Rotation.align_vectors(b, a, weights=weights)[0]
 
@@ -282,8 +282,13 @@ def _place(
     K: Float[np.ndarray, "3 3"],
     offsets: Float[np.ndarray, "k 3"],
 ) -> Float[np.ndarray, "3"]:
-    """The point from which points at these offsets are seen at their keypoints: with (x, y) a
-    keypoint over the focal length, x (z + t_z) = X + t_x, linear in t; the same for y.
+    """Returns the position t at which a body is seen where its keypoints are, metres.
+
+    Arguments: points: keypoints, pixels. offsets: points of the body relative to t, metres.
+
+    Let (X, Y, Z) be a point's offset in the camera's axes, and (x, y) its keypoint over the focal
+    length, from the principal point. Then x (Z + t_z) = X + t_x, which is linear in t; y gives the
+    same.
     """
     xy = (points - K[:2, 2]) / np.diagonal(K)[:2]
     off = offsets * np.diag(FLIP)[:3]
@@ -309,7 +314,7 @@ def _tallness(body: BodyModel) -> Float[np.ndarray, " s1"]:
 def _of_height(
     betas: Float[np.ndarray, " s"], tall: Float[np.ndarray, " s1"], height: float | int | None
 ) -> Float[np.ndarray, " s"]:
-    """The nearest shape of that height, metres; None: the shape itself."""
+    """Returns the shape of that height (metres) nearest to `betas`; with None, `betas`."""
     if height is None:
         return betas
     missing = height - tall[0] - tall[1:] @ betas
@@ -332,8 +337,9 @@ def _joined(
     run: Callable[..., tuple[BodyPose, np.ndarray]],
     more: Callable[[np.ndarray], dict[str, Any]] = lambda window: {},
 ) -> BodyPose:
-    """The poses after each window has been solved, from the first to the last. The frames that a
-    window shares with the one before are anchored in their first half.
+    """Solves the windows one after the other, and returns the poses of all frames.
+
+    A window keeps the first half of the frames that it shares with the one before.
     """
     for i, window in enumerate(windows):
         anchored = np.zeros(len(window))
@@ -356,8 +362,9 @@ def _run(
     static: Float[np.ndarray, "w f"] | None = None,
     anchored: Float[np.ndarray, " w"] | None = None,
 ) -> tuple[BodyPose, Float[np.ndarray, " s"]]:
-    """All poses, with those of these frames fitted, and the shape. timed: whether the frames follow
-    each other in time and have the shape already.
+    """Fits the poses of these frames. Returns all poses and the shape.
+
+    timed: whether the frames follow each other in time and the shape is known already.
     """
     count = len(frames)
     # windows have one length, so that one program does for all: what is added shows nothing
@@ -387,7 +394,7 @@ def _run(
 
 @functools.cache
 def _smoother(fps: float) -> Float[np.ndarray, "w w"]:
-    """S of a window."""
+    """Returns the matrix S of a window, see the module's docstring."""
     third = np.diff(np.eye(WINDOW), n=3, axis=0)
     values, vectors = np.linalg.eigh(third.T @ third)
     weight = (_PRIOR.keypoint * fps**3 / _JERK) ** 2
@@ -398,7 +405,7 @@ def _smoother(fps: float) -> Float[np.ndarray, "w w"]:
 def _solved(
     model: LandmarkModel, seen: Observations, window: _Window
 ) -> tuple[BodyPose, Float[Array, " s"]]:
-    """The poses of a window and the shape, from those that it begins with."""
+    """Fits a window, beginning with its poses and shape. Returns the new poses and the shape."""
     problem = keypoint_problem(model)
     origin = replace(problem.origin, betas=jnp.zeros_like(window.betas))
     usual = problem.origin.pose
@@ -466,7 +473,7 @@ def _solved(
 
 
 def _descended(loss: Callable[[FitState], Float[Array, ""]], start: Any) -> FitState:
-    """Where Adam gets in `_STEPS` steps, whose length falls to 0 (cosine)."""
+    """Returns the unknowns after `_STEPS` steps of Adam. The step length falls to 0 (cosine)."""
     optimizer = optax.adam(optax.cosine_decay_schedule(_STEP_LENGTH, _STEPS), b1=0.9, b2=0.95)
 
     def step(carry, _):
@@ -562,8 +569,8 @@ def _matrix(turn: Rotation, shift: Float[np.ndarray, "3"]) -> Float[np.ndarray, 
 def betas_of_joints(
     body: BodyModel, rest_joints: Float[np.ndarray, "j 3"]
 ) -> Float[np.ndarray, " s"]:
-    """The shape whose joints in the T-pose are nearest to these, up to a translation: that of an
-    avatar.
+    """Returns the shape whose joints in the T-pose are nearest to `rest_joints`, up to a
+    translation. It is used for the joints of an avatar.
 
     Raises: ValueError for another number of joints.
     """

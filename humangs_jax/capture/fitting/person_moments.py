@@ -35,9 +35,9 @@ from humangs_jax.io.images import DIAGONAL_35MM
 USUAL_FOCAL = 29.0
 """Focal length of a telephone's main camera, mm, 35-mm equivalent."""
 USUAL_STD = 0.2
-"""Standard deviation of the logarithm of a focal length that is supposed."""
+"""Standard deviation of the logarithm of a focal length that is only assumed."""
 _EXIF_STD = 0.03
-"""Standard deviation of the logarithm of a focal length that EXIF says."""
+"""Standard deviation of the logarithm of a focal length from EXIF."""
 SEEN = 0.1
 """Least visibility of a landmark that counts."""
 FEWEST = 6
@@ -122,13 +122,13 @@ class PersonViews:
 
 
 def known_landmarks(seen: PersonViews) -> Bool[np.ndarray, "c k"]:
-    """Those that are seen, and finite."""
+    """Which landmarks are visible and have finite coordinates, (c, k)."""
     finite = np.isfinite(seen.points).all(-1) & np.isfinite(seen.world).all(-1)
     return finite & (np.nan_to_num(seen.visibility) > SEEN)
 
 
 def cleaned(seen: PersonViews) -> PersonViews:
-    """The same with zeros for all that is not known."""
+    """Returns the views with zeros in place of all landmarks that are not known."""
     known = known_landmarks(seen)
     return dataclasses.replace(
         seen,
@@ -184,7 +184,7 @@ class Explanation:
     views: tuple[int, ...]
     """Indices of all photos, or of all but one."""
     warnings: tuple[str, ...] = ()
-    """What a user should know of it, a line each."""
+    """What a user should know about this explanation, a line each."""
 
 
 def explain(seen: PersonViews) -> Explanation:
@@ -229,7 +229,10 @@ def explain(seen: PersonViews) -> Explanation:
 def _without_one(
     seen: PersonViews, chosen: tuple[int, ...]
 ) -> tuple[Trial, tuple[int, ...]] | None:
-    """Cameras of all photos but one, if they are of one moment then."""
+    """Fits the cameras of all photos but the one that contradicts the others most.
+
+    None if the rest is not of one moment either.
+    """
     rests = [tuple(v for v in chosen if v != out) for out in chosen]
     trials = [
         _try(seen.select(rest), np.zeros(len(rest), bool))
@@ -245,8 +248,9 @@ def _without_one(
 def _with_others(
     seen: PersonViews, trial: Trial, views: tuple[int, ...], others: Sequence[int]
 ) -> tuple[Trial, tuple[int, ...]]:
-    """Cameras of further photos, too: of those that show the person of the trial, mirrored or
-    not.
+    """Adds those of the other photos that show the person of the trial, mirrored or not.
+
+    Returns the cameras of all these photos, fitted together, and the photos.
     """
     mirrored = dict(zip(views, trial.mirrored, strict=True))
     for view in under_bar(others, "cameras of further photos"):
@@ -260,8 +264,8 @@ def _with_others(
 
 
 def _different(seen: PersonViews) -> tuple[int, ...]:
-    """The photos that decide, from sides that differ: always the one that is farthest from all that
-    were chosen.
+    """Chooses the photos that decide, so that they look from different sides. Each next one is the
+    photo farthest from all that were chosen.
     """
     count = len(seen.photos)
     if count <= ONE_MOMENT.deciding:
@@ -277,7 +281,7 @@ def _different(seen: PersonViews) -> tuple[int, ...]:
 
 
 def under_bar(items: Sequence[Any], what: str) -> Iterator[Any]:
-    """Items under a bar, if there are several and a program shows one."""
+    """Yields the items under a progress bar, if there are several and a program shows one."""
     yield from bar(items, desc=what, leave=False, shown=watched() and len(items) > 1)
 
 
@@ -301,7 +305,7 @@ def best_trial(seen: PersonViews) -> Trial:
 
 
 def _least(seen: PersonViews, start: Trial) -> Trial:
-    """View after view is mirrored while that explains the landmarks clearly better."""
+    """Mirrors view after view, as long as that explains the landmarks clearly better."""
     views = np.arange(len(seen.points))
     while True:
         flips = [start.mirrored ^ (views == v) for v in views]
@@ -313,20 +317,20 @@ def _least(seen: PersonViews, start: Trial) -> Trial:
 
 
 def _try(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> Trial:
-    """Cameras as exact as a comparison needs."""
+    """Fits the cameras for a trial, as exactly as a comparison of trials needs."""
     evidence, start = evidence_of(seen, mirrored)
     return Trial(mirrored, *adjust(evidence, start, COARSE), evidence)
 
 
 def _polished(trial: Trial) -> Trial:
-    """The same as exact as they can be."""
+    """Fits the cameras of a trial again, as exactly as possible."""
     rig, cost = adjust(trial.evidence, trial.rig, EXACT, ROBUST_SCALES[-1:])
     return dataclasses.replace(trial, rig=rig, cost=cost)
 
 
 def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"]) -> float:
-    """Rms of errors (c, k), by degrees of freedom where there are any: points and cameras were
-    fitted to them.
+    """Rms of the errors (c, k). The divisor counts the degrees of freedom that are left after
+    points and cameras were fitted.
     """
     views, shown = len(errors), weights.max(0) > SEEN
     numbers = 2 * (weights > SEEN).sum()
@@ -337,13 +341,13 @@ def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray,
 
 
 def _angle(rig: Rig) -> float:
-    """Degrees between the two photos that see the person from the most different sides."""
+    """Largest angle between the directions from which two photos see the person, degrees."""
     towards = _directions(rig)
     return float(np.rad2deg(np.arccos(np.clip(towards @ towards.T, -1, 1))).max())
 
 
 def _directions(rig: Rig) -> Float[np.ndarray, "c 3"]:
-    """From the person towards the cameras, unit vectors."""
+    """Unit vectors from the person towards the cameras, (c, 3)."""
     places = rig.places / np.linalg.norm(rig.places, axis=1, keepdims=True)
     return -np.einsum("cba,cb->ca", rig.rotations, places)
 
@@ -442,7 +446,7 @@ def middle_of(
 def only_known(
     points: Float[np.ndarray, "k 3"], names: Sequence[str], known: Bool[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "n 3"], tuple[str, ...]]:
-    """Those landmarks that are known, and their names: places of the others mean nothing."""
+    """The landmarks that are known, (n, 3), and their names. Places of others mean nothing."""
     kept = np.flatnonzero(known)
     return points[kept], tuple(names[i] for i in kept)
 

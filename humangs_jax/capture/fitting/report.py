@@ -26,24 +26,24 @@ class _Worth:
     """What in a fit is worth a line."""
 
     outliers: float = 0.3
-    """Share of the keypoints of a view: fits tolerate more, but a detector that errs this often saw
-    something else."""
+    """A view with a larger share of outliers among its keypoints gives a warning. A fit tolerates
+    more, but a detector that errs this often saw something else."""
     off: float = 4.0
-    """Multiple of the expected noise: a view with this median error, 2 % of the person's height,
-    shows another pose or camera."""
+    """A view whose median error is more than this many times the expected noise gives a warning.
+    That is 2 % of the person's height; such a view shows another pose or camera."""
     beyond_limit: float = np.rad2deg(0.05)
-    """Degrees beyond a joint's limit that are no violation: limits are rough."""
+    """A joint this many degrees beyond its limit is no violation yet, because limits are rough."""
     far_beyond: float = 10.0
-    """Degrees beyond a joint's limit from which on there is a warning."""
+    """A joint more than this many degrees beyond its limit gives a warning."""
     std: float = 0.03
     """Metres: a joint whose std exceeds this is undetermined."""
     determined: float = 0.1
-    """A joint of whose rotation a smaller share is determined is undetermined: a mean over axes, of
-    which knees and fingers have one that turns."""
+    """A joint is undetermined if the determined share of its rotation is smaller than this. The
+    share is a mean over three axes; knees and fingers turn about only one."""
     named: int = 5
     """Items that are listed by name; the others are counted."""
     rows: int = 24
-    """Views in the printed table; of more, those that fit worst."""
+    """Rows of the printed table. If there are more views, it shows those that fit worst."""
 
 
 WORTH_A_LINE = _Worth()
@@ -221,9 +221,11 @@ def undetermined_joints(
     joint_std: Float[np.ndarray, "m j"],
     determined: Float[np.ndarray, "m j"],
 ) -> tuple[str, ...]:
-    """Joints that the views do not determine in m frames; fingers and other groups as one.
+    """Names the joints that the views do not determine in m frames. Fingers and other groups are
+    named as one.
 
-    Arguments: joint_std: metres. determined: shares.
+    Arguments: joint_std: standard deviation of each joint, metres. determined: share of each
+    joint's rotation that the views determine.
     """
     unknown = (joint_std > WORTH_A_LINE.std) | (determined < WORTH_A_LINE.determined)
     counts = {
@@ -249,7 +251,10 @@ def keypoint_warnings(
     violations: Sequence[Violation],
     swaps: Sequence[Swap],
 ) -> tuple[str, ...]:
-    """What points to a mistake. expected: noise of the keypoints of each frame, pixels."""
+    """Returns a line for each thing in the keypoints that points to a mistake.
+
+    expected: noise of the keypoints of each frame, pixels.
+    """
     found = [str(swap) for swap in swaps[: WORTH_A_LINE.named]]
     if len(swaps) > WORTH_A_LINE.named:
         found.append(
@@ -294,14 +299,16 @@ def _names(views: Sequence[ViewReport]) -> str:
 
 
 def _span(views: Sequence[ViewReport], field: str, form: str) -> str:
-    """The least and the greatest value of a field, or the one value if they are equal."""
+    """Writes the smallest and the largest value of a field, or one value if they are equal."""
     ends = [form.format(of(getattr(view, field) for view in views)) for of in (min, max)]
     return ends[0] if ends[0] == ends[1] else " to ".join(ends)
 
 
 def how_far(start: Capture, refined: Capture) -> dict[str, float]:
-    """How far two captures of one person differ, means: focal_factor; camera_degrees, camera_cm;
-    joint_degrees of the joints' rotations, transl_cm of the root.
+    """Says how far two captures of one person differ. Each value is a mean.
+
+    Keys: focal_factor, the ratio of the focal lengths; camera_degrees and camera_cm, the turn and
+    the move of the cameras; joint_degrees, the turn of the joints; transl_cm, the move of the root.
     """
     both = (start, refined)
     focal = [np.asarray(each.cameras.K, float)[:, 0, 0] for each in both]

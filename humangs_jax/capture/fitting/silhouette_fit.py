@@ -267,8 +267,8 @@ def _evidence_residuals(
 
 
 def _counted(clothing: Float[Array, " b"]) -> Float[Array, " b"]:
-    """Thicknesses of clothes as their prior counts them: clothes have no negative one, which counts
-    five times.
+    """Thicknesses of clothes as their prior counts them. A negative one counts five times, because
+    clothes have none.
     """
     return jnp.where(clothing < 0, 5.0 * clothing, clothing)
 
@@ -346,9 +346,8 @@ class SilhouetteFit:
     unknown: Bool[np.ndarray, "v h w"] | None
     """Where masks say nothing, (v, h, w); None: they say something everywhere."""
     hidden: list[Bool[np.ndarray, "h w"] | None]
-    """The same with a rim where the edge of a mask is that of whoever stands in front; None for a
-    view without any.
-    """
+    """Where masks say nothing, and a rim around it: there the edge of the mask is that of whoever
+    stands in front. None for a view without such pixels."""
     faces: Int[np.ndarray, "f 3"]
     """Faces of the body."""
     edges: silhouettes.MeshEdges
@@ -433,7 +432,9 @@ class SilhouetteFit:
         return state, move
 
     def calls(self) -> Iterator[Call]:
-        """The programs of `run` and `score`, the longest first. Only shapes decide on them."""
+        """Yields the programs that `run` and `score` call, the longest first, with arguments of the
+        right shapes. Which programs are compiled depends on the shapes alone, not on the values.
+        """
         state, capture = start_state(self.origin, self.config), self.capture
         betas, cameras = self.origin.betas, self.cameras
         evidence, count = self._no_evidence(), self.config.points
@@ -451,7 +452,7 @@ class SilhouetteFit:
         yield silhouettes.coverage, (np.zeros(self.masks.shape[1:], np.float32), places)
 
     def _no_evidence(self) -> Evidence:
-        """Evidence of the shape that all evidence has."""
+        """Returns evidence that shows nothing, whose arrays have the shapes of all evidence."""
         views, count = len(self.masks), self.config.points
         pixels, ends = np.zeros((2, 0, 2), np.float32), np.zeros((0, 2), int)
         nothing = silhouettes.Boundary(*pixels, ends, np.zeros(0, np.float32))
@@ -500,8 +501,8 @@ class SilhouetteFit:
         )
 
     def _keypoint_errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
-        """Distances of a body from these keypoints, pixels of the photos; NaN where there is
-        none.
+        """Distances of the body of a capture from the keypoints `seen`, pixels of the photos; NaN
+        where there is no keypoint.
         """
         cameras = capture.cameras
         seen = replace(
@@ -545,7 +546,9 @@ class SilhouetteFit:
 def _with_rim(
     unknown: Bool[np.ndarray, "v h w"] | None, views: int
 ) -> list[Bool[np.ndarray, "h w"] | None]:
-    """What is unknown of each view and a rim of three pixels; None for a view without any."""
+    """The unknown pixels of each view, and a rim of three pixels around them. None for a view
+    without unknown pixels.
+    """
     if unknown is None:
         return [None] * views
     return [ndimage.binary_dilation(each, iterations=3) if each.any() else None for each in unknown]
@@ -556,8 +559,8 @@ def overlap(
     mask: Float[np.ndarray, "h w"],
     known: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """Intersection over union of a body and a mask where that is known (default: everywhere);
-    NaN if the mask is empty.
+    """Intersection over union of a body and a mask, over the pixels where the mask is known
+    (default: all). NaN if the mask is empty.
     """
     person = mask > 0.5
     if known is not None:
@@ -579,8 +582,10 @@ def posed_vertices(
 def _noise(
     boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]
 ) -> float:
-    """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a
-    body that is not yet there. At least 0.7: silhouettes of masks are no better.
+    """How far the bodies are from their masks, pixels, at least 0.7.
+
+    Clothes make masks less certain, and so does a body that has not yet arrived. Silhouettes are
+    never more exact than 0.7 pixels.
     """
     found = [np.zeros(0)]
     for boundary, own in zip(boundaries, matches, strict=True):
@@ -619,7 +624,7 @@ class RefinedCapture:
     """The result of a refinement."""
 
     capture: Capture
-    """The better one of start and result; the very start if `report.kept` is False."""
+    """The better of start and result. The start itself if `report.kept` is False."""
     report: FitReport
     """What was fitted, and how well."""
 

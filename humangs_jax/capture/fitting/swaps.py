@@ -145,8 +145,10 @@ class Order(NamedTuple):
         a: Int[np.ndarray, " e"],
         b: Int[np.ndarray, " e"] | None,
     ) -> "Order":
-        """The order with the keypoints of cameras a and b exchanged in some frames, or without b
-        left and right of camera a's.
+        """The order after an exchange in some frames.
+
+        Cameras a and b exchange their keypoints. If b is None, left and right of camera a's
+        keypoints are exchanged.
         """
         source, mirrored = self.source.copy(), self.mirrored.copy()
         if b is None:
@@ -283,14 +285,19 @@ class _Search:
         a: Int[np.ndarray, " e"],
         b: Int[np.ndarray, " e"] | None = None,
     ) -> Float[np.ndarray, " e"]:
-        """(e,) agreement that an exchange adds in each of its frames."""
+        """Returns how much agreement an exchange adds in each of its frames, (e,).
+
+        Arguments: frames, a, b: as in `Order.exchanged`.
+        """
         order = self.order.exchanged(frames, a, b)
         own = agreements(_arranged(self.observations, self.mirror, order), self.mirror).own
         return (np.asarray(own).sum(-1) - self.total)[frames]
 
     def is_clear(self, trial: _Trial, of: Bool[np.ndarray, " k"]) -> bool:
-        """Whether an exchange of the keypoints `of` gains enough: attainable is that all agree that
-        another view sees.
+        """Whether an exchange of the keypoints `of` gains enough.
+
+        The gain is compared with what is attainable: agreement on all keypoints that another view
+        sees, too.
         """
         seen = (self.confidences > 0) & of
         shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
@@ -305,7 +312,9 @@ class _Search:
         return trial.gain / max(attainable, 1e-6) > least
 
     def flips(self) -> dict[int, _Trial]:
-        """The view of each frame whose sides are exchanged most clearly, by frame."""
+        """Finds the view of each frame whose sides are exchanged most clearly. Returns trials by
+        frame.
+        """
         found: dict[int, _Trial] = {}
         sided = self.mirror != np.arange(len(self.mirror))
         for slot in np.flatnonzero(self.sides.any(0)):
@@ -318,7 +327,9 @@ class _Search:
         return found
 
     def exchanges(self) -> list[_Trial]:
-        """Exchanges of two cameras in all of their frames together, and in each alone."""
+        """Returns the clear exchanges of two cameras: in all their frames together, and in each
+        frame alone.
+        """
         # pairs of cameras that look exchanged in some frame are tried in all of their frames
         suspected = {self._pair(*at) for at in np.argwhere(self.pairs).tolist()}
         tried: dict[tuple[int, ...], list[_Trial]] = {}
@@ -338,12 +349,12 @@ class _Search:
         return [trial for trial in (*together, *alone) if self.is_clear(trial, every)]
 
     def _pair(self, frame: int, a: int, b: int) -> tuple[int, ...]:
-        """The numbers of two cameras of a frame, sorted."""
+        """The numbers of the cameras in two columns of a frame, sorted."""
         return tuple(sorted(self.cameras[frame, [a, b]].tolist()))
 
 
 def _together(trials: Sequence[_Trial]) -> _Trial:
-    """Exchanges of two cameras in several frames as one."""
+    """Joins the exchanges of two cameras in several frames to one."""
     frames, a, b = (
         np.concatenate([getattr(trial, key) for trial in trials]) for key in ("frames", "a", "b")
     )
@@ -353,7 +364,9 @@ def _together(trials: Sequence[_Trial]) -> _Trial:
 def _cameras(
     best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"], names: Sequence[str]
 ) -> Swap:
-    """The swap of the best exchange, and the others of the same frames that gain as much."""
+    """Reports the best exchange as a swap. Other exchanges of the same frames that gain as much are
+    its alternatives.
+    """
 
     def named(trial: _Trial) -> tuple[str, ...]:
         """The two views in the first frame of an exchange."""
@@ -370,8 +383,8 @@ def _cameras(
 def _sides(
     observations: Observations, views: Int[np.ndarray, "m c"], order: Order, names: Sequence[str]
 ) -> list[Swap]:
-    """A swap for each view whose sides are exchanged; if these are half of the views, it may be the
-    other half.
+    """Returns a swap for each view whose sides are exchanged. If these are half of the views, the
+    other half may be exchanged instead.
     """
     found = []
     seen = np.any(np.asarray(observations.confidences) > 0, axis=-1)
