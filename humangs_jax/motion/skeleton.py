@@ -233,8 +233,10 @@ def _pelvis_turns(
         return smallest_turns(unit(candidate @ rest_line), unit(line)) @ candidate
 
     def tilts(candidate, top):
-        """Angles (m,) about the line of the hips, between the direction of a joint above in the
-        rest pose and in each frame.
+        """Angles (m,) about the line of the hips that the candidate rotations miss, radians.
+
+        They go from the direction of a joint above the pelvis, turned by the candidate from the
+        rest pose, to its direction in the frame.
         """
         axis = unit(line)
 

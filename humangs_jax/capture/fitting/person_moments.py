@@ -264,8 +264,9 @@ def _with_others(
 
 
 def _different(seen: PersonViews) -> tuple[int, ...]:
-    """Chooses the photos that decide, so that they look from different sides. Each next one is the
-    photo farthest from all that were chosen.
+    """Chooses the photos that decide, so that they show the person from different sides.
+
+    Each next photo is the one whose direction is farthest from those of all chosen before.
     """
     count = len(seen.photos)
     if count <= ONE_MOMENT.deciding:
