@@ -166,6 +166,10 @@ def inspect_folder(
     )
 
 
+look = inspect_folder
+"""The name that `inspect_folder` had; it goes in version 0.3."""
+
+
 def photo_files(folder: Path) -> tuple[Path, list[Path]]:
     """The folder that the photos are in, and their files in order.
 
