@@ -271,7 +271,13 @@ def shape_fault(tree: Any) -> str | None:
             fault = _array_fault(value, field, batch_rank, sizes)
         if fault:
             return f".{name}{fault}"
-    return _size_fault(tree)
+    # sizes are whole numbers
+    for static in dataclasses.fields(tree):
+        value = getattr(tree, static.name)
+        is_size = static.metadata.get("static") and static.type is int
+        if is_size and not isinstance(value, int | np.integer):
+            return f".{static.name}: expected a whole number, got {value!r}"
+    return None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -324,19 +330,6 @@ def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, in
 
 def _shown_shape(axes: Sequence[str | int]) -> str:
     return f"({', '.join(map(str, axes))}{',' * (len(axes) == 1)})"
-
-
-def _size_fault(tree: Any) -> str | None:
-    """Finds the first static field that should be an integer and is not."""
-    for field in dataclasses.fields(tree):
-        value = getattr(tree, field.name)
-        if (
-            field.metadata.get("static")
-            and field.type is int
-            and not isinstance(value, int | np.integer)
-        ):
-            return f".{field.name}: expected a whole number, got {value!r}"
-    return None
 
 
 @functools.cache
