@@ -63,8 +63,8 @@ def step_programs(run: Run, before: str | None = None, turns: int = 1, repeats: 
 
             return work
 
-        cases = {title: case("count", platform) for platform, title in PLATFORMS.items()}
-        cases |= {f"turn {turn + 1}": case("time", str(repeats)) for turn in range(turns)}
+        cases = {f"turn {turn + 1}": case("time", str(repeats)) for turn in range(turns)}
+        cases |= {title: case("count", platform) for platform, title in PLATFORMS.items()}
         rows = run.rows(cases, {"before": before, "repeats": repeats})
     table = []
     for title in PLATFORMS.values():
@@ -94,6 +94,7 @@ def _started(place: Path, *words: str) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        start_new_session=True,  # Linux shares a busy machine among sessions
     )
 
 
