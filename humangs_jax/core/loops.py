@@ -15,7 +15,7 @@ from humangs_jax.core.array_types import PyTree
 T = TypeVar("T", bound=PyTree)
 PIXELS_AT_ONCE = 1 << 22
 """Pixels of the images that an accelerator works on side by side for one subject: sixteen of 512 x
-512. Drawing keeps up to 1 KB for each while it sorts and blends, 4 GB.
+512, so that four photos or targets of the published size are worked on together. More go in parts.
 """
 
 
