@@ -379,9 +379,10 @@ def _certainty_found(
     own = jax.vmap(errors_of_frame)(observations, states)
     found = jnp.stack([own, own[..., mirror]])
     ratio = jnp.nan_to_num(jnp.nanmedian(found, axis=(0, 1, 2)) / RAYLEIGH_MEDIAN, nan=1.0)
-    # keypoints that it comes from; those of a landmark in the middle are in `found` twice
-    twice = 1 + (mirror != np.arange(len(mirror)))
-    count = jnp.sum(~jnp.isnan(found), axis=(0, 1, 2)) / twice
+    # how many keypoints it comes from: of a pair the mean of its sides; a landmark in the middle is
+    # in `found` twice and counts twice
+    sides = 1 + (mirror != np.arange(len(mirror)))
+    count = jnp.sum(~jnp.isnan(found), axis=(0, 1, 2)) / sides
     # the usual noise counts for 16 keypoints, and half of it is the least
     usual_count, least_share = 16, 0.5
     usual = 1 / problem.model.certainty
