@@ -205,8 +205,8 @@ def reconstruct_batch(
         that a capture, or the function that loads it, has raised.
 
     Examples:
-        >>> for capture, avatar, error in hg.reconstruct_batch(*hg.load_weights(), captures):
-        ...     print(error or avatar)
+        >>> made = hg.reconstruct_batch(*hg.load_weights(), captures)
+        >>> failed = [each for each in made if each.error]
     """
     for start in range(0, len(captures), batch):
         # what is wrong with one capture is kept in its place

@@ -42,6 +42,10 @@ _SOMA_JOINTS = 77
 """Joints of Kimodo's skeleton, which is not SMPL-X's."""
 _NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat"
 """A note about hands that are not read."""
+_MISSING_RATE = (
+    "missing: how many frames are a second? expected --motion-fps (in Python fps=), or this key"
+)
+"""What is wrong with a file that has no rate."""
 
 
 def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
@@ -383,12 +387,7 @@ class _MotionFile(ArrayFile):
                 )
             return rate
         if form.fps is None:
-            raise MotionError(
-                self.path,
-                key,
-                "missing: how many frames are a second? expected --motion-fps (in Python fps=), or"
-                " this key",
-            )
+            raise MotionError(self.path, key, _MISSING_RATE)
         if not form.fixed:
             self.notes.append(
                 f"{NO_RATE.format(form.fps)}, which --motion-fps (in Python fps=) changes"
