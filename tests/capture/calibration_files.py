@@ -3,7 +3,6 @@ it.
 """
 
 import json
-import struct
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -214,25 +213,6 @@ K, POSES = scene()
 SIZE = [WIDTH, HEIGHT]
 
 
-def tables(title, name="", extra=""):
-    """TOML: a table of each camera."""
-    lines = ["[metadata]", "adjusted = true"]
-    for i, (k, pose) in enumerate(zip(K, POSES, strict=True)):
-        lines += [
-            f"[{title.format(i)}]",
-            *([f'name = "{name.format(NAMES[i])}"'] if name else []),
-            f"size = {SIZE}",
-            extra,
-        ]
-        lines += [
-            f"matrix = {k.tolist()}",
-            f"distortions = {LENS}",
-            f"translation = {pose[:3, 3].tolist()}",
-        ]
-        lines += [f"rotation = {Rotation.from_matrix(pose[:3, :3]).as_rotvec().tolist()}"]
-    return "\n".join(lines)
-
-
 def panoptic():
     rows = zip(NAMES, K, POSES, strict=True)
     entry = lambda n, k, p: {
@@ -243,75 +223,3 @@ def panoptic():
         "distCoef": LENS,
     }
     return {"cameras": [entry(*row) | {"resolution": SIZE, "type": "hd"} for row in rows]}
-
-
-def shelf():
-    def entry(k, pose):
-        place = -pose[:3, :3].T @ pose[:3, 3:]
-        numbers = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]}
-        lens = {"k": [[LENS[0]], [LENS[1]], [LENS[4]]], "p": [[LENS[2]], [LENS[3]]]}
-        return numbers | lens | {"R": pose[:3, :3].tolist(), "T": place.tolist()}
-
-    return {str(i): entry(k, pose) for i, (k, pose) in enumerate(zip(K, POSES, strict=True))}
-
-
-def qualisys():
-    """Pixels of a field of view that begins at (3, 2)."""
-    cameras = []
-    for name, k, pose in zip(NAMES, K, POSES, strict=True):
-        turn = np.diag([1.0, -1, -1]) @ pose[:3, :3]
-        place = -1000 * pose[:3, :3].T @ pose[:3, 3]
-        turns = " ".join(f'r{i + 1}{j + 1}="{turn[i, j]!r}"' for i in range(3) for j in range(3))
-        moved = (k[0, 0], k[1, 1], k[0, 2] + 3, k[1, 2] + 2)
-        keys = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV")
-        inner = " ".join(
-            f'{key}="{64 * value!r}"' for key, value in zip(keys, map(float, moved), strict=True)
-        )
-        lens = zip(
-            (
-                "radialDistortion1",
-                "radialDistortion2",
-                "tangentalDistortion1",
-                "tangentalDistortion2",
-            ),
-            LENS,
-            strict=False,
-        )
-        inner += " " + " ".join(f'{key}="{value}"' for key, value in lens)
-        at = " ".join(f'{axis}="{float(v)!r}"' for axis, v in zip("xyz", place, strict=True))
-        view = f'<fov_video left="3" top="2" right="{2 + SIZE[0]}" bottom="{1 + SIZE[1]}"/>'
-        cameras.append(
-            f'<camera serial="{name}">{view}<transform {at} {turns}/><intrinsic {inner}/></camera>'
-        )
-    text = "<calibration><cameras>" + "".join(cameras) + "</cameras></calibration>"
-    return text.replace("np.float64(", "").replace(')"', '"')
-
-
-def write_binary(folder, text):
-    """The .bin files of a text model of PINHOLE cameras."""
-    lines = lambda name: [
-        x.split() for x in (text / name).read_text().splitlines() if not x.startswith("#")
-    ]
-    cameras = lines("cameras.txt")
-    pack = lambda c: struct.pack("<iiQQ4d", int(c[0]), 1, int(c[2]), int(c[3]), *map(float, c[4:]))
-    (folder / "cameras.bin").write_bytes(
-        struct.pack("<Q", len(cameras)) + b"".join(map(pack, cameras))
-    )
-    rows, data = lines("images.txt"), b""
-    for image, seen in zip(rows[::2], rows[1::2], strict=True):
-        data += (
-            struct.pack("<i7di", int(image[0]), *map(float, image[1:8]), int(image[8]))
-            + image[9].encode()
-            + b"\0"
-        )
-        data += struct.pack("<Q", len(seen) // 3)
-        for k in range(0, len(seen), 3):
-            data += struct.pack("<ddq", float(seen[k]), float(seen[k + 1]), int(seen[k + 2]))
-    (folder / "images.bin").write_bytes(struct.pack("<Q", len(rows) // 2) + data)
-    points = lines("points3D.txt")
-    pack = lambda p: struct.pack(
-        "<Q3d3BdQii", int(p[0]), *map(float, p[1:4]), 9, 9, 9, 0.5, 1, 1, 2
-    )
-    (folder / "points3D.bin").write_bytes(
-        struct.pack("<Q", len(points)) + b"".join(map(pack, points))
-    )

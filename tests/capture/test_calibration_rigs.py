@@ -3,12 +3,14 @@ distortion.
 """
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
+from changes import edit_text
 
 from humangs_jax.data.cameras import (
-    _squared_reach,
     distort,
     read_calibration,
     undistort,
@@ -22,50 +24,48 @@ NAMES, LENS, SIZE = written.NAMES, written.LENS, [written.WIDTH, written.HEIGHT]
 K, POSES = written.scene()
 
 
-OTHERS = {"distance": 2.0, "model": "fisheye"}
-OTHER_KEYS = 'distance = 2.0\nmodel = "fisheye"'
-FORMATS = {
-    "Caliscope": ("camera_array.toml", lambda: written.tables("cameras.{}"), "0123", LENS),
-    "Anipose": ("calibration.toml", lambda: written.tables("cam_{}", "{}"), NAMES, LENS),
-    "Pose2Sim": (
-        "Calib.toml",
-        lambda: written.tables("cam_{}", "{}", "fisheye = false"),
-        NAMES,
-        LENS,
-    ),
-    "Panoptic": ("calibration_160906.json", written.panoptic, NAMES, LENS),
-    "TOML, other keys": (
-        "Calib.toml",
-        lambda: written.tables("cam_{}", "{}", OTHER_KEYS),
-        NAMES,
-        LENS,
-    ),
-    "Panoptic, other keys": (
-        "calibration_1.json",
-        lambda: {"cameras": [c | OTHERS for c in written.panoptic()["cameras"]]},
-        NAMES,
-        LENS,
-    ),
-    "Shelf": ("calibration_shelf.json", written.shelf, "0123", LENS),
-    "Qualisys": ("Calib.qca.txt", written.qualisys, NAMES, [*LENS[:4], 0.0]),
-}
+FILES = Path(__file__).parents[1] / "data" / "files"
 
 
-@pytest.mark.parametrize("kind", FORMATS)
-def test_cameras_are_read_as_written(kind, tmp_path):
-    name, content, names, lens = FORMATS[kind]
-    text = content()
-    (tmp_path / name).write_text(text if isinstance(text, str) else json.dumps(text))
-    for source in (tmp_path / name, tmp_path):
-        found = read_calibration(source, lambda name: (1, 1))
-        assert [camera.name for camera in found.cameras] == list(names)
-        np.testing.assert_allclose([camera.K for camera in found.cameras], K, atol=EXACT)
-        np.testing.assert_allclose(
-            [camera.cam_from_world for camera in found.cameras], POSES, atol=EXACT
-        )
-        np.testing.assert_allclose(
-            [camera.distortion for camera in found.cameras], [lens] * 4, atol=EXACT
-        )
+def test_cameras_of_panoptic_are_read_as_written(tmp_path):
+    """Also with keys of other programs, which mean something else."""
+    content = written.panoptic()
+    content["cameras"] = [
+        each | {"distance": 2.0, "model": "fisheye"} for each in content["cameras"]
+    ]
+    (tmp_path / "calibration_1.json").write_text(json.dumps(content))
+    found = read_calibration(tmp_path, lambda name: (1, 1))
+    assert [camera.name for camera in found.cameras] == list(NAMES)
+    for key, values in {"K": K, "cam_from_world": POSES, "distortion": [LENS] * 4}.items():
+        got = [getattr(camera, key) for camera in found.cameras]
+        np.testing.assert_allclose(got, values, atol=EXACT)
+
+
+def edited(folder, name, old, new):
+    """A file of another tool with another text in one place."""
+    copy = shutil.copy(FILES / name, folder)
+    edit_text(Path(copy), old, new)
+    return copy
+
+
+def test_a_field_of_view_of_qualisys_moves_the_centre_and_the_lens_of_shelf_is_in_opencvs_order(
+    tmp_path,
+):
+    moved = edited(
+        tmp_path,
+        "pose2sim/Calib.qca.txt",
+        '<fov_video bottom="1919" left="0" right="1087" top="0"/>',
+        '<fov_video bottom="1001" left="3" right="1002" top="2"/>',
+    )
+    camera = read_calibration(moved, lambda name: (1, 1)).cameras[0]
+    assert (camera.width, camera.height) == (1000, 1000)
+    centre = [34110.316406 / 64 - 3, 60680.792969 / 64 - 2]
+    np.testing.assert_allclose(camera.K[:2, 2], centre, atol=EXACT)
+    values = json.loads((FILES / "mmpose/calibration_shelf.json").read_text())
+    values["0"] |= {"k": [[1], [2], [5]], "p": [[3], [4]]}
+    (tmp_path / "calibration_shelf.json").write_text(json.dumps(values))
+    found = read_calibration(tmp_path / "calibration_shelf.json", lambda name: (1, 1))
+    np.testing.assert_array_equal(found.cameras[0].distortion, [1, 2, 3, 4, 5])
 
 
 @pytest.mark.parametrize("place", ["frame", "file"])
@@ -85,87 +85,41 @@ def test_a_whole_K_of_a_frame_or_of_the_file(place, tmp_path):
     )
 
 
-def test_a_binary_model_of_colmap_is_the_text_model(tmp_path):
-    world = written.points()
-    seen = [written.project(k, pose, world) for k, pose in zip(K, POSES, strict=True)]
-    written.write_colmap(
-        tmp_path / "text", K, POSES, [f"{n}.png" for n in NAMES], seen=seen, world_points=world
-    )
-    (tmp_path / "binary").mkdir()
-    written.write_binary(tmp_path / "binary", tmp_path / "text")
-    one, other = (
-        read_calibration(tmp_path / kind, lambda name: (1, 1)) for kind in ("text", "binary")
-    )
-    for a, b in zip(one.cameras, other.cameras, strict=True):
-        assert (a.name, a.width, a.height) == (b.name, b.width, b.height)
-        np.testing.assert_array_equal(a.K, b.K)
-        np.testing.assert_array_equal(a.cam_from_world, b.cam_from_world)
-    assert one.observations is not None and other.observations is not None
-    np.testing.assert_array_equal(one.observations.pixels, other.observations.pixels)
-    np.testing.assert_array_equal(one.observations.points, other.observations.points)
-    for name in ("cameras.bin", "images.bin", "points3D.bin"):
-        whole = (tmp_path / "binary" / name).read_bytes()
-        (tmp_path / "binary" / name).write_bytes(whole[:-5])
-        with pytest.raises(
-            CaptureError, match=f"{name}: not a readable COLMAP model: cut short, or damaged"
-        ):
-            read_calibration(tmp_path / "binary", lambda name: (1, 1))
-        (tmp_path / "binary" / name).write_bytes(whole)
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_a_binary_model_that_is_cut_short_is_refused(name, tmp_path):
+    for file in (FILES / "colmap").glob("*.bin"):
+        shutil.copy(file, tmp_path)
+    (tmp_path / name).write_bytes((FILES / "colmap" / name).read_bytes()[:-5])
+    with pytest.raises(CaptureError, match=f"{name}: not a readable COLMAP model: cut short"):
+        read_calibration(tmp_path, lambda name: (1, 1))
 
 
+TOML, QUALISYS = "pose2sim/Calib_qca.toml", "pose2sim/Calib.qca.txt"
 WRONG = {
-    "ignored": (
-        "a.toml",
-        written.tables("cameras.{}", extra="ignore = true"),
-        "every camera is to be ignored",
-    ),
-    "fisheye": (
-        "a.toml",
-        written.tables("cam_{}", extra="fisheye = true"),
-        "fisheye lenses are not supported",
-    ),
-    "no place": (
-        "a.toml",
-        written.tables("cam_{}").replace("translation", "other"),
-        r"cam_0\.translation: missing",
-    ),
-    "no TOML": ("a.toml", "[cam_0", "not a readable calibration: Expected"),
-    "a size": (
-        "a.json",
-        '{"a": {"K": [1,0,0,0,1,0,0,0,1], "R": [0,0,0], "T": [0,0,0], "width": 0.5, "height": 2}}',
-        r"a\.width: expected",
-    ),
-    "a matrix": (
-        "a.yml",
-        "!!opencv-matrix {rows: 1, cols: 1, dt: d, data: [1]}",
-        "expected keys with values",
-    ),
-    "a JSON matrix": (
-        "a.json",
-        '{"type_id": "opencv-matrix", "rows": 1, "cols": 1, "dt": "d", "data": [1]}',
-        "expected keys with",
-    ),
-    "entities": (
-        "a.qca.txt",
-        "<!DOCTYPE x [<!ENTITY a 'b'>]>" + written.qualisys(),
-        "XML with entities",
-    ),
-    "no focal length": (
-        "a.qca.txt",
-        written.qualisys().replace("focalLengthV", "other"),
-        r"camera 0\.intrinsic\.focalLengthV",
-    ),
-    "no list": ("a.json", json.dumps({"cameras": [{"name": "a"}]}), r"cameras\[0\]\.K: missing"),
+    "fisheye": (TOML, "fisheye = false", "fisheye = true", "fisheye lenses are not supported"),
+    "no place": (TOML, "translation", "other", r"cam_1\.translation: missing"),
+    "no TOML": (TOML, "[cam_1]", "[cam_1", "not a readable calibration: Expected"),
+    "entities": (QUALISYS, "<calibration", "<!ENTITY a 'b'><calibration", "XML with entities"),
+    "no focal length": (QUALISYS, "focalLengthV", "f", r"camera 0\.intrinsic\.focalLengthV"),
 }
 
 
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_files_are_one_line(case, tmp_path):
-    name, text, problem = WRONG[case]
-    (tmp_path / name).write_text(text)
+    name, old, new, problem = WRONG[case]
+    file = edited(tmp_path, name, old, new)
     with pytest.raises(CaptureError, match=problem) as caught:
-        read_calibration(tmp_path / name, lambda name: (1, 1))
-    assert str(tmp_path / name) in str(caught.value) and "\n" not in str(caught.value)
+        read_calibration(file, lambda name: (1, 1))
+    assert str(file) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_cameras_to_be_ignored_are_left_out(tmp_path):
+    file = edited(tmp_path, "caliscope/camera_array.toml", "ignore = false", "ignore = true")
+    found = read_calibration(file, lambda name: (1, 1))
+    assert [camera.name for camera in found.cameras] == ["1", "2", "3"]
+    Path(file).write_text(Path(file).read_text().replace("ignore = false", "ignore = true"))
+    with pytest.raises(CaptureError, match="every camera is to be ignored"):
+        read_calibration(file, lambda name: (1, 1))
 
 
 # Lenses
@@ -229,27 +183,33 @@ def test_distortion_is_opencvs():
     np.testing.assert_allclose(got, [x, y], rtol=1e-12)
 
 
-def test_a_folded_lens_shows_nothing_twice():
-    K = np.asarray([[30.0, 0, 40], [0, 30, 40], [0, 0, 1]])
-    photo = np.zeros((80, 80), np.float32)
-    straight = undistort(photo, K, np.asarray([-0.3, 0, 0, 0, 0.0]), fill=1.0)
-    r = np.hypot(*(np.mgrid[:80, :80] + 0.5 - 40)) / 30
-    np.testing.assert_array_equal(straight[r**2 >= 1 / 0.9], 1)
-    np.testing.assert_array_equal(straight[r**2 < 1 / 0.9 - 0.05], 0)
-
-
-@pytest.mark.parametrize("folds", [(2,), (3, 2), (5, 2, 3), (-1, 4), (-1, -2, -3), ()])
-def test_a_lens_folds_at_the_first_root_of_its_slope(folds):
-    """The slope d/dr (r + k1 r^3 + k2 r^5 + k3 r^7) as a product of (1 - r^2 / fold)."""
+def of_folds(*folds):
+    """A lens whose slope d/dr (r + k1 r^3 + k2 r^5 + k3 r^7) is a product of (1 - r^2 / fold)."""
     slope = np.polynomial.Polynomial([1.0])
     for fold in folds:
         slope *= np.polynomial.Polynomial([1, -1 / fold])
     k1, k2, k3 = np.pad(slope.coef, (0, 4 - len(slope.coef)))[1:] / [3, 5, 7]
-    expected = min((fold for fold in folds if fold > 0), default=np.inf)
-    assert _squared_reach(np.array([k1, k2, 0, 0, k3])) == pytest.approx(expected, rel=1e-9)
+    return [k1, k2, 0, 0, k3]
 
 
-def test_coefficients_of_a_lens_may_be_tiny_or_huge():
-    for k3 in (1e-310, -1e-310):
-        assert _squared_reach([-0.3, 0, 0, 0, k3]) == pytest.approx(1 / 0.9, rel=1e-9)
-    assert 0 < _squared_reach(np.full(5, -1e308)) < 1e-30
+@pytest.mark.parametrize(
+    ("coefficients", "fold"),
+    [
+        *((of_folds(*folds), min(folds)) for folds in ((2,), (3, 2), (5, 2, 3))),
+        (of_folds(-1, 4), 4),
+        (of_folds(-1, -2, -3), np.inf),
+        ([0.0] * 5, np.inf),
+        *(([-0.3, 0, 0, 0, k3], 1 / 0.9) for k3 in (1e-310, -1e-310)),
+        ([-1e308] * 5, 0),
+    ],
+)
+def test_a_lens_shows_nothing_beyond_its_first_fold(coefficients, fold):
+    K = np.asarray([[15.0, 0, 40], [0, 15, 40], [0, 0, 1]])
+    straight = undistort(np.zeros((80, 80), np.float32), K, np.asarray(coefficients), fill=1.0)
+    rows, columns = (np.mgrid[:80, :80] + 0.5 - 40) / 15
+    squared = rows**2 + columns**2
+    with np.errstate(all="ignore"):
+        seen = np.abs(distort(np.stack([columns, rows], axis=-1), np.asarray(coefficients)))
+    inside = (seen < 38 / 15).all(axis=-1)
+    np.testing.assert_array_equal(straight[squared >= fold], 1)
+    np.testing.assert_array_equal(straight[inside & (squared < fold - 0.1)], 0)

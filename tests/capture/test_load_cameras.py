@@ -1,11 +1,10 @@
 """`load_cameras`: cameras of other tools in their own world, with lenses and points."""
 
-import json
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from changes import edit_json
 
 import humangs_jax as hg
 from humangs_jax.data.capture_checks import CaptureError
@@ -67,15 +66,6 @@ def test_cameras_of_colmap_keep_their_lens_their_world_and_its_points(tmp_path, 
         assert hg.load_cameras(tmp_path, lenses=False)[names[0]].is_plain
 
 
-def test_a_binary_model_has_the_colors_of_its_points(tmp_path):
-    model_of(tmp_path / "text", "PINHOLE", ())
-    (tmp_path / "binary").mkdir()
-    written.write_binary(tmp_path / "binary", tmp_path / "text")
-    cameras = hg.load_cameras(tmp_path / "binary")
-    np.testing.assert_allclose(cameras.colors, 9 / 255, atol=1e-6)
-    assert cameras.points.shape == (30, 3)
-
-
 def test_y_up_turns_the_world_and_pixel_centres_become_ours(tmp_path):
     K, poses = written.scene()
     turned = written.in_source(poses, turn=written.Y_UP_FROM_Z_UP.T)
@@ -127,19 +117,15 @@ def test_lenses_of_transforms_are_kept(tmp_path, changes, lens, count):
     ],
 )
 def test_lenses_of_rigs_are_kept(tmp_path, changes, lens, expected):
-    K, poses = written.scene()
-    written.write_calibration_full(tmp_path / "calibration_full.json", K, poses, NAMES, **changes)
-    values = json.loads((tmp_path / "calibration_full.json").read_text())
-    for each in values.values():
-        each.update(changes)
-        each.pop("distCoeff", None)
-    (tmp_path / "calibration_full.json").write_text(json.dumps(values))
-    written.write_photos(tmp_path / "photos", FILES)
+    file, photos = tmp_path / "calibration_full.json", tmp_path / "photos"
+    written.write_calibration_full(file, *written.scene(), NAMES, **changes)
+    edit_json(file, lambda values: [each.pop("distCoeff") for each in values.values()])
+    written.write_photos(photos, FILES)
     if len(expected) == 5:
         with pytest.raises(CaptureError, match="fisheye lens: expected 4 coefficients, got 5"):
-            hg.load_cameras(tmp_path / "calibration_full.json", tmp_path / "photos")
+            hg.load_cameras(file, photos)
         return
-    camera = hg.load_cameras(tmp_path / "calibration_full.json", tmp_path / "photos")["c"]
+    camera = hg.load_cameras(file, photos)["c"]
     assert camera.lens == lens
     np.testing.assert_allclose(camera.distortion, expected, rtol=1e-6)
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(camera))
