@@ -75,7 +75,6 @@ def matrices(rotations):
 SCHEMES = {
     "CMU": (CMU, {}, {"order": "ZYX"}),
     "CMU, A-pose": (CMU, {"arms_down": 48}, {"unit": 1 / 0.45 / 0.0254}),
-    "Mixamo": (MIXAMO, {}, {"order": "XYZ"}),
     "Mixamo, turned": (MIXAMO, {"arms_down": 40, "turned": 90}, {}),
     "z up": (CMU, {}, {"up": Rotation.from_euler("x", 90, degrees=True)}),
 }
@@ -100,8 +99,6 @@ def test_bones_point_where_the_files_bones_point(tmp_path, scheme):
 
 TURNS = {
     "about x": Rotation.from_euler("x", [[90]] * 4, degrees=True),
-    "about y": Rotation.from_euler("y", [[-120]] * 4, degrees=True),
-    "about z": Rotation.from_euler("z", [[90]] * 4, degrees=True),
     "half a turn": Rotation.from_euler("y", [[180]] * 4, degrees=True),
     "any": Rotation.random(4, random_state=3),
     "now and then": Rotation.from_rotvec([[0, 0, 0], [2, 1, 0], [0, 0, 0], [0, 0, 1.5]]),
@@ -246,8 +243,6 @@ HEAD = (
 )
 BAD = {
     "words": ("hello", "not a BVH file: expected HIERARCHY first"),
-    "cut": ("HIERARCHY ROOT Hips { OFFSET 0 0", "cut short"),
-    "open": ("HIERARCHY ROOT Hips { OFFSET 0 0 0 ", "a brace of the joints is open"),
     "no motion": (HEAD, "expected MOTION, Frames: and Frame Time:"),
     "strange": (
         HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 0 0\n",
@@ -257,21 +252,11 @@ BAD = {
         HEAD + "MOTION\nFrames: 2\nFrame Time: 0.1\n0 0 0\n",
         "expected 2 frames of 3 numbers, got 3 numbers",
     ),
-    "nan": (
-        HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 nan 0\n",
-        "expected finite numbers, got nan",
-    ),
-    "letters": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 x 0\n", "frames: expected numbers"),
     "time": (
         HEAD + "MOTION\nFrames: 1\nFrame Time: 0\n0 0 0\n",
         "a positive Frame Time, got 1 and 0",
     ),
-    "instant": (
-        HEAD + "MOTION\nFrames: 1\nFrame Time: 5e-324\n0 0 0\n",
-        "a positive Frame Time, got 1 and 5e-324",
-    ),
     "channels": (HEAD.replace("Zrot", "Wrot"), "expected up to 6 channels"),
-    "word": (HEAD.replace("CHANNELS", "CHANELS"), "unknown word CHANELS"),
 }
 
 
