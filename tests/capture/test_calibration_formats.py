@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from changes import edit_json, edit_text
+from scipy.spatial.transform import Rotation
 
 from humangs_jax.capture.calibration.importing import import_cameras
 from humangs_jax.capture.calibration.rigs import parse_file_storage
@@ -56,7 +57,7 @@ FORMATS = {
         written.write_transforms,
         "transforms.json",
         Z_UP,
-        [f"./images/{file}" for file in FILES],
+        [f"./images/{name}" for name in NAMES],  # a suffix is found
     ),
 }
 """The writer, the source, the turn from our world into one with the format's axis up, and names."""
@@ -79,26 +80,16 @@ def test_known_cameras_come_back(tmp_path, kind):
 @pytest.mark.parametrize("up", ["+x", "-x", "+y", "-y", "+z", "-z"])
 def test_any_axis_can_be_up(tmp_path, up):
     K, poses = written.scene()
-    # a world in which the axis `up` is our y: rows of the turn are our axes' places there
-    sign, axis = (1.0 if up[0] == "+" else -1.0), "xyz".index(up[1])
-    turn = np.zeros((3, 3))
-    turn[axis, 1] = sign
-    turn[(axis + 1) % 3, 2] = 1.0
-    turn[(axis + 2) % 3, 0] = sign
-    assert np.linalg.det(turn) == pytest.approx(1)
+    axis = (1 if up[0] == "+" else -1) * np.eye(3)["xyz".index(up[1])]
+    turn = Rotation.align_vectors([axis], [[0, 1, 0]])[0].as_matrix()
     source, images = rig(
         tmp_path, written.write_calibration_full, "rig.json", K, written.in_source(poses, turn=turn)
     )
     report = import_cameras(source, images, tmp_path / "out", up=up)
     assert report.warnings == ()
-    views = views_of(tmp_path / "out")
-    got, true = (
-        np.stack([p[:3, :3] for p in which])
-        for which in (np.asarray([v["cam_from_world"] for v in views]), poses)
-    )
-    np.testing.assert_allclose(
-        got[:, :, 1], true[:, :, 1], atol=1e-9
-    )  # y is y; the heading is free
+    got = np.asarray([v["cam_from_world"] for v in views_of(tmp_path / "out")])[:, :3, :3]
+    true = poses[:, :3, :3]
+    np.testing.assert_allclose(got[:, :, 1], true[:, :, 1], atol=1e-9)  # the heading is free
     relative = lambda r: r @ np.swapaxes(r[:1], 1, 2)
     np.testing.assert_allclose(relative(got), relative(true), atol=1e-9)
     other = "+z" if up != "+z" else "+y"
@@ -120,13 +111,16 @@ def test_the_example_of_the_docs_is_a_calibration(tmp_path):
     )
 
 
-def test_easymocap_with_three_decimals(tmp_path):
+@pytest.mark.parametrize("key", ["Rot_", "R_"])
+def test_easymocap_with_three_decimals_and_a_matrix_or_a_vector(tmp_path, key):
     K, poses = written.scene()
     source, images = rig(tmp_path, written.write_easymocap, "cams", K, poses, decimals=3)
+    other = {"Rot_": "R_", "R_": "Rot_"}[key]
+    text = (source / "extri.yml").read_text().replace(f"\n{other}", "\nUnused_")
+    (source / "extri.yml").write_text(text)
     import_cameras(source / "intri.yml", images, tmp_path / "out", up="+y")
-    assert (
-        error_of(tmp_path / "out", K, poses) < 0.1
-    )  # 5e-4 of rounding times a focal length of 70 px
+    # 5e-4 of rounding times a focal length of 70 px
+    assert error_of(tmp_path / "out", K, poses) < 0.1
     for view in views_of(tmp_path / "out"):
         r = np.asarray(view["cam_from_world"])[:3, :3]
         np.testing.assert_allclose(r @ r.T, np.eye(3), atol=1e-12)  # rounded no longer
@@ -178,14 +172,6 @@ def test_easymocap_values_are_of_their_own_file(tmp_path, file, more, problem):
     np.testing.assert_allclose([camera.cam_from_world for camera in cameras], poses, atol=1e-6)
 
 
-def test_rotation_vectors_are_read_where_there_is_no_matrix(tmp_path):
-    K, poses = written.scene()
-    source, images = rig(tmp_path, written.write_easymocap, "cams", K, poses)
-    (source / "extri.yml").write_text((source / "extri.yml").read_text().replace("Rot_", "Unused_"))
-    import_cameras(source, images, tmp_path / "out", up="+y")
-    assert error_of(tmp_path / "out", K, poses) < PIXELS
-
-
 def test_colmap_points_are_reprojected(tmp_path):
     K, poses = written.scene()
     K[:, 1, 1] = K[:, 0, 0]  # SIMPLE_RADIAL has one focal length
@@ -208,23 +194,6 @@ def test_colmap_points_are_reprojected(tmp_path):
     report = import_cameras(source, images, tmp_path / "out", up="+y", overwrite=True)
     assert report.checks.reprojection == pytest.approx(3)
     assert "mean reprojection error is 3 px" in report.warnings[0]
-
-
-def test_nerf_with_field_of_view_only(tmp_path):
-    K, poses = written.scene()
-    K[:] = [[80, 0, written.WIDTH / 2], [0, 80, written.HEIGHT / 2], [0, 0, 1]]
-    file = tmp_path / "transforms_train.json"
-    written.write_transforms(file, K, poses, [f"./train/r_{i}" for i in range(4)])
-    values = json.loads(file.read_text())
-    frames = [
-        {key: frame[key] for key in ("file_path", "transform_matrix")} for frame in values["frames"]
-    ]
-    file.write_text(
-        json.dumps({"camera_angle_x": 2 * np.arctan(written.WIDTH / 160), "frames": frames})
-    )
-    written.write_photos(tmp_path, [f"train/r_{i}.png" for i in range(4)])
-    import_cameras(file, tmp_path, tmp_path / "out", up="+y")
-    assert error_of(tmp_path / "out", K, poses) < PIXELS
 
 
 def test_pixel_centers_can_be_overridden(tmp_path):
@@ -282,20 +251,16 @@ same_level:
     ("text", "problem"),
     [
         ("%YAML:1.0\na: [ 1, 2\n", "line 2: expected ',' or ']', but got '<stream end>'"),
-        ("%YAML:1.0\nhello\n", "expected keys with values"),
         ("%YAML:1.0\na: &a [ 1 ]\nb: *a\n", "line 3: aliases are not supported"),
         ("%YAML:1.0\na: " + "[" * 10_000, "nested too deeply"),
-        ("%YAML:1.0\na: 1\n   b: 2\n", "line 3: mapping values are not allowed here"),
         (
             "%YAML:1.0\na: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 1. ]\n",
             "not a matrix",
         ),
-        ("%YAML:1.0\na: !!opencv-matrix\n   rows: 1\n   cols: 1\n   dt: d\n", "not a matrix"),
         (
             "%YAML:1.0\na: !!opencv-sparse-matrix\n   rows: 1\n",
             "'opencv-sparse-matrix' is not supported",
         ),
-        ('{"a": {"type_id": "opencv-matrix", "rows": 1}}', "a: not a matrix"),
         ('{"a": ', "not valid JSON"),
     ],
 )
@@ -325,16 +290,10 @@ def colmap(tmp_path, cameras=None, images=None):
             "line 2: camera model OPENCV_FISHEYE: expected one of",
         ),
         (
-            lambda t: t.replace("PINHOLE", "FOV"),
-            None,
-            "line 2: camera model FOV: expected one of",
-        ),
-        (
             lambda t: t.replace("PINHOLE", "SIMPLE_PINHOLE"),
             None,
             "line 2: SIMPLE_PINHOLE: expected WIDTH HEIGHT f cx cy",
         ),
-        (lambda t: t.replace("64 48", "64 x"), None, "line 2: could not convert"),
         (lambda t: t[: t.index("\n2 ")], None, "line 5: camera 2 is not in cameras.txt"),
         (None, lambda t: "# nothing\n", "images.txt: no image is registered"),
         (
@@ -344,15 +303,9 @@ def colmap(tmp_path, cameras=None, images=None):
         ),
         (
             None,
-            lambda t: t.replace("a.png", ""),
-            "line 3: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME",
-        ),
-        (
-            None,
             lambda t: t.replace("b.png", "z.png"),
             r"images\.txt: z\.png: no such photo \(\.png, .*\.webp",
         ),
-        (None, lambda t: t.replace("b.png", "sub/a.png"), r"a\.png is the photo of a\.png already"),
         (None, lambda t: "1 0 0 0 0 0 0 0 1 a.png\n\n", "line 1: expected a quaternion"),
     ],
 )
@@ -365,12 +318,10 @@ def test_faults_of_a_colmap_model_name_the_line(tmp_path, cameras, images, probl
     ("edit", "problem"),
     [
         (lambda v: v.update(frames=[]), "frames: expected at least one"),
-        (lambda v: v.update(frames={}), "frames: expected a list"),
         (
             lambda v: v["frames"][1].pop("transform_matrix"),
             r"frames\[1\]\.transform_matrix: missing",
         ),
-        (lambda v: v["frames"][1].pop("file_path"), r"frames\[1\]\.file_path: missing"),
         (lambda v: v["frames"][1].update(file_path="z"), r"transforms\.json: z: no such photo"),
         (
             lambda v: [f.pop("fl_x") and f.pop("fl_y") for f in v["frames"]],
@@ -384,8 +335,6 @@ def test_faults_of_a_colmap_model_name_the_line(tmp_path, cameras, images, probl
             lambda v: v.update(camera_model="OPENCV_FISHEYE"),
             "camera_model: 'OPENCV_FISHEYE': expected",
         ),
-        (lambda v: v.update(is_fisheye=True), "is_fisheye: fisheye lenses"),
-        (lambda v: v.update(k4=0.1), "k4: fisheye lenses"),
         (lambda v: v.pop("w"), r"frames\[0\]\.w: missing"),
         (
             lambda v: v.pop("w") and v.pop("h") and v["frames"][0].update(file_path="z"),
@@ -477,10 +426,6 @@ def test_photos_of_one_moment_are_one_frame(tmp_path, kind):
             r"frames\[0\] and frames\[3\] have the camera_index 0, so they show",
         ),
         (
-            [{"camera_id": f"c{i % 2}"} for i in ALL],
-            r"frames\[0\] and frames\[2\] have the camera_id c0, so .*: expected timest",
-        ),
-        (
             [{}] * 6,
             (
                 r"frames\[0\] and frames\[3\] have the same camera pose, so they show different"
@@ -492,8 +437,6 @@ def test_photos_of_one_moment_are_one_frame(tmp_path, kind):
             r"frames\[0\]\.time: missing, but other frames have it",
         ),
         ([{"time": None} for i in ALL], r"frames\[0\]\.time: expected a number, got None"),
-        ([{"time": float("nan")} for i in ALL], r"frames\[0\]\.time: expected finite numbers"),
-        ([{"time": str(i) if i else 0} for i in ALL], r"time: expected numbers or names, got both"),
         (
             [{"timestep_index": 0, "camera_index": i % 3} for i in ALL],
             (

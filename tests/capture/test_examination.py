@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from fit_people import NOISE, default_body, person
 
-from humangs_jax.apps import check as module
 from humangs_jax.apps.check import TINTS, fit_sheet
 from humangs_jax.avatar.video import GAP
 from humangs_jax.body.joints import JOINT_NAMES
@@ -14,8 +13,6 @@ from humangs_jax.capture.fitting.files import FitRecord
 from humangs_jax.capture.fitting.fit_capture import examine
 from humangs_jax.capture.fitting.report import (
     WORTH_A_LINE,
-    ViewReport,
-    keypoint_warnings,
     undetermined_joints,
 )
 from humangs_jax.capture.fitting.swaps import Swap
@@ -181,23 +178,6 @@ def test_frames_without_views(good):
     assert examination.report.ok and examination.report.undetermined == ()
 
 
-@pytest.mark.slow
-def test_the_table_is_of_the_views_that_fit_worst():
-    capture, keypoints = person(21, 9, 3)
-
-    def displace(points, confidences):
-        points[13] += 8
-        confidences[26] = 0
-
-    text = str(examine(capture, with_points(keypoints, displace)).report)
-    rows = [line for line in text.splitlines() if line[:1] == "m" and line[2:3] == "v"]
-    assert len(rows) == WORTH_A_LINE.rows and "... " in text and "3 more that fit better" in text
-    assert any(row.startswith("m4v1") for row in rows) and any(
-        row.startswith("m8v2") and "0" in row for row in rows
-    )
-    assert "worst in frame 4" in text
-
-
 # Findings
 # --------------------------------------------------------------------------------------------------
 
@@ -217,21 +197,6 @@ def test_undetermined_joints_are_named_in_groups():
         "left_ankle",
         "left_eye (in 1 of 2 frames)",
         "right_index1 (in 1 of 2 frames)",
-    )
-
-
-def test_warnings_stay_few():
-    fits = [ViewReport(f"v{i}", 0, 17, 1.0 + i, 9.0, 0.5 * (i % 2)) for i in range(30)]
-    swaps = [Swap("sides", (f"v{i}",)) for i in range(12)]
-    found = keypoint_warnings(fits, np.full(1, 5.0), [], swaps)
-    assert len(found) == WORTH_A_LINE.named + 3
-    assert found[WORTH_A_LINE.named] == "7 more views or pairs of views seem exchanged"
-    assert found[WORTH_A_LINE.named + 1].endswith(
-        "in view v20, v21, v22, v23, v24 and 5 more: median error 21 to 30 px"
-    )
-    assert (
-        found[WORTH_A_LINE.named + 2]
-        == "many keypoints are outliers in view v1, v3, v5, v7, v9 and 5 more: 50%"
     )
 
 
@@ -314,20 +279,3 @@ def test_discs_are_where_the_keypoints_are_those_of_outliers_are_hollow_and_line
     x, y = 2 * examination.landmarks[0, LEFT_WRIST] + [GAP, top]
     near = image[int(y) - 6 : int(y) + 7, int(x) - 6 : int(x) + 7]
     assert (np.abs(near - np.asarray(TINTS.cross) / 255).max(-1) < 0.3).sum() >= 5
-
-
-@pytest.mark.slow
-def test_of_many_views_an_evenly_chosen_few_are_drawn(tmp_path, monkeypatch):
-    capture, keypoints = person(31, 9, 3)
-    examination = examine(capture, keypoints)
-    overlays = []
-    monkeypatch.setattr(
-        module, "_overlay", lambda capture, view: overlays.append(view) or np.ones((128, 128, 3))
-    )
-    fit_sheet(capture, keypoints, examination, tmp_path / "fit.png")
-    assert (
-        len(overlays) == module.VIEWS
-        and overlays[0] == 0
-        and overlays[-1] == 26
-        and np.diff(overlays).max() <= 2
-    )

@@ -5,12 +5,8 @@ import pytest
 
 from humangs_jax.apps.same_people import PersonInPhoto, exchanged
 from humangs_jax.capture.detection.face_and_hands import (
-    PALM,
-    SHAPE_NAMES,
-    SHAPE_POINTS,
     FaceAndHands,
     Hand,
-    _palm_region,
     face_region,
     hand_columns,
     hand_region,
@@ -57,24 +53,6 @@ def test_a_face_is_whole_in_its_region():
     crop = face_region(upright_body())
     chin, brow = crop.from_photo(np.asarray([[100.0, 160], [100, 70]]))
     assert 0.1 < brow[1] < chin[1] < 0.9 and crop.from_photo(crop.center) == pytest.approx(0.5)
-
-
-def test_the_region_of_the_next_look_at_a_hand_holds_its_fingers():
-    """The palm alone says where it is: a fist and an open hand have the same region."""
-    points = np.zeros((21, 2))
-    points[[0, 1, 2, 5, 9, 13, 17]] = [
-        [100, 100], [112, 92], [118, 80], [112, 60], [104, 56], [96, 58], [88, 62],
-    ]  # fmt: skip
-    for root in (5, 9, 13, 17):
-        points[root + 1 : root + 4] = points[root] - np.asarray([[0, 12], [0, 24], [0, 34]])
-    points[[3, 4]] = [[124, 70], [128, 60]]
-    opened = _palm_region(points)
-    inside = opened.from_photo(points)
-    assert inside.min() > 0 and inside.max() < 1
-    fist = points.copy()
-    fist[[k for k in range(21) if k not in PALM]] = [100, 70]
-    np.testing.assert_allclose(_palm_region(fist).center, opened.center)
-    assert len(SHAPE_POINTS) == 146 and len(SHAPE_NAMES) == 51
 
 
 def hand(first):

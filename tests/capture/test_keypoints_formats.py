@@ -160,18 +160,11 @@ FOLDERS = {
         },
     ),
     "EasyMocap, Halpe": (HALPE_136, NAMES, lambda v: {n: annots(x, None) for n, x in OF_NAMES(v)}),
-    "OpenPose of one image": (
-        OPENPOSE_67,
-        ("front",),
-        lambda v: {"front_keypoints": openpose(openpose_person(v[0]))},
-    ),
-    "MMPose": (COCO_17, NAMES, lambda v: {n: instances(x) for n, x in OF_NAMES(v)}),
     "MMPose's demo": (
         COCO_17,
         NAMES,
         lambda v: {f"results_{n}": demo(instances(x)) for n, x in OF_NAMES(v)},
     ),
-    "MMPose of a video": (COCO_17, VIDEO, lambda v: {"walk": frames(v)}),
     "MMPose's demo of a video": (COCO_17, VIDEO, lambda v: {"walk": demo(frames(v, 1))}),
     "MMPose of two videos": (
         COCO_WHOLEBODY_133,
@@ -190,16 +183,6 @@ def test_a_folder_of_files(kind, tmp_path):
     check(read(tmp_path, names), values, keypoint_set)
     if len(written) == 1:
         check(read(written[0], names), values, keypoint_set)
-
-
-def test_openpose_without_hands(tmp_path):
-    values = known(67)
-    people = [openpose_person(each, hands=False) for each in values]
-    del people[1]["hand_left_keypoints_2d"], people[1]["hand_right_keypoints_2d"]  # older versions
-    for name, person in zip(NAMES, people, strict=True):
-        write(tmp_path / f"{name}_keypoints.json", openpose(person))
-    values[:, 25:] = 0
-    check(read(tmp_path), values, OPENPOSE_67)
 
 
 def test_people_of_easymocap_are_chosen_by_their_id(tmp_path):
@@ -284,17 +267,6 @@ def test_annotations_tell_visibility(tmp_path, whole):
     check(read(file), values, COCO_WHOLEBODY_133 if whole else COCO_17)
 
 
-def test_fractional_visibilities_are_reliable(tmp_path):
-    values = known(17, 1)
-    values[..., 2] = 0.25
-    content = {
-        "images": [{"id": 1, "width": 0, "height": 0}],
-        "annotations": [{"image_id": 1, "keypoints": flat(values)}],
-    }
-    keypoints = read(write(tmp_path / "a.json", content), ("1",))
-    np.testing.assert_array_equal(keypoints.confidences, 1)
-
-
 # Ours
 # --------------------------------------------------------------------------------------------------
 
@@ -368,25 +340,11 @@ def test_a_person_of_our_detector_is_read_by_number(tmp_path, where):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda c: c.update(version=2), "version: expected 1, got 2"),
         (lambda c: c.update(set="faces"), "set: expected one of .*mediapipe33.*, got 'faces'"),
-        (lambda c: c.update(images={}), r"images: expected a list, got \{\}"),
         (lambda c: c["images"][0].pop("people"), r"images\[0\]\.people: missing"),
-        (
-            lambda c: c["images"][0].update(width=0.5),
-            r"images\[0\]\.width: expected an integer, got 0\.5",
-        ),
         (
             lambda c: c["images"][0]["people"][0]["pixels"].pop(),
             r"people\[0\]\.pixels: .*\(33, 2\), got \(32, 2\)",
-        ),
-        (
-            lambda c: c["images"][0]["people"][0].update(world="no"),
-            r"people\[0\]\.world: expected a list",
-        ),
-        (
-            lambda c: c["images"][0].update(people=[[]]),
-            r"people\[0\]: expected a JSON object, got \[\]",
         ),
     ],
 )
@@ -397,14 +355,6 @@ def test_damaged_files_of_our_detector_are_one_line(tmp_path, change, said):
     with pytest.raises(CaptureError, match=said) as error:
         read(path, person=0)
     assert "\n" not in str(error.value)
-
-
-def test_saving_checks_its_arguments(tmp_path):
-    keypoints = Keypoints(np.zeros((2, 17, 2), np.float32), np.zeros((2, 17), np.float32), COCO_17)
-    with pytest.raises(ValueError, match=r"k\.json: expected a name ending in \.npz"):
-        save_keypoints(tmp_path / "k.json", keypoints, NAMES[:2])
-    with pytest.raises(ValueError, match="names: expected one for each of 2 views, got 3"):
-        save_keypoints(tmp_path / "k.npz", keypoints, NAMES)
 
 
 # Views by name and number
@@ -420,9 +370,7 @@ CAMERAS = ("images_cam0_000000", "images_cam0_000012", "images_cam1_000000", "im
         (["/a/b/my photo (1).JPG"], ("my_photo__1_",), [0]),
         (["C:\\photos\\front.png"], ("front",), [0]),
         (["front.v2.png", "front.v2"], ("front.v2",), "both"),
-        (["front.v2"], ("front.v2",), [0]),
         (["cam1/000012.png", "cam0/000000.png"], CAMERAS, [3, 0]),
-        (["images/cam1/000012.png"], CAMERAS, [3]),
         (["cam1_000000000012", "cam0_000000000000"], CAMERAS, [3, 0]),  # OpenPose on videos
         (["cam1/12"], CAMERAS, [3]),  # MMPose on videos
         (["000012.png"], CAMERAS, [None]),  # of which camera?
@@ -436,20 +384,14 @@ CAMERAS = ("images_cam0_000000", "images_cam0_000012", "images_cam1_000000", "im
         (["f_1", "f_3", "f_2"], ("f_000", "f_001", "f_002"), [0, 2, 1]),
         (["b/0", "a/1", "b/1", "a/2"], ("v_a_1", "v_b_1", "v_a_2", "v_b_2"), [1, 0, 3, 2]),
         (["a_0.jpg", "a_1.jpg", "b_0.jpg", "b_1.jpg"], ("a_1", "a_2", "b_0", "b_1"), [0, 1, 2, 3]),
-        (["0", "1"], ("000001", "000002"), [0, 1]),
         # who knows: the numbers as they are
         (["f_0", "f_1", "f_2", "f_3"], ("f_1", "f_2", "f_3"), [None, 0, 1, 2]),
-        (["f_0", "f_1"], ("f_1", "f_2", "f_3"), [None, 0]),
         (["f_0", "f_2", "f_3"], ("f_1", "f_2", "f_3"), [None, 1, 2]),
         (["cam_2", "cam_3"], ("cam_1", "cam_2"), [1, None]),
-        (["cam_0"], ("cam_1",), [None]),
-        (["frame_0"], ("0",), [None]),
         (["1"], ("cam_1", "11"), [None]),
         (["cam0/000000", "cam1/000000"], ("000000",), "both"),
         (["01", "1"], ("1", "01"), [1, 0]),  # as written, before numbers as numbers
-        (["other.jpg"], ("a", "photo_1_"), [None]),
         (["a.jpg", "photo(1).jpg", "b.jpg"], ("a", "photo_1_"), [0, 1, None]),
-        (["a_1", "a_2"], ("a_1", "a_2"), [0, 1]),
     ],
 )
 def test_names(images, names, views):
@@ -466,20 +408,14 @@ def test_names(images, names, views):
         ([139, 285], ("000000000285", "000000000139"), [1, 0]),
         ([3, 1], ("cam_1", "cam_2"), [None, 0]),
         ([0, 1, 2], ("f_001", "f_002", "f_003"), [0, 1, 2]),  # ffmpeg counts from 1
-        ([1, 2, 3], ("f_000", "f_001", "f_002"), [0, 1, 2]),
         ([0, 1, 2], ("f_100", "f_101", "f_102"), [0, 1, 2]),
         (
             [0, 1, 2, 3],
             ("f_001", "f_002", "f_003"),
             [None, 0, 1, 2],
         ),  # who knows: the numbers as they are
-        ([0, 2, 3], ("f_001", "f_002", "f_003"), [None, 1, 2]),  # gaps
         ([1, 2, 3, 4], ("cam0_rgb", "cam1_rgb", "cam2_rgb", "cam3_rgb"), [0, 1, 2, 3]),
-        ([0, 1, 2, 3], ("a1", "b2", "c3", "d4"), [0, 1, 2, 3]),
-        ([1], ("photo0",), [0]),
         ([3, 4], ("left_1", "left_2", "right_3", "right_4"), [2, 3]),  # not one for every view
-        ([5], ("front", "back"), [None]),
-        ([], ("front",), []),
     ],
 )
 def test_numbers(numbers, names, views):

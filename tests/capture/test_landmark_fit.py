@@ -48,26 +48,6 @@ def noisy():
     return joints, betas, seen, fit_landmarks(model_of(), seen)
 
 
-def test_frames_are_a_batch(monkeypatch):
-    """Without the fit itself, which takes minutes: the fast tests know that its arguments pass."""
-    _, _, seen = observe(NAMES[:2])
-
-    class Reached(Exception):
-        pass
-
-    def reached(model, observations):
-        raise Reached(observations)
-
-    monkeypatch.setattr(landmark_fit, "fit_frames", reached)
-    with pytest.raises(Reached) as caught:
-        fit_landmarks(model_of(), seen)
-    assert caught.value.args[0].batch_shape == (2,)
-    with pytest.raises(
-        ValueError, match=r"observations.K: expected shape \(2, 4, 3, 3\), got \(2, 3, 3, 3\)"
-    ):
-        fit_landmarks(model_of(), replace(seen, K=seen.K[:, :3]))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "bound"),

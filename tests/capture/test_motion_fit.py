@@ -1,7 +1,5 @@
 """The fit of a motion to the keypoints of one camera."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +8,6 @@ import pytest
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, shape_body
-from humangs_jax.capture.fitting import motion_fit
 from humangs_jax.capture.fitting.motion_fit import FLIP, betas_of_joints, fit_motion
 from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
 from humangs_jax.geometry.mesh import smallest_turns
@@ -57,10 +54,11 @@ def test_a_walk_is_found_in_the_keypoints_of_one_camera_whose_noise_it_does_not_
     """Several windows, and frames in which nobody is seen."""
     truth, world, keypoints, fps = walker(150)
     keypoints.confidences[70:76] = 0
-    tall = motion_fit._tallness(BODY)
-    height = float(tall[0] + tall[1:] @ BETAS)
+    ends = [int(f(np.asarray(BODY.template)[:, 1])) for f in (np.argmin, np.argmax)]
+    height_of = lambda betas: np.ptp(shape_body(BODY, jnp.asarray(betas)).vertices[ends, 1])
+    height = float(height_of(BETAS))
     found = fit_motion(BODY, keypoints, K, fps, height=height)
-    assert float(tall[0] + tall[1:] @ found.betas) == pytest.approx(height, abs=0.01)
+    assert height_of(found.betas) == pytest.approx(height, abs=0.01)
     matrix = found.cam_from_world
     ours = found.joints[:, :22] @ matrix[:3, :3].T + matrix[:3, 3]
     aligned = lambda x: x - x[:, :1]
@@ -73,22 +71,6 @@ def test_a_walk_is_found_in_the_keypoints_of_one_camera_whose_noise_it_does_not_
     assert abs(np.quantile(found.joints[..., 1].min(1), 0.05)) < 0.1
 
 
-def test_the_windows_of_a_video_cover_all_frames_and_overlap():
-    for count in (2, 24, 119, 120, 121, 217, 1000):
-        windows = motion_fit._windows(count)
-        assert np.array_equal(np.unique(np.concatenate(windows)), np.arange(count))
-        shared = [len(np.intersect1d(*pair)) for pair in itertools.pairwise(windows)]
-        assert set(shared) <= {motion_fit.OVERLAP}
-        assert max(map(len, windows)) <= motion_fit.WINDOW
-
-
-def test_the_preconditioner_leaves_slow_changes_and_damps_fast_ones():
-    smoother, frames = motion_fit._smoother(60.0), np.arange(motion_fit.WINDOW)
-    np.testing.assert_allclose(smoother @ (0.01 * frames), 0.01 * frames, atol=1e-6)
-    # the ends have no neighbours beyond them
-    assert np.abs(smoother @ (-1.0) ** frames)[3:-3].max() < 0.05
-
-
 def test_the_shape_of_an_avatar_is_that_of_its_joints():
     joints = np.asarray(shape_body(BODY, jnp.asarray(BETAS)).joints)
     found = betas_of_joints(BODY, joints + np.asarray([0.0, 1.0, 0.0]))
@@ -96,13 +78,6 @@ def test_the_shape_of_an_avatar_is_that_of_its_joints():
     assert np.linalg.norm((again - again[0]) - (joints - joints[0]), axis=-1).max() < 2e-3
     with pytest.raises(ValueError, match="expected 55 joints, got 54"):
         betas_of_joints(BODY, joints[1:])
-
-
-def test_a_known_height_is_that_of_the_shape():
-    tall = motion_fit._tallness(BODY)
-    found = motion_fit._of_height(BETAS, tall, 1.9)
-    assert tall[0] + tall[1:] @ found == pytest.approx(1.9)
-    assert motion_fit._of_height(BETAS, tall, None) is BETAS
 
 
 def test_a_video_that_shows_nobody_is_refused():

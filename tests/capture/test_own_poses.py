@@ -9,10 +9,8 @@ import pytest
 
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.model import pose_body, shape_body
-from humangs_jax.capture.fitting import own_poses
 from humangs_jax.capture.fitting.files import FitRecord, write_fitted
 from humangs_jax.capture.fitting.own_poses import (
-    Movement,
     find_movement,
     fit_own_poses,
     movement_line,
@@ -20,7 +18,6 @@ from humangs_jax.capture.fitting.own_poses import (
     with_own_poses,
 )
 from humangs_jax.capture.fitting.report import FitReport
-from humangs_jax.capture.fitting.silhouette_fit import _as_motion
 from humangs_jax.capture.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture, save_capture
@@ -88,22 +85,6 @@ def test_someone_who_moved_is_given_a_pose_for_each_photo_and_someone_who_stood_
     assert np.linalg.norm(after) < np.linalg.norm(before)
 
 
-def test_poses_of_photos_begin_at_the_shared_one():
-    capture = with_own_poses(truth())
-    assert capture.frames.tolist() == list(range(VIEWS)) and capture.frame_count == VIEWS
-    for frame in range(VIEWS):
-        np.testing.assert_array_equal(
-            np.asarray(capture.poses.rotations[frame]), np.asarray(truth().poses.rotations[0])
-        )
-
-
-def test_movement_is_what_masks_see_of_poses_that_they_had_no_say_in():
-    assert Movement(0.72, 0.74).shown
-    assert not Movement(0.72, 0.72 + own_poses.LEAST_GAIN / 2).shown
-    assert not Movement(0.80, 0.79).shown
-    assert not Movement(np.nan, np.nan).shown
-
-
 def test_the_movement_that_is_told_is_that_across_the_line_of_sight():
     one = with_own_poses(truth()).select([0])
     towards = np.asarray(one.cameras.center[0]) - np.asarray(one.poses.translation[0])
@@ -113,15 +94,6 @@ def test_the_movement_that_is_told_is_that_across_the_line_of_sight():
         moved = one.poses.translation.at[0].add(jnp.asarray(shift, jnp.float32))
         poses = replace(one.poses, translation=moved)
         assert told in movement_line(dataclasses.replace(one, poses=poses))
-
-
-def test_poses_of_a_video_remember_those_before():
-    """Deviations with the covariance of the process are independent numbers of unit variance."""
-    times = np.asarray([0.0, 0.5, 0.6, 3.0])
-    covariance = np.exp(-np.abs(times[:, None] - times) / own_poses.MEMORY)
-    factor = np.linalg.cholesky(covariance)
-    memory = jnp.asarray(np.exp(-np.diff(times) / own_poses.MEMORY))
-    np.testing.assert_allclose(_as_motion(jnp.asarray(factor), memory), np.eye(4), atol=1e-5)
 
 
 def test_the_record_of_a_fit_has_a_row_for_each_photo():

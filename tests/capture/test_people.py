@@ -11,22 +11,16 @@ from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.capture.detection.painting import painted_over
 from humangs_jax.capture.detection.people import (
     ENLARGED,
-    SEARCH,
     Crop,
     Detection,
     Landmarks,
     Networks,
-    _anchors,
-    _merged,
-    _people,
     bilinear,
     distinct,
     find_people,
     mask_at,
     mask_in_photo,
     refined,
-    sampled,
-    window_detections,
     windows,
 )
 from humangs_jax.capture.detection.sharpening import sharpened
@@ -160,17 +154,13 @@ def test_the_smallest_windows_are_looked_at_only_where_nobody_is_large(
 
 
 def test_whoever_stands_half_behind_somebody_is_found_without_what_is_covered(networks, demo):
-    """The detector alone finds one of them: painted over, the first leaves the other one to be
-    seen.
-    """
+    """Painted over, the first leaves the other one to be seen."""
     front = demo.masks[0]
     step = round(0.7 * np.ptp(np.flatnonzero((front > 0.5).any(0))))
     image, mask = (np.roll(each[2], step, axis=1) for each in (demo.images, demo.masks))
     room = np.full_like(image, 0.7)
     photo = image * mask[..., None] + room * (1 - mask[..., None])
     photo = demo.images[0] * front[..., None] + photo * (1 - front[..., None])
-    alone = _people(networks, photo, window_detections(networks, photo, SEARCH.shares))
-    assert len(alone) == 1
     people = find_people(networks, photo)
     assert len(people) == 2
     seen = {"front": front, "behind": mask * (1 - front)}
@@ -268,26 +258,6 @@ def test_the_second_point_of_a_detection_is_above_the_middle_of_its_crop(head):
     )
 
 
-def test_anchors_are_the_detectors():
-    anchors = _anchors()
-    assert anchors.shape == (2254, 2)  # 28 * 28 * 2 + 14 * 14 * 2 + 7 * 7 * 6
-    np.testing.assert_allclose(
-        anchors[:3], [[4 / 224] * 2, [4 / 224] * 2, [12 / 224, 4 / 224]], atol=ROUNDING
-    )
-    np.testing.assert_allclose(anchors[-1], [1 - 16 / 224] * 2, atol=ROUNDING)
-
-
-def test_boxes_that_overlap_the_best_are_averaged_by_score():
-    boxes = np.zeros((3, 12))
-    boxes[:, 2:4] = 0.2
-    boxes[:, 0] = 0.30, 0.32, 0.70
-    (best, mean), (other, alone) = _merged(np.asarray([0.6, 0.9, 0.7]), boxes)
-    assert (best, other) == (0.9, 0.7)
-    assert mean[0] == pytest.approx((0.6 * 0.30 + 0.9 * 0.32) / 1.5) and alone[0] == pytest.approx(
-        0.70
-    )
-
-
 def test_landmarks_move_to_the_centroid_of_their_peak_only():
     heatmaps = np.zeros((16, 16, 4))
     heatmaps[6, 8, 0], heatmaps[6, 9, 0] = 0.6, 0.2
@@ -332,20 +302,6 @@ def test_the_mask_of_a_crop_at_the_size_of_the_photo_is_the_one_at_its_pixels(an
     expected = mask_at(nobody, grid.reshape(-1, 2)).reshape(36, 64)
     assert expected.max() > 0.9
     np.testing.assert_allclose(mask_in_photo(nobody, 64, 36), expected, atol=1e-3)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1)])
-def test_bilinear_of_a_photo_of_one_row_or_column(shape):
-    image = np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
-    grid = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1).astype(float)
-    np.testing.assert_array_equal(bilinear(image, grid), image)
-
-
-def test_an_upright_crop_of_the_photos_size_is_the_photo():
-    photo = np.random.default_rng(0).uniform(size=(8, 8, 3)).astype(np.float32)
-    np.testing.assert_allclose(
-        sampled(photo, Crop(np.asarray([4.0, 4.0]), 8.0, 0.0), 8), photo, atol=1e-6
-    )
 
 
 @pytest.mark.parametrize("size", [(640, 640), (1920, 1080), (300, 4000), (7, 5)])

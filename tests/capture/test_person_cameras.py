@@ -20,7 +20,6 @@ from fit_people import (
 
 from humangs_jax.apps.check import check_capture
 from humangs_jax.body.model import BodyPose, shape_body
-from humangs_jax.capture.fitting import fit_capture, person_bundle
 from humangs_jax.capture.fitting.camera_errors import find_camera_errors, mended
 from humangs_jax.capture.fitting.fit_capture import examine, fit_photos
 from humangs_jax.capture.fitting.person_cameras import cameras_from_person, scaled_to_height
@@ -153,9 +152,7 @@ def cameras_at(*azimuths):
     return matrices
 
 
-@pytest.mark.parametrize(
-    "azimuths", [(0, 1), (0, 0.5, 1), (0, 0.5, 1, 1.5), (40, 40.6, 41.2, 42, 42.4)]
-)
+@pytest.mark.parametrize("azimuths", [(0, 0.5, 1, 1.5), (40, 40.6, 41.2, 42, 42.4)])
 def test_photos_from_one_side_stand_alone_and_are_said_to_be_from_one_side(azimuths):
     found = cameras_from_person(seen_by(posed(), cameras_at(*azimuths)))
     assert found.moments == len(azimuths) == len(found.views)
@@ -209,17 +206,6 @@ def test_a_photo_of_another_lens_without_exif_leaves_the_focal_lengths_of_the_ot
     np.testing.assert_allclose(lengths[[0, 2, 3]], FOCAL, rtol=0.015)
     assert abs(np.log(lengths[1] / (factor * FOCAL))) < abs(np.log(factor)) / 2
     assert errors_of(found, matrices)[0].max() < NOISY_DEGREES
-
-
-@pytest.mark.parametrize("views", [4, 8])
-def test_cameras_take_few_steps_and_so_little_time(views, monkeypatch):
-    """Steps are counted, since seconds depend on the machine; each is some milliseconds."""
-    steps, solve = [], person_bundle.solve
-    monkeypatch.setattr(person_bundle, "solve", lambda *given: steps.append(1) or solve(*given))
-    cameras_from_person(
-        seen_by(posed("standing", 1, 0.2), cameras_around(views, 1), seed=1, **NOISE)
-    )
-    assert len(steps) < 15 * (views + 2)
 
 
 def test_what_cannot_be_used_is_refused_by_name():
@@ -414,28 +400,3 @@ def test_a_fit_turns_the_camera_back_and_says_so_and_check_names_it(tmp_path):
         check_capture(dataclasses.replace(capture, masks=masks), tmp_path / "x.png", known)
     )
     assert "--fixed-cameras" not in said(wrong, keypoints) + said(truth, None)
-
-
-def test_cameras_that_were_found_from_the_person_are_not_turned_back_by_the_same_keypoints(
-    monkeypatch,
-):
-    truth, keypoints = person(1, 1, 4)
-    wrong = turned(truth, [2], (1.0, 0.0, 0.5))
-    looked_for, fitted = [], []
-
-    def fit_landmarks(model, observations, smoothness):
-        fitted.append(observations.cam_from_world)
-        raise ValueError("far enough")
-
-    def find(photos, keypoints):
-        looked_for.append(photos.calibrated)
-        return find_camera_errors(photos, keypoints)
-
-    monkeypatch.setattr(fit_capture, "fit_landmarks", fit_landmarks)
-    monkeypatch.setattr(fit_capture, "find_camera_errors", find)
-    for calibrated in (True, False):
-        photos = Photos(wrong.images, None, wrong.cameras, wrong.frames, wrong.names, calibrated)
-        with pytest.raises(ValueError, match="far enough"):
-            fit_photos(photos, keypoints, truth.body)
-    assert looked_for == [True]
-    np.testing.assert_array_equal(fitted[1][0], wrong.cameras.cam_from_world)

@@ -10,7 +10,7 @@ import pytest
 
 from humangs_jax.capture.calibration.loaded import load_cameras
 from humangs_jax.capture.keypoints.reading import read_keypoints
-from humangs_jax.data.cameras import mean_reprojection_error, read_calibration
+from humangs_jax.data.cameras import check_calibration, read_calibration
 from humangs_jax.data.capture_checks import CaptureError
 
 FILES = Path(__file__).parents[1] / "data" / "files"
@@ -85,9 +85,9 @@ def test_a_model_of_colmap_sees_its_points_where_colmap_found_them(suffix, tmp_p
     for file in (FILES / "colmap").glob(f"*.{suffix}"):
         shutil.copy(file, tmp_path)
     model = read_calibration(tmp_path, lambda photo: (1, 1))
-    error = mean_reprojection_error(model)
-    assert error is not None and error < 0.6  # COLMAP itself says 0.58 pixels
-    assert model.observations is not None and len(model.observations.pixels) == 53
+    checks = check_calibration(model, model, "-y")
+    assert checks.reprojection is not None and checks.reprojection < 0.6  # COLMAP itself: 0.58
+    assert checks.observations == 53
     np.testing.assert_allclose(model.cameras[0].K, read("colmap").cameras[0].K, rtol=1e-5)
     one, other = (load_cameras(folder) for folder in (tmp_path, FILES / "colmap"))
     np.testing.assert_allclose(one.points, other.points, rtol=1e-5)

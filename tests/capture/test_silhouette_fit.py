@@ -31,7 +31,6 @@ from humangs_jax.capture.fitting.silhouette_fit import (
     SilhouetteFit,
     refine_capture,
     start_state,
-    usual_config,
 )
 from humangs_jax.capture.keypoints.keypoints import COCO_17, Keypoints
 from humangs_jax.core.pytree import replace
@@ -229,44 +228,6 @@ def test_small_gains_are_kept_where_keypoints_do_not_get_worse(before, after, ke
     assert bare is (kept or after == (0.20, 6.0))
 
 
-def test_a_displacement_of_the_shape_before_is_left_out():
-    start = dataclasses.replace(
-        truth(), displacement=np.zeros(truth().body.template.shape, np.float32)
-    )
-    origin = module.capture_origin(start, start.cameras, CONFIG)
-    best, score = (
-        module.moved_capture(start, origin, start_state(origin, CONFIG)),
-        Score(np.zeros(VIEWS), 0.9, None, 0.1),
-    )
-    told = [
-        module._report(start, *pair, score, "").notes for pair in ((best, score), (start, score))
-    ]
-    assert best.displacement is None and ["left out" in " ".join(notes) for notes in told] == [
-        True,
-        False,
-    ]
-
-
-def test_settings_suit_what_is_known():
-    alone, both, bare = (
-        usual_config(False),
-        usual_config(True),
-        usual_config(True, fixed_cameras=True, bare=True),
-    )
-    assert vars(alone.std) == vars(CaptureRefineConfig().std)
-    assert (
-        both.std.betas > alone.std.betas
-        and both.std.focal < alone.std.focal
-        and both.std.clothing == alone.std.clothing
-        and not both.fixed_cameras
-    )
-    assert (
-        bare.fixed_cameras
-        and bare.std.clothing < 0.002
-        and bare.robust_scales[0] == bare.robust_scales[1]
-    )
-
-
 def test_keypoints_of_long_narrow_photos_are_where_they_are():
     """At the size that is looked at, the height is 0.853 and the width, of whole pixels, 0.856 of
     the photo's.
@@ -445,11 +406,6 @@ def test_clothes_explain_a_gap_and_a_body_outside_costs_more_than_one_inside(sph
     assert cost(4.0, 4.0) < 0.02 * cost(4.0, 0.0)
     assert cost(-4.0, 0.0) > 1.5 * cost(4.0, 0.0)
     assert cost(4.0, 0.0) < 40 * 4.0**2, "180 equations count for 40"
-
-
-def test_clothes_inside_the_body_count_more_than_those_outside():
-    inside, outside = module._counted(jnp.asarray([-0.5, 0.5]))
-    assert -inside > 3 * outside == 1.5
 
 
 def shapes_of(arguments):

@@ -10,7 +10,6 @@ from fit_people import TOY_MODEL as MODEL
 
 from humangs_jax.body.landmarks import pose_landmarks
 from humangs_jax.body.model import BodyPose
-from humangs_jax.capture.fitting import landmark_fit
 from humangs_jax.capture.fitting.fit_capture import _motion_warnings
 from humangs_jax.capture.fitting.landmark_fit import LandmarkFit, keypoint_problem, smooth_motion
 from humangs_jax.capture.fitting.residuals.keypoints import make_observations
@@ -168,32 +167,6 @@ def test_smoothness_that_the_keypoints_contradict_by_the_certainty_that_the_fit_
     again = smoothed(seen_by(landmarks), (rotations, translations), model=supposed)
     assert float(again.smoothness) == float(fit.smoothness)
     np.testing.assert_array_equal(again.joints, fit.joints)
-
-
-@jax.jit
-def bridged(seen, state):
-    problem = keypoint_problem(MODEL)
-    return landmark_fit._poses(problem, landmark_fit._bridged(problem, seen, state))
-
-
-def test_frames_without_keypoints_are_bridged_on_the_shortest_way(walk):
-    """A quarter, a half and three quarters of the way from frame 1 to frame 5; behind the last one
-    the pose stays.
-    """
-    rotations, translations = (
-        np.zeros((FRAMES, 4, 3), np.float32),
-        np.zeros((FRAMES, 3), np.float32),
-    )
-    rotations[1, :, 1], rotations[5, :, 1] = (
-        3.0,
-        2 * np.pi - 3.0 - 2 * np.pi,
-    )  # 16 degrees apart, the short way round
-    translations[5, 0] = 4.0
-    poses = bridged(without(walk[0], (2, 3, 4, 6)), states_of(rotations, translations))
-    np.testing.assert_allclose(poses.translation[:, 0], [0, 0, 1, 2, 3, 4, 4], atol=1e-5)
-    turned = np.asarray(poses.rotations)[1:6, 0, 1] % (2 * np.pi)
-    np.testing.assert_allclose(turned, 3.0 + (2 * np.pi - 6.0) * np.arange(5) / 4, atol=1e-4)
-    np.testing.assert_allclose(poses.rotations[6], poses.rotations[5], atol=1e-5)
 
 
 def test_what_became_of_smooth_motion_is_told():

@@ -3,22 +3,18 @@ the rest.
 """
 
 import json
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-import humangs_jax as hg
 from humangs_jax.apps.start import inspect_folder, photo_files
 from humangs_jax.apps.video_photos import video_of
 from humangs_jax.avatar.video import contact_sheet, write_video
 from humangs_jax.capture.calibration.importing import import_cameras
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.datasets.multiview import numbered
-from humangs_jax.data.folders import photo_of_mask, photos_in, scan_folder, unused_line
-from humangs_jax.io.images import DRAWN, MASK, PHOTO_SUFFIXES, is_own_picture, mark_of, write_png
+from humangs_jax.data.folders import photo_of_mask, scan_folder, unused_line
+from humangs_jax.io.images import DRAWN, MASK, is_own_picture, mark_of, write_png
 from tests.capture import calibration_files as written
 
 FILES, NAMES = written.FILES, written.NAMES
@@ -202,17 +198,3 @@ def test_folders_that_are_captures_are_named_and_previews_are_not(rig):
         len(scan.photos) == 4
         and unused_line(scan.unused) == "not used: 1 folder that is a capture already (me)"
     )
-
-
-def test_one_list_says_which_files_are_photos(tmp_path):
-    """Whoever looks for photos, masks or images of others asks it."""
-    package = Path(hg.__file__).parent
-    own = [
-        str(file.relative_to(package))
-        for file in sorted(package.rglob("*.py"))
-        if re.search(r'["\']\.jpe?g["\']', file.read_text(encoding="utf-8"))
-    ]
-    assert own == ["io/images.py"]
-    for number, suffix in enumerate(PHOTO_SUFFIXES):
-        (tmp_path / f"{number:04d}{suffix}").write_bytes(b"a photo")
-    assert len(numbered(tmp_path)) == len(photos_in(tmp_path)) == len(PHOTO_SUFFIXES) == 7

@@ -120,27 +120,3 @@ def test_the_first_row_that_recognizes_a_file_reads_it(tmp_path, made_up):
     )
     for source in (tmp_path / "model", tmp_path / "model" / "images.txt"):
         assert read_calibration(source, size).format == CAMERAS["colmap"].about
-
-
-def test_a_suffix_of_its_own_is_for_files_that_are_no_text(tmp_path, made_up):
-    camera = CalibratedCamera("a", np.eye(3), np.eye(4), 1, 1)
-    made_up(
-        CAMERAS,
-        CameraFormat("Binary", "made_up:read", (".cams",)),
-        recognizes=lambda source: source.path.suffix == ".cams",
-        read=lambda source, format: source.calibration(format, [camera]),
-    )
-    (tmp_path / "rig.cams").write_bytes(b"\xff\x00")
-    assert read_calibration(tmp_path / "rig.cams", lambda name: (1, 1)).format == "Binary"
-    point = np.full((1, 17, 3), 1.0)
-    made_up(
-        KEYPOINTS,
-        SourceFormat("Tables", "made_up:read", (".points",)),
-        recognizes=lambda source: source.path.suffix == ".points",
-        read=lambda source, format: detections_of(
-            [DetectedImage("front", source.path, tuple(30 * point))]
-        ),
-    )
-    (tmp_path / "front.points").write_bytes(b"\xff\x00")
-    with pytest.raises(CaptureError, match="confidences"):  # it was read
-        read_keypoints(tmp_path / "front.points", ["front"], 20, 20)

@@ -17,7 +17,7 @@ from humangs_jax.apps.settings import Settings
 from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.pytree import replace
 from humangs_jax.data import view_choice as module
-from humangs_jax.data.body_and_masks import _sampling, views_without_person
+from humangs_jax.data.body_and_masks import views_without_person
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.exposure import (
     EXPECTED,
@@ -89,20 +89,6 @@ def test_other_masks_are_kept(demo, mask):
         else with_mask(demo, 1, KEPT[mask](demo.masks[1]))
     )
     assert not views_without_person(capture)
-
-
-def test_exact_masks_hold_the_body(demo, monkeypatch):
-    monkeypatch.setattr("humangs_jax.data.body_and_masks.LEAST_SHARE", 0.95)
-    assert not views_without_person(demo)
-
-
-def test_points_are_spread_by_the_area_of_the_skin():
-    vertices, corners = np.zeros((6, 3)), np.asarray([[0, 1, 2], [3, 4, 5]])
-    vertices[[1, 2, 4, 5], [0, 1, 0, 1]], vertices[3:, 2] = [3, 3, 1, 1], 1.0  # areas 9 : 1
-    found, weights = _sampling(vertices, corners, 1000)
-    assert np.mean(found[:, 0] == 0) == pytest.approx(0.9, abs=0.01)
-    points = np.einsum("pc,pcx->px", weights, vertices[found])[found[:, 0] == 0]
-    np.testing.assert_allclose(points.mean(axis=0), [1, 1, 0], atol=0.1)  # the centroid
 
 
 def test_a_body_that_is_out_of_the_frame_meets_no_mask(demo):

@@ -110,8 +110,8 @@ def read_cameras(path):
     return read_calibration(path, lambda name: (64, 48))
 
 
-def read_detections(*names):
-    return lambda path: read_keypoints(path, names, 640, 480, person=0)
+def read_detections(*names, size=(640, 480)):
+    return lambda path: read_keypoints(path, names, *size, person=0)
 
 
 def read_data_set(folder):
@@ -473,8 +473,14 @@ ROWS = {
     ),
     "easymocap": (read_cameras, rig(calibration_files.write_easymocap, "cams"), "intri.yml"),
     "import": (import_beside, write_import),
-    "openpose": (read_detections("cam03.0050"), real("pose2sim/pose/cam03.0050.json")),
-    "coco annotations": (read_detections("000000000785"), real("coco/test_coco.json")),
+    "openpose": (
+        read_detections("cam03.0050", size=(1088, 1920)),
+        real("pose2sim/pose/cam03.0050.json"),
+    ),
+    "coco annotations": (
+        read_detections("000000000785", size=(640, 425)),
+        real("coco/test_coco.json"),
+    ),
     "coco": (read_detections(*VIEWS), written("results.json", COCO)),
     "mmpose": (read_detections(*VIEWS), written("walk.json", MMPOSE)),
     "easymocap annots": (read_detections(*VIEWS), written("000.json", ANNOTS)),
@@ -486,8 +492,9 @@ ROWS = {
     "amass": (load_motion, npz("m.npz", AMASS)),
     **{
         kind: of_motion(kind)
-        for kind in ("AIST++", "parts", "WHAM", "PHALP", "GVHMR", "MDM", "Motion-X", "Kimodo")
+        for kind in ("AIST++", "parts", "WHAM", "GVHMR", "MDM", "Motion-X", "Kimodo")
     },
+    "PHALP": (functools.partial(load_motion, person=3), motion_files.FILES["PHALP"][0]),
     "smplcodec": of_motion("smplcodec"),
     "EasyMocap": of_motion("EasyMocap", "000000.json"),
     "Human3R": of_motion("Human3R", "smpl/000000.npz"),

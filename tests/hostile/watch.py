@@ -7,7 +7,10 @@ import os
 import resource
 import signal
 import sys
+import time
 from pathlib import Path
+
+from humangs_jax.core.progress import printable
 
 MEMORY = 3 << 30
 """Bytes of address space that reading a file may add to what the process has."""
@@ -15,6 +18,8 @@ RESIDENT = 1 << 30
 """Bytes that it may make resident."""
 SECONDS = 10.0
 """Seconds of the processor that it may take."""
+KILLED = 60
+"""Seconds of the processor after which the run of all tests ends: a loop in C hears no signal."""
 LONGEST_LINE = 1500
 FORBIDDEN = {
     *("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.fork", "pty.spawn"),
@@ -85,16 +90,19 @@ def watched(folder):
     pages = [int(number) for number in status.read_text().split()]
     size = resource.getpagesize()
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    times = resource.getrlimit(resource.RLIMIT_CPU)
     before = signal.signal(signal.SIGPROF, too_long)
     bytecode, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # of modules imported late
     WATCH.folder, WATCH.seen = Path(folder).resolve(), []
     resource.setrlimit(resource.RLIMIT_AS, (pages[0] * size + MEMORY, hard))
+    resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time()) + KILLED, times[1]))
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+        resource.setrlimit(resource.RLIMIT_CPU, times)
         WATCH.folder, sys.dont_write_bytecode = None, bytecode
         signal.signal(signal.SIGPROF, before)
     assert not WATCH.seen
@@ -107,14 +115,11 @@ def chain(error):
         error = error.__cause__ or error.__context__
 
 
-def outcome(read, path):
+def outcome(read, path, folder):
     """ "read" or "refused".
 
     Raises: AssertionError if a refusal is no line that names a full path; whatever else is raised.
     """
-    from humangs_jax.core.progress import printable
-
-    folder = path if path.is_dir() else path.parent
     try:
         with watched(folder):
             read(path)

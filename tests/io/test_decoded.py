@@ -7,10 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from humangs_jax.apps import detect
-from humangs_jax.apps.from_photos import FromPhotos
-from humangs_jax.data.capture import load_capture
-from humangs_jax.data.photos import DEMO_CAPTURE, capture_folder, load_photos
 from humangs_jax.io import images
 from humangs_jax.io.decoded import decoded_once, forget_decoded
 from humangs_jax.io.images import read_grey, read_image, write_png
@@ -94,28 +90,3 @@ def test_no_more_is_kept_than_there_is_room_for(tmp_path, decodings):
         forget_decoded()
         read_image(paths[0])
         assert sorted(decodings.values()) == [1, 2, 2]
-
-
-def test_the_steps_of_start_decode_each_photo_of_a_capture_once(tmp_path, monkeypatch, decodings):
-    """Finding the person, importing, fitting: each reads the photos."""
-    folder = tmp_path / "c"
-    shutil.copytree(capture_folder(DEMO_CAPTURE), folder)
-
-    def looked_at(names, photos):
-        for _ in zip(names, photos, strict=True):
-            pass
-        return []
-
-    def steps(start, material):
-        detect.found_in_capture(folder)
-        load_photos(folder)
-        load_capture(folder)
-        yield from ()
-
-    monkeypatch.setattr(detect, "detect_photos", looked_at)
-    monkeypatch.setattr(detect, "with_masked", lambda found, *_: found)
-    monkeypatch.setattr(detect, "same_people", lambda photos, *_: photos)
-    monkeypatch.setattr(FromPhotos, "_go_on", steps)
-    photos = folder / "images"
-    list(FromPhotos(photos, tmp_path / "out").steps())
-    assert decodings and set(decodings.values()) == {1}

@@ -57,11 +57,8 @@ def test_several_views_round_trip_exactly(tmp_path):
 
 STRIDED = {
     "flipped rows": lambda x: x[::-1],
-    "flipped columns": lambda x: x[:, ::-1],
     "transposed": lambda x: np.swapaxes(x, 0, 1),
-    "cropped": lambda x: x[2:-1, 1:-2],
     "every other": lambda x: x[::2, ::2],
-    "fortran": lambda x: np.asfortranarray(x),
 }
 
 

@@ -4,11 +4,9 @@ import ast
 import dataclasses
 import errno
 import re
-import struct
 import threading
 import time
 import zipfile
-import zlib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -101,36 +99,15 @@ ZOO = [
     RecursionError("maximum recursion depth exceeded"),
     MemoryError(),
     zipfile.BadZipFile("File is not a zip file"),
-]
-ZOO += [
-    zlib.error("Error -3"),
     EOFError(),
     KeyError("x"),
-    IndexError("out of range"),
-    OverflowError("too large"),
-]
-ZOO += [
-    struct.error("unpack requires a buffer"),
     UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"),
-]
-ZOO += [
-    AttributeError("'list' has no 'items'"),
-    TypeError("unhashable"),
-    AssertionError(),
-    SyntaxError("broken"),
-]
-ZOO += [
-    NotImplementedError("compression"),
     RuntimeError("two\nlines"),
     PermissionError(13, "Permission denied"),
-]
-ZOO += [
-    ValueError("no"),
-    ZeroDivisionError("division by zero"),
     StopIteration(),
     InvalidFileError("expected something else"),
+    ValueError("x" * 10_000),
 ]
-ZOO += [ValueError("x" * 10_000)]
 
 
 @pytest.mark.parametrize("error", ZOO, ids=lambda error: type(error).__name__)

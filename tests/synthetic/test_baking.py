@@ -171,21 +171,3 @@ def test_scans_are_read_back_as_they_were(person, tmp_path):
     again = mean(jnp.where(covered, sample_texture(texture, uv), 1.0))
     assert np.abs(np.asarray(mean(covered)[..., 0]) - mask).mean() < 1e-3
     assert -10 * np.log10(np.mean((np.asarray(again) - direct) ** 2)) > SCAN_PSNR
-
-
-def test_a_scan_is_written_whole_or_not_at_all(person, baked, tmp_path, monkeypatch):
-    def fail(*_, **__):
-        raise OSError("disk full")
-
-    (tmp_path / "scan").mkdir()
-    (tmp_path / "scan" / "scan.json").touch()
-    monkeypatch.setattr(bank, "write_json", fail)
-    monkeypatch.setattr(bank, "bake_subject", lambda *_: baked)
-    monkeypatch.setattr(bank, "lit_texture", lambda *_: baked.albedo)
-    with pytest.raises(OSError, match="disk full"):
-        bank.export_scan(
-            subject.pose_subject(person, np.zeros((55, 3), np.float32), np.zeros(3, np.float32)),
-            tmp_path / "scan",
-            128,
-        )
-    assert [path.name for path in tmp_path.rglob("*")] == ["scan", "scan.json"]

@@ -211,13 +211,6 @@ def test_processes_write_the_same_files(tmp_path):
             writer.Layout(128, 4, 60, 12, frames=30),
             7,
         ),
-        (
-            ("--views", "4", "--close-views", "0", "--held-out", "8", "--scans"),
-            writer.Layout(512, 1, 4, 0, 8, scan_texture=2048),
-            0,
-        ),
-        (("--views", "4"), writer.Layout(512, 1, 4, 0), 0),
-        (("--views", "4", "--close-views", "3"), writer.Layout(512, 1, 4, 3), 0),
         (("--for-training",), writer.Layout(256, 2, 12), 0),
     ],
 )

@@ -340,22 +340,6 @@ def test_the_working_folder_may_be_the_data_set(videos, tmp_path, body, monkeypa
     assert report.scenes == 1 and (tmp_path / "out" / "avatarrex_a" / "scene.json").is_file()
 
 
-def test_wrong_options_are_one_line(tmp_path):
-    (tmp_path / "model.npz").write_bytes(b"")
-    command = lambda scans=ScanViews(), body="model.npz", **options: Preprocess(
-        "thuman", tmp_path / "in", scans, tmp_path / "out", tmp_path / body, **options
-    )
-    for made, words in (
-        (command(shard="3/3"), "--shard 3/3"),
-        (command(shard="x"), "--shard x"),
-        (command(ScanViews(factors=(2.0, 1.0))), "--factors 2 1"),
-        (command(body="none.npz"), "--body"),
-        (command(), "model: no such folder"),
-    ):
-        with pytest.raises((ValueError, OSError), match=words):
-            made.run()
-
-
 def test_a_face_before_the_camera_has_the_color_of_its_texture():
     corners = np.asarray([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0]])
     faces = np.asarray([[0, 1, 2], [0, 2, 3]], np.int32)
