@@ -43,8 +43,8 @@ def test_cameras_of_panoptic_are_read_as_written(tmp_path):
 
 def edited(folder, name, old, new):
     """A file of another tool with another text in one place."""
-    copy = shutil.copy(FILES / name, folder)
-    edit_text(Path(copy), old, new)
+    copy = Path(shutil.copy(FILES / name, folder))
+    edit_text(copy, old, new)
     return copy
 
 
@@ -117,7 +117,7 @@ def test_cameras_to_be_ignored_are_left_out(tmp_path):
     file = edited(tmp_path, "caliscope/camera_array.toml", "ignore = false", "ignore = true")
     found = read_calibration(file, lambda name: (1, 1))
     assert [camera.name for camera in found.cameras] == ["1", "2", "3"]
-    Path(file).write_text(Path(file).read_text().replace("ignore = false", "ignore = true"))
+    file.write_text(file.read_text().replace("ignore = false", "ignore = true"))
     with pytest.raises(CaptureError, match="every camera is to be ignored"):
         read_calibration(file, lambda name: (1, 1))
 
@@ -205,10 +205,10 @@ def of_folds(*folds):
 )
 def test_a_lens_shows_nothing_beyond_its_first_fold(coefficients, fold):
     K = np.asarray([[15.0, 0, 40], [0, 15, 40], [0, 0, 1]])
-    straight = undistort(np.zeros((80, 80), np.float32), K, np.asarray(coefficients), fill=1.0)
     rows, columns = (np.mgrid[:80, :80] + 0.5 - 40) / 15
     squared = rows**2 + columns**2
     with np.errstate(all="ignore"):
+        straight = undistort(np.zeros((80, 80), np.float32), K, np.asarray(coefficients), fill=1.0)
         seen = np.abs(distort(np.stack([columns, rows], axis=-1), np.asarray(coefficients)))
     inside = (seen < 38 / 15).all(axis=-1)
     np.testing.assert_array_equal(straight[squared >= fold], 1)

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from humangs_jax.capture.calibration.checks import check_calibration
 from humangs_jax.capture.calibration.loaded import load_cameras
 from humangs_jax.capture.keypoints.reading import read_keypoints
-from humangs_jax.data.cameras import check_calibration, read_calibration
+from humangs_jax.data.cameras import read_calibration
 from humangs_jax.data.capture_checks import CaptureError
 
 FILES = Path(__file__).parents[1] / "data" / "files"
