@@ -139,7 +139,7 @@ def test_scans_are_read_back_as_they_were(person, tmp_path):
 
     posed, baked = writer.sample_pose(person, 0), bank.bake_subject(person, 512)
     bank.export_scan(posed, tmp_path / "scan", 512)
-    known = json.loads((tmp_path / "scan" / bank.PARAMETERS).read_text())
+    known = json.loads((tmp_path / "scan" / "scan.json").read_text())
     assert known["seed"] == person.seed and known["lit"]
     np.testing.assert_allclose(known["rotations"], posed.rotations)
     expected = bank.lit_texture(posed, baked)
