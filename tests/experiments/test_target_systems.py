@@ -510,7 +510,7 @@ def test_parts_that_do_not_fit_are_refused():
         ):
             wrong()
     config, target = small("lca"), Target(pose(), tube().template)
-    outputs, run = (
+    outputs, ctx = (
         jax.eval_shape(
             lambda v: apply_humangs(v, inputs_of("lca"), config)[0], random_variables(config)
         ),
@@ -525,7 +525,7 @@ def test_parts_that_do_not_fit_are_refused():
     ):
         with pytest.raises(ValueError, match=said):
             jax.eval_shape(
-                functools.partial(driver.init, run=run), jax.random.key(0), outputs, target
+                functools.partial(driver.init, ctx=ctx), jax.random.key(0), outputs, target
             )
     with pytest.raises(ValueError, match="works on a map of the surface"):
         mapless = replace(inputs_of("animatable"), texels=None)
