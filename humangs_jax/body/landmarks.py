@@ -1,16 +1,18 @@
-"""Positions on a body of the landmarks that annotators and detectors mark in photos.
+"""Places the landmarks that annotators and detectors mark in photos on a body.
 
 A landmark is a mean of joints, or a vertex that a rule finds on the body's own template
-(`_Finder`), so that any body whose joints have SMPL-X's names has them. Sides are the person's.
-Joints: shoulder, elbow, wrist, hip, knee, ankle, jaw, eye (the centre of the eyeball), knuckles
-`{side}_FINGER_1, 2, 3` from the palm outwards, and means of them: neck (of the shoulders, as
-OpenPose has it), mid_hip. Vertices: nose (or face_30), face_8 the chin, face_27 the root of the
-nose, ears, finger tips, and of each foot big_toe, small_toe, heel and the foremost, foot_index. The
-other 65 points of the face follow expressions, which bodies without a face rig do not have.
+(`_Finder`). So every body whose joints have SMPL-X's names has landmarks. Sides are the person's.
 
-Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres):
-fits give them less weight. Where it is known at which places a detector sees its landmarks, they
-are moved there: `LandmarkDefinition`.
+These landmarks are joints: shoulder, elbow, wrist, hip, knee, ankle, jaw, eye (the centre of the
+eyeball), and the knuckles `{side}_FINGER_1, 2, 3` from the palm outwards. Two are means of joints:
+neck (of the shoulders, as OpenPose has it) and mid_hip. These are vertices: nose (or face_30),
+face_8 the chin, face_27 the root of the nose, ears, finger tips, and of each foot big_toe,
+small_toe, heel and foot_index, the foremost point. The other 65 points of the face follow
+expressions, which bodies without a face rig do not have.
+
+Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres), so
+fits give these landmarks less weight. If it is known where a detector sees its landmarks, they are
+moved there by a `LandmarkDefinition`.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,16 +45,18 @@ from humangs_jax.geometry import transform
 
 
 class _FacePart(NamedTuple):
-    """A run of points of the face that holds the mirror image of each of them."""
+    """A range of face points that is its own mirror image."""
 
     first: int
     """Number of the first point."""
     end: int
-    """Number behind the last point."""
+    """Number of the last point plus 1."""
     total: int
-    """Sum of the numbers of a point and its mirror image."""
+    """Number of a point plus the number of its mirror image, which is the same for all
+    points here.
+    """
     left_is_later: bool = True
-    """Whether the one with the larger number is on the person's left."""
+    """Whether the point with the larger number of a mirrored pair is on the person's left."""
 
 
 _FACE_PARTS = (
@@ -65,12 +69,12 @@ _FACE_PARTS = (
     _FacePart(65, 68, 132, left_is_later=False),  # lower lip, inside
 )
 _FACE_EYES = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
-"""Points of the right eye, and their mirror images of the left one."""
+"""Number of each point of the right eye -> number of its mirror image at the left eye."""
 
 
 def mirrored_name(name: str) -> str:
-    """Returns the landmark that a mirror puts in the place of `name`: a landmark in the middle
-    stays.
+    """Returns the name of the landmark's mirror image. A landmark in the middle is its own mirror
+    image.
     """
     kind, _, rest = name.partition("_")
     if kind == "face":
@@ -82,7 +86,9 @@ def mirrored_name(name: str) -> str:
 
 
 def side_of(name: str) -> int:
-    """Returns -1 for a landmark of the person's right, and 1 for the left and the middle."""
+    """Returns -1 for a landmark on the person's right, and 1 for one on the left or in the
+    middle.
+    """
     kind, _, rest = name.partition("_")
     if kind == "face":
         return _mirrored_face(int(rest))[1]
@@ -90,8 +96,8 @@ def side_of(name: str) -> int:
 
 
 def _mirrored_face(i: int) -> tuple[int, int]:
-    """Returns the number of the mirror image of a point of the face, and the side of the point: -1
-    on the right, else 1.
+    """Returns the number of a face point's mirror image, and the side of the point: -1 on the
+    right, else 1.
     """
     for first, end, total, left_is_later in _FACE_PARTS:
         if first <= i < end:
@@ -113,26 +119,26 @@ Millimetres = tuple[float | int, float | int, float | int]
 
 
 class LandmarkDefinition(NamedTuple):
-    """Where a detector sees one of its landmarks."""
+    """The place where a detector sees one of its landmarks."""
 
     name: str
     """Name of the landmark."""
     base: str
-    """The landmark of `body.landmarks` that it is measured from."""
+    """Name of the landmark of `body.landmarks` that the offset starts from."""
     offset: tuple[float, float, float]
-    """Vector from there to the landmark, metres in T-pose: x to the person's left, y up, z to the
-    front.
+    """Vector from the base to the landmark, metres in T-pose: x to the person's left, y up, z to
+    the front.
     """
     joints: tuple[str, ...] = ()
-    """Joints whose turning carries the offset along, by equal shares. None of them: the base is a
-    vertex, and the offset moves with it.
+    """Joints whose rotations turn the offset, in equal shares. Without joints, the offset turns
+    with the base.
     """
 
 
 def place(
     name: str, base: str, joints: tuple[str, ...], millimetres: Millimetres
 ) -> LandmarkDefinition:
-    """Makes a landmark whose offset is in millimetres."""
+    """Returns a `LandmarkDefinition` whose offset is given in millimetres."""
     x, y, z = millimetres
     return LandmarkDefinition(name, base, (x / 1000, y / 1000, z / 1000), joints)
 
@@ -147,12 +153,14 @@ CARRIERS = {
     },
     **{"hip": ("pelvis",), "knee": ("{side}_hip",), "ankle": ("{side}_knee",)},
 }
-"""The joints whose turning carries what lies beside a landmark; none: what carries its vertex."""
+"""The joints whose rotations turn the offset of each kind of landmark. Without joints, the offset
+turns with the landmark's vertex.
+"""
 
 
 def plain_places(names: tuple[str, ...]) -> tuple[LandmarkDefinition, ...]:
-    """Makes a place for each landmark that has `CARRIERS`, where this module has it: fits may find
-    it elsewhere.
+    """Returns a definition with offset 0 for each of the landmarks whose kind is in `CARRIERS`. A
+    fit may then find other offsets.
     """
     places = []
     for name in names:
@@ -167,10 +175,10 @@ def plain_places(names: tuple[str, ...]) -> tuple[LandmarkDefinition, ...]:
 def both_sides(
     names: tuple[str, str], base: str, joints: tuple[str, ...], millimetres: Millimetres
 ) -> tuple[LandmarkDefinition, LandmarkDefinition]:
-    """Makes a landmark of the left side and its mirror image.
+    """Returns the definitions of a left landmark and of its mirror image on the right.
 
-    Arguments: names: names of the left and the right one. base, joints: with {side} for the side.
-    millimetres: the offset of the left one.
+    Arguments: names: names of the left and the right landmark. base, joints: names with {side} in
+    place of the side. millimetres: the offset of the left landmark.
     """
     x, y, z = millimetres
 
@@ -186,32 +194,33 @@ def both_sides(
 
 
 SIDES = {"left": 1.0, "right": -1.0}
-"""The sign of x that points outwards on each side, in T-pose."""
+"""Sign of x that points outwards on each side, in T-pose."""
 FOOT = {
     "foot_index": (0.0, 1.0),
     "big_toe": (-0.3, 1.0),
     "small_toe": (1.0, 1.0),
     "heel": (0.0, -1.0),
 }
-"""The direction in which landmarks of the foot are farthest: outwards and forwards."""
+"""Direction in which each landmark of the foot is the farthest vertex: (outwards, forwards)."""
 
 
 class PlacedLandmark(NamedTuple):
-    """A landmark whose place a fit may move, a left and a right one together. It is unpacked like a
-    tuple, as which files of `jax.export` give it back.
+    """A landmark whose place a fit may move. A left and a right landmark move together.
+
+    This is a plain tuple in code that uses it, because files of `jax.export` give back a tuple.
     """
 
     landmark: int
     """Number of the landmark."""
     group: int
-    """Number of the group: a pair of mirror images, or one landmark in the middle."""
+    """Number of the group. A group is a pair of mirror images, or one landmark in the middle."""
     side: int
-    """1, and -1 for the right one of a pair, whose x moves the other way."""
+    """-1 for the right landmark of a pair, whose x moves the opposite way; else 1."""
 
 
 @pytree_dataclass
 class LandmarkModel:
-    """The part of a body that k landmarks need, which is posed without the rest of it.
+    """The part of a body that k landmarks need. It can be posed without the rest of the body.
 
     landmarks = `regressor` @ [the j posed joints, the p posed `points` of the surface]
     """
@@ -221,9 +230,9 @@ class LandmarkModel:
     joint_directions: Float[Array, "j 3 s"]
     """Change of the rest joints per unit of a shape coefficient, (j, 3, s), metres."""
     points: SurfacePoints
-    """The points of the surface that landmarks need, p of them; those of `placed` come last."""
+    """The p points of the surface that landmarks need. The points of `placed` come last."""
     regressor: Float[Array, "k jp"]
-    """Weights of joints and points in each landmark, (k, j + p); rows sum to 1, or are 0 where the
+    """Weights of joints and points in each landmark, (k, j + p). Rows sum to 1, or to 0 where the
     body lacks the landmark.
     """
     certainty: Float[Array, " k"]
@@ -244,7 +253,7 @@ class LandmarkModel:
     def moved(self, offsets: Float[Array, "g 3"]) -> "LandmarkModel":
         """Returns the model with its placed landmarks moved, each group by its offset.
 
-        offsets: metres in T-pose, for the left one of a pair.
+        offsets: (g, 3), metres in T-pose, of the left landmark of a pair.
         """
         if not self.placed:
             return self
@@ -254,7 +263,9 @@ class LandmarkModel:
         return replace(self, points=replace(self.points, rest=rest))
 
     def by_landmark(self, offsets: Float[Array, "g 3"]) -> Float[np.ndarray, "k 3"]:
-        """Returns the offset of each landmark for those of the groups; 0 for what is not placed."""
+        """Returns the offset of each landmark, (k, 3), from the offsets of the groups (g, 3).
+        Landmarks that are not placed have 0.
+        """
         found = np.zeros((len(self.names), 3))
         for landmark, group, side in self.placed:
             found[landmark] = np.asarray(offsets[group]) * (side, 1, 1)
@@ -262,7 +273,7 @@ class LandmarkModel:
 
 
 LESS_CERTAIN = {"hip": 2.0, "shoulder": 1.5, "neck": 1.5, "mid_hip": 1.5, "ear": 1.5}
-"""Multiples of the noise for landmarks on whose position annotators disagree."""
+"""Factors on the noise of the kinds of landmarks whose position annotators disagree on."""
 
 
 def usual_certainty(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
@@ -271,7 +282,7 @@ def usual_certainty(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
 
 
 def kind_of(name: str) -> str:
-    """Returns the name without its side."""
+    """Returns the landmark's name without its side: "hip" for "left_hip"."""
     if name.startswith(("left_", "right_")):
         return name.split("_", 1)[1]
     return name
@@ -284,13 +295,14 @@ def landmark_model(
     places: tuple[LandmarkDefinition, ...] = (),
     certainty: tuple[float, ...] = (),
 ) -> LandmarkModel:
-    """Prepares the landmarks of a body by name; those that it lacks get rows of zeros. Without
-    names there are the joints alone.
+    """Returns a model of the named landmarks of a body. Landmarks that the body lacks get rows of
+    zeros. Without names, the model has only the joints.
 
-    Arguments: places: of the landmarks that may be elsewhere than the module says; ignored where
-    the body lacks what they depend on. certainty: of each, if it is known.
-    Raises: ValueError if it has none of them, which is so when its joints have other names than
-    SMPL-X's.
+    Arguments: places: definitions of landmarks that are elsewhere than this module says. A
+    definition is ignored where the body lacks what it depends on. certainty: weight of each
+    landmark's error; if empty, `usual_certainty` is taken.
+    Raises: ValueError if the body has none of the landmarks, for example because its joints do not
+    have SMPL-X's names.
     """
     finder = _Finder(body)
     # where each landmark is: at a place that the caller gives, or at the mean of its sources
@@ -345,7 +357,9 @@ def landmark_model(
 
 
 def _grouped(names: tuple[str, ...], placed: Sequence[str]) -> tuple[PlacedLandmark, ...]:
-    """Puts left and right landmarks into one group, named by the left one."""
+    """Returns the placed landmarks with their groups. A left landmark and its mirror image share a
+    group.
+    """
     pairs = [name if side_of(name) > 0 else mirrored_name(name) for name in placed]
     groups = sorted(set(pairs))
     return tuple(
@@ -357,17 +371,17 @@ def _grouped(names: tuple[str, ...], placed: Sequence[str]) -> tuple[PlacedLandm
 def _regressed(
     regressor: Float[Array | np.ndarray, "j n"], values: Float[Array | np.ndarray, "n *b"]
 ) -> Float[np.ndarray, "j *b"]:
-    """Returns what joints have of a quantity that is linear in the vertices."""
+    """Returns the values of joints, (j, ...), of a quantity that is linear in the vertices."""
     return np.tensordot(np.asarray(regressor), np.asarray(values), axes=1)
 
 
 def _rows(points: SurfacePoints, rows: Int[np.ndarray, " p"] | list[int]) -> SurfacePoints:
-    """Returns some of the points."""
+    """Returns the points with these numbers."""
     return jax.tree.map(lambda leaf: leaf[np.asarray(rows, np.int32)], points)
 
 
 def _joint_point(body: BodyModel, surface: SurfacePoints, joint: int) -> SurfacePoints:
-    """Makes a point of a joint: the joint carries it."""
+    """Returns a surface point at a joint, which moves with the joint alone."""
     row = np.asarray(body.joint_regressor)[joint : joint + 1]
     weights = np.zeros_like(surface.weights[:1])
     weights[0, joint] = 1.0
@@ -386,8 +400,8 @@ def _joint_point(body: BodyModel, surface: SurfacePoints, joint: int) -> Surface
 def _placed(
     body: BodyModel, surface: SurfacePoints, finder: "_Finder", place: LandmarkDefinition
 ) -> SurfacePoints:
-    """Makes a point beside the sources of a landmark: it grows with them, and turns with the joints
-    of the place.
+    """Returns the point of a placed landmark, at an offset from the mean of its base's sources. The
+    point follows the sources in every shape, and turns with the joints of the place.
 
     surface: all vertices, on the host.
     """
@@ -405,14 +419,14 @@ def _placed(
 
 
 def _concatenated(points: Sequence[SurfacePoints]) -> SurfacePoints:
-    """Joins points."""
+    """Returns all points in one record."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *points)
 
 
 def pose_landmarks(
     model: LandmarkModel, betas: Float[Array, " s_used"], pose: BodyPose
 ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
-    """Returns landmarks and joints of a person in a pose, metres.
+    """Returns landmarks (k, 3) and joints (j, 3) of a person in a pose, metres.
 
     Landmarks that the body lacks are at the origin.
     """
@@ -424,7 +438,9 @@ def pose_landmarks(
 def pose_joints(
     model: LandmarkModel, betas: Float[Array, " s_used"], pose: BodyPose
 ) -> tuple[Float[Array, "j 4 4"], Float[Array, "j 3"]]:
-    """Returns the transforms of the joints from rest, and where the joints are, metres."""
+    """Returns the transforms of the joints from rest, (j, 4, 4), and the posed joints, (j, 3),
+    metres.
+    """
     rest = shaped(model.joints, model.joint_directions, betas)
     transforms = joint_transforms(rest, model.parents, pose.rotations, pose.translation)
     return transforms, transform.apply(transforms, rest)
@@ -433,7 +449,7 @@ def pose_joints(
 def landmarks_from(
     model: LandmarkModel, joints: Float[Array, "j 3"], points: Float[Array, "p 3"]
 ) -> Float[Array, "k 3"]:
-    """Returns the landmarks of posed joints and points."""
+    """Returns the landmarks (k, 3) of posed joints (j, 3) and posed points (p, 3), metres."""
     return jnp.matmul(model.regressor, jnp.concatenate([joints, points]), precision=EXACT)
 
 
@@ -442,10 +458,13 @@ def _movers(
     joints_used: Bool[np.ndarray, " j"],
     point_weights: Float[np.ndarray, "p j"],
 ) -> tuple[int, ...]:
-    """Returns the joints that move a point or lie above one that does, and those above a joint that
-    is used: turning a joint does not move the joint.
+    """Returns the joints whose rotation moves a used joint or a point.
 
-    Arguments: point_weights: skinning weights of the points, (p, j).
+    These are the joints that carry a point, and all ancestors of them and of used joints. A used
+    joint itself is not among them for its own sake, because turning a joint does not move it.
+
+    Arguments: joints_used: whether a landmark uses each joint, (j,). point_weights: skinning
+    weights of the points, (p, j).
     """
     moving = point_weights.max(axis=0, initial=0.0) > 0.1  # less is hardly seen
     for j in np.flatnonzero(joints_used | moving):
@@ -457,11 +476,13 @@ def _movers(
 
 
 Score = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]]
-"""Scores of places; the best has the largest."""
+"""A function from positions (n, 3) to scores (n,). The best position has the largest score."""
 
 
 class _Finder:
-    """Finds the sources of landmarks on one body: a vertex by its number, joint j as -1 - j."""
+    """Finds the sources of landmarks on one body. A source is the number of a vertex, or -1 - j for
+    joint j.
+    """
 
     def __init__(self, body: BodyModel) -> None:
         self.template = np.asarray(body.template, np.float64)
@@ -474,14 +495,18 @@ class _Finder:
         return all(name in self.index for name in joints)
 
     def find(self, name: str) -> list[int]:
-        """Returns the sources whose mean is the landmark; none if the body lacks it."""
+        """Returns the sources whose mean is the landmark. The list is empty if the body lacks the
+        landmark.
+        """
         try:
             return self._find(name)
         except (KeyError, ValueError):  # a joint that it lacks, or no vertex where a rule looks
             return []
 
     def _find(self, name: str) -> list[int]:
-        """Does the same. Raises: KeyError, ValueError if the body lacks it."""
+        """Returns the sources of a landmark. Raises: KeyError, ValueError if the body lacks the
+        landmark.
+        """
 
         def joint(x):
             return -1 - self.index[x]
@@ -537,18 +562,18 @@ class _Finder:
         raise KeyError(name)
 
     def _segment(self, *joints: str) -> Int[np.ndarray, " n"]:
-        """Returns the vertices that have most of their weight from some joints together; joints
+        """Returns the vertices whose skinning weights for these joints sum to more than 0.5. Joints
         that the body lacks are left out.
         """
         present = [self.index[name] for name in joints if name in self.index]
         return np.flatnonzero(self.weights[:, present].sum(1) > 0.5)
 
     def _best(self, vertices: Int[np.ndarray, " n"], score: Score) -> int:
-        """Returns the vertex with the largest score."""
+        """Returns the number of the vertex with the largest score, out of `vertices`."""
         return int(vertices[np.argmax(score(self.template[vertices]))])
 
     def _eyes(self) -> Float[np.ndarray, "3"]:
-        """Returns the middle between the eyes, metres."""
+        """Returns the point midway between the eyes, (3,), metres."""
         return self.joints[[self.index["left_eye"], self.index["right_eye"]]].mean(0)
 
     def _head(self, low: float, high: float) -> Int[np.ndarray, " n"]:
@@ -558,7 +583,9 @@ class _Finder:
         return head[(height > low) & (height < high)]
 
     def _on_midline(self, score: Score, highest: float = np.inf) -> int:
-        """Returns the best vertex in front, within 6 mm of the middle of the face."""
+        """Returns the vertex with the largest score among vertices at the front of the head, within
+        6 mm of the middle and below `highest` metres.
+        """
         head = self._segment("head", "jaw")
         p = self.template[head]
         front = p[:, 2] > 0.5 * (self._eyes()[2] + p[:, 2].max()) - 0.02

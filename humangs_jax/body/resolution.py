@@ -1,20 +1,21 @@
-"""Bodies of other resolutions: long edges split, or vertices collapsed onto their neighbours.
+"""Changes the resolution of bodies: long edges are split, or vertices are collapsed onto their
+neighbours.
 
 Modellers put few rings of vertices along arms and legs and many into faces and fingers. Gaussians
-hang on the vertices, and where those are sparse they leave gaps; midpoints of long edges fill them.
-A midpoint takes the mean of its two ends in everything that is linear (template, shape and pose
-directions, skinning weights), so it stays on the mesh in every shape.
+hang on the vertices, so they leave gaps where vertices are sparse. Midpoints of long edges fill
+these gaps. A midpoint takes the mean of its two ends in everything that is linear (template, shape
+and pose directions, skinning weights), so it stays on the mesh in every shape.
 
-A half-edge collapse u -> v moves vertex u onto its neighbour v: the two triangles between them
-vanish, and what remains is a mesh on a subset of the vertices, whose positions, shape directions
-and skinning weights are the original ones. `collapse_sequence` orders all collapses once:
-`order[u]` is the rank of u (0 stays longest), `into[u]` the vertex it moves onto. Any size is then
-a table look-up.
+A half-edge collapse u -> v moves vertex u onto its neighbour v. The two triangles between them
+vanish. What remains is a mesh on a subset of the vertices, which keep their positions, shape
+directions and skinning weights. `collapse_sequence` orders all collapses once: `order[u]` is the
+rank of u (0 stays longest), and `into[u]` is the vertex that u moves onto. Any size is then a table
+look-up.
 
-Cost of u -> v: |uv|^2 + FLATNESS q_u(v), with q_u the mean squared distance to the planes that u
-has gathered (Garland and Heckbert, Surface Simplification Using Quadric Error Metrics): the length
-spreads the vertices evenly over the skin, so that the crowded face and ears go before the torso,
-and the quadric keeps fingers round. What cannot be seen from outside goes first.
+The cost of u -> v is |uv|^2 + FLATNESS q_u(v). Here q_u is the mean squared distance to the planes
+that u has gathered (Garland and Heckbert, Surface Simplification Using Quadric Error Metrics). The
+length spreads the vertices evenly over the skin, so that the crowded face and ears go before the
+torso. The quadric keeps fingers round. Vertices that cannot be seen from outside go first.
 """
 
 import heapq
@@ -43,22 +44,22 @@ from humangs_jax.geometry.mesh import (
 
 
 FINEST = 64
-"""Edges are made at most this many times shorter: finer asks for billions of faces, and is a length
-in another unit.
+"""Edges are made at most this many times shorter. A smaller length would give billions of faces,
+and is probably in another unit.
 """
 
 
 def split_long_edges(body: BodyModel, longest: float) -> tuple[BodyModel, sparse.csr_array]:
-    """Splits edges until those of the template are at most `longest` metres; the original vertices
-    stay first, in their order.
+    """Splits edges until all edges of the template are at most `longest` metres long.
 
-    Faces are cut into two, three or four along the midpoints of their long edges, consistently on
-    both sides. Texture coordinates and decimation order are dropped: they belong to the original
-    mesh. `relative_vertex_spacing` is the root of the area around a vertex over what it was: 1/2
-    where every edge has been halved.
+    The original vertices stay first, in their order. Faces are cut into two, three or four along
+    the midpoints of their long edges, consistently on both sides of an edge. Texture coordinates
+    and decimation order are dropped, because they belong to the original mesh.
+    `relative_vertex_spacing` is the square root of the area around a vertex relative to its
+    original area: 1/2 where every edge has been halved.
 
-    Also returns the matrix (finer, n) whose product with a linear quantity of the original vertices
-    is that of the result's: a midpoint has the mean of its ends.
+    Returns: the finer body; a matrix (finer, n) that maps any quantity of the n original vertices
+    that is linear to the vertices of the finer body. A midpoint gets the mean of its ends.
 
     Raises: ValueError if `longest` is not positive, or less than 1/64 of the longest edge.
     """
@@ -120,9 +121,10 @@ def split_long_edges(body: BodyModel, longest: float) -> tuple[BodyModel, sparse
 
 
 class _Moves:
-    """The expressions of a mesh whose edges are split.
+    """The expressions of a mesh whose edges are being split.
 
-    Most vertices do not move: `row` is then the last one, of zeros.
+    `row` holds the row of each vertex in `directions`. Most vertices do not move; their row is the
+    last one, which is zero.
     """
 
     def __init__(self, expressions: Expressions, vertices: int) -> None:
@@ -133,7 +135,7 @@ class _Moves:
         self.row[np.asarray(expressions.vertices)] = np.arange(len(directions))
 
     def split(self, edges: Int[np.ndarray, "e 2"]) -> None:
-        """Add the middles of these edges to the vertices."""
+        """Adds the midpoints of these edges (e, 2) to the vertices."""
         still = len(self.directions) - 1
         moves = (self.row[edges] < still).any(axis=1)
         middles = self.directions[self.row[edges[moves]]].mean(axis=1)
@@ -146,7 +148,7 @@ class _Moves:
         self.row = np.concatenate([row, added])
 
     def expressions(self) -> Expressions:
-        """Returns the expressions of the mesh as it is now."""
+        """Returns the expressions of the mesh after all splits so far."""
         vertices = np.flatnonzero(self.row < len(self.directions) - 1)
         return replace(
             self.of_body,
@@ -158,8 +160,9 @@ class _Moves:
 def _kept_moves(
     expressions: Expressions | None, renumber: Int[np.ndarray, " n"]
 ) -> Expressions | None:
-    """Returns expressions of the vertices that stay. renumber: their new numbers, -1 for those
-    that go.
+    """Returns the expressions of the vertices that stay, or None if there are no expressions.
+
+    renumber: new number of each vertex, (n,), -1 for a vertex that goes.
     """
     if expressions is None:
         return None
@@ -175,8 +178,9 @@ def _kept_moves(
 def _cut(
     faces: Int[np.ndarray, "f 3"], middles: Int[np.ndarray, "f 3"]
 ) -> Int[np.ndarray, "finer 3"]:
-    """Cuts faces at the midpoints of their sides. middles (f, 3): the vertex on side i to i + 1, -1
-    for none.
+    """Returns the faces (finer, 3) after a cut at the midpoints of their sides.
+
+    middles (f, 3): the vertex on side i to i + 1, -1 for a side that is not cut.
     """
     count = (middles >= 0).sum(1)
     parts = [faces[count == 0]]
@@ -204,25 +208,30 @@ def _cut(
 
 
 FLATNESS = 100.0
-"""1 mm off the surface costs as much as 1 cm of edge."""
+"""Weight of the squared distance to the surface: 1 mm off the surface costs as much as 1 cm of
+edge.
+"""
 HIDDEN = 0.01
-"""Factor on the cost of what cannot be seen from outside: edges there count as ten times shorter.
+"""Factor on the cost of vertices that cannot be seen from outside: edges there count as ten times
+shorter.
 """
 RIM = 2
-"""Rings of hidden vertices next to visible ones that count as visible: they hold lips and eyelids
-in place.
+"""Number of rings of hidden vertices next to visible ones that count as visible, because they hold
+lips and eyelids in place.
 """
 VIEWS = 40
 CELL = 0.004
-"""Metres: size of a depth-buffer cell, and with it how narrow a gap lets light through."""
+"""Size of a depth-buffer cell, metres. It decides how narrow a gap may be and still let light
+through.
+"""
 RIDGE = 1e-13
-"""Relative to the trace of the normal equations, which are singular where a shape direction moves
-nothing.
+"""Regularization of the normal equations, relative to their trace. Without it they are singular
+where a shape direction moves nothing.
 """
 
 
 def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarray:
-    """Spreads points over the faces, corners included, about `spacing` apart, metres."""
+    """Returns points on the faces, corners included, about `spacing` metres apart, (p, 3)."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     # parts of a side, at most 40
@@ -235,8 +244,8 @@ def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> 
 
 
 def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Returns the share of `VIEWS` parallel projections, in [0, 1], in which each vertex (n, 3) is
-    not hidden.
+    """Returns in which share of `VIEWS` parallel projections each vertex is visible, (n,), in [0,
+    1].
     """
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
@@ -248,7 +257,9 @@ def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 class _Mesh:
-    """A mesh under collapse: the neighbours of each vertex, and the planes it has gathered."""
+    """A mesh while vertices collapse: the faces and neighbours of each vertex, and the sum of the
+    plane quadrics that it has gathered.
+    """
 
     def __init__(self, vertices, faces, uv_faces, importance):
         self.positions = vertices.tolist()
@@ -282,8 +293,10 @@ class _Mesh:
         return [f for f in self.around[u] if v in self.faces[f]]
 
     def uv_moves(self, u: int, shared: list[int], v: int) -> dict[int, int] | None:
-        """Maps texture vertices of u to that of v in the same chart; None if some chart at u
-        does not reach v.
+        """Returns, for each texture vertex of u, the texture vertex of v in the same chart. None if
+        a chart at u does not reach v.
+
+        shared: the faces between u and v.
         """
         moves = {self.uv_at(f, u): self.uv_at(f, v) for f in shared}
         if all(self.uv_at(f, u) in moves for f in self.around[u]):
@@ -294,8 +307,8 @@ class _Mesh:
         return self.uv_faces[face][self.faces[face].index(vertex)]
 
     def allowed(self, u: int, v: int) -> bool:
-        """Says whether u -> v keeps the topology, the texture charts whole, and folds no face nor
-        makes it a needle.
+        """Says whether the collapse u -> v keeps the topology and the texture charts, folds no
+        face, and makes no face a needle.
         """
         # the topology: u and v share the corners of the faces between them and no others
         shared = self.between(u, v)
@@ -372,8 +385,10 @@ def _quality(
 def _vertex_quadrics(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "n 11"]:
-    """Sums over the faces of each vertex, weighted by area, the outer product of (normal, d), and
-    the area: (n, 11).
+    """Returns the quadrics of the vertices, (n, 11).
+
+    Each is a sum over the faces of a vertex, weighted by area: the ten different entries of the
+    outer product of the plane (normal, d) with itself, and the area.
     """
     normal = face_crosses(vertices, faces)
     area = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -392,12 +407,13 @@ def _vertex_quadrics(
 def collapse_sequence(
     vertices: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Finds all half-edge collapses of a triangle mesh, best first.
+    """Returns the order in which the vertices of a triangle mesh collapse, and the vertex that each
+    one moves onto.
 
-    Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3), whose seams are then kept
-    closed.
-    Returns: order (n,), 0 for the vertex that stays longest; into (n,), the vertex each one moves
-    onto, itself if it never can.
+    Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3): faces of the texture, whose
+    seams are kept closed; None: no texture.
+    Returns: order (n,), 0 for the vertex that stays longest; into (n,), the vertex that each one
+    moves onto, or its own number if it can never collapse.
     """
     # what is hidden costs less, but for a few rings beside what is seen
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
@@ -437,11 +453,11 @@ def collapse_sequence(
 
 
 def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """Makes a joint regressor on the kept vertices that gives the joints of the full body, whatever
-    its shape.
+    """Returns a joint regressor (j, kept) for the kept vertices that gives the joints of the full
+    body in every shape.
 
-    The weights of lost vertices move to where those went; the smallest change of the nearby weights
-    then removes the error.
+    The weights of a removed vertex move to the vertex that it ends on (`target`). Then the smallest
+    change of the weights near a joint removes the remaining error.
     """
     regressor = np.asarray(body.joint_regressor, np.float64)
     moved = np.zeros_like(regressor)
@@ -474,8 +490,10 @@ def _carry_uvs(
     target: Int[np.ndarray, " n"],
     kept_faces: Bool[np.ndarray, " f"],
 ) -> tuple[Float[Array, "u 2"], Int[Array, "kept 3"]]:
-    """Finds texture vertices for the remaining corners: of the vertex a corner moved onto, the one
-    nearest in the texture.
+    """Returns texture coordinates (u, 2) and texture faces (kept, 3) for the faces that remain.
+
+    A corner that moved onto another vertex takes the texture vertex of that vertex that is nearest
+    in the texture.
     """
     uvs, uv_faces = np.asarray(body.uvs), np.asarray(body.uv_faces)
     # (vertex, texture vertex)
@@ -496,10 +514,10 @@ def _carry_uvs(
 
 @checked_arguments
 def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
-    """Reduces a body to `vertex_count` of its vertices, with the same joints for every shape.
+    """Returns a body with `vertex_count` of the body's vertices and the same joints in every shape.
 
-    Host-side numpy: about 0.1 s if the body carries its collapses (the shipped one does), seconds
-    to find them otherwise; the result carries its own.
+    This runs in numpy on the host. It takes about 0.1 s if the body holds its collapse order (the
+    shipped one does), and seconds to find the order otherwise. The result holds its collapse order.
 
     Raises: ValueError if vertex_count is larger than the body or too small for its topology.
     """
@@ -509,10 +527,10 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
 def decimate_with_kept(
     body: BodyModel, vertex_count: int
 ) -> tuple[BodyModel, Int[np.ndarray, " kept"]]:
-    """Does what `decimate` does. Also returns the numbers of the vertices that it keeps, in their
-    order.
+    """Returns the body of `decimate` and the numbers of the kept vertices in the full body,
+    ascending.
 
-    Raises: ValueError, as it.
+    Raises: ValueError, as `decimate`.
     """
     # the collapses, which the body may carry
     total = body.template.shape[0]

@@ -1,9 +1,10 @@
-"""Files and folders that appear whole or not at all: written under a temporary name beside their
-place, then renamed.
+"""Writes files and folders so that they appear whole or not at all.
 
-Temporary names are unique, so several processes may write at once. What a killed process left
-behind is removed when a later process writes to the same place; an old folder that it had already
-moved aside is put back.
+They are written under a temporary name in the same folder, then renamed.
+
+Temporary names are unique, so several processes may write at once. When a process was killed, a
+later process that writes to the same place removes its temporary files. It also puts back an old
+folder that the killed process had already moved aside.
 """
 
 import contextlib
@@ -24,25 +25,24 @@ from humangs_jax.core.processes import undisturbed
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
-"""A temporary file of another machine (on a shared disk) is abandoned when it was not touched for
-this long.
+"""Seconds without a change after which a temporary file of another machine (on a shared disk)
+counts as abandoned.
 """
 MOVE_AWAY = "move it away, or choose another folder"
-"""What can be done where a file that was not written here has the name of one that is to be
-written.
-"""
+"""Advice in errors about a file that was not written here and has the name of an output."""
 _TEMPORARY = re.compile(
     r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?"
 )
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file. Raises: OSError."""
+    """Writes bytes to a file, whole or not at all. Raises: OSError."""
     replace_file(path, lambda temporary: temporary.write_bytes(data))
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a file in UTF-8, but for names of files whose bytes are no UTF-8: these stay.
+    """Writes text to a file in UTF-8. Names of files in it whose bytes are no UTF-8 keep these
+    bytes.
 
     Raises: OSError.
     """
@@ -50,7 +50,9 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def _encoded(text: str) -> bytes:
-    """Returns what `write_text` writes. Half surrogates that are no bytes of a name are escaped."""
+    """Returns the bytes that `write_text` writes. Half surrogates that are no bytes of a name are
+    escaped.
+    """
     try:
         return text.encode("utf-8", "surrogateescape")
     except UnicodeEncodeError:
@@ -58,7 +60,7 @@ def _encoded(text: str) -> bytes:
 
 
 def write_texts(texts: Mapping[str | os.PathLike[str], str]) -> None:
-    """Write files in UTF-8, all of them or none. Raises: OSError."""
+    """Writes texts to files in UTF-8, all of them or none. Raises: OSError."""
     replace_files(
         {
             path: functools.partial(Path.write_bytes, data=_encoded(text))
@@ -68,18 +70,21 @@ def write_texts(texts: Mapping[str | os.PathLike[str], str]) -> None:
 
 
 def replace_file(path: str | os.PathLike[str], write: Callable[[Path], object]) -> None:
-    """Writes one file by `replace_files`."""
+    """Writes one file whole or not at all: write(temporary) makes the file, which is then renamed
+    to `path`. See `replace_files`.
+    """
     replace_files({path: write})
 
 
 def replace_files(writers: Mapping[str | os.PathLike[str], Callable[[Path], object]]) -> None:
-    """Calls write(temporary) for each path, which makes that file; then all are renamed to their
-    paths at once.
+    """Calls write(temporary) for each path, which makes that file, then renames all files to their
+    paths.
 
-    If one of them cannot be written, none appears. Temporary names have the same suffix. Folders
-    that do not exist are made.
+    If one of them cannot be written, none appears. A temporary name has the suffix of its path.
+    Folders that do not exist are made.
 
-    Raises: OSError, naming the path, if it cannot be written; what `write` raises.
+    Raises: OSError, which names the path, if a file cannot be written; anything that `write`
+    raises.
     """
     temporaries: dict[Path, Path] = {}
     with contextlib.ExitStack() as unfinished:
@@ -100,7 +105,9 @@ def replace_files(writers: Mapping[str | os.PathLike[str], Callable[[Path], obje
 
 @contextlib.contextmanager
 def _made_folder(folder: Path) -> Generator[None]:
-    """Makes a folder with those above it; they go again if nothing was written into them."""
+    """Makes a folder and its parents, and removes the new ones again if the block raises and they
+    are empty.
+    """
     new = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -118,16 +125,16 @@ def _made_folder(folder: Path) -> Generator[None]:
 def replace_folder(
     folder: str | os.PathLike[str], write: Callable[[Path], object], *, mark: str
 ) -> None:
-    """Calls write(temporary), which makes that folder, and renames it to `folder`; an existing one
-    is replaced.
+    """Calls write(temporary), which makes that folder, and renames it to `folder`. An existing
+    folder is replaced.
 
     The existing folder is moved aside first and deleted last, so its contents are never lost.
     Parents are made.
 
-    Arguments: mark: a file that all folders of this kind hold; a filled folder without it is not
-    replaced.
-    Raises: ValueError, see `check_replaceable`; OSError, naming `folder`, if it cannot be written;
-    whatever `write` raises.
+    Arguments: mark: a file that all folders of this kind hold. A filled folder without that file is
+    not replaced.
+    Raises: ValueError, see `check_replaceable`; OSError, which names `folder`, if the folder cannot
+    be written; anything that `write` raises.
     """
     folder = Path(folder)
     check_replaceable(folder, mark=mark)
@@ -147,8 +154,8 @@ _being_written: set[Path] = set()
 
 @contextlib.contextmanager
 def _unfinished(temporary: Path) -> Generator[None]:
-    """Removes a temporary file or folder at the end, if it is still there, or when the process is
-    ended.
+    """Removes a temporary file or folder after the block if it still exists, and when the process
+    ends early (`remove_unfinished`).
     """
     _being_written.add(temporary.absolute())
     try:
@@ -159,7 +166,9 @@ def _unfinished(temporary: Path) -> Generator[None]:
 
 
 def _remove(path: Path) -> None:
-    """Removes a file or a folder; if that fails, the error that ended the write is raised."""
+    """Removes a file or a folder, and ignores errors, so that an error of the write is raised
+    instead.
+    """
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -168,18 +177,19 @@ def _remove(path: Path) -> None:
 
 
 def remove_unfinished() -> None:
-    """Removes the temporary files that this process is still writing, just before it is ended.
+    """Removes the temporary files and folders that this process is still writing. Call it just
+    before the process is ended.
 
-    Final files are not touched.
+    Finished files are not touched.
     """
     for temporary in tuple(_being_written):
         _remove(temporary)
 
 
 def _exchange(folder: Path, temporary: Path, aside: Path) -> None:
-    """Rename `folder` to `aside` and `temporary` to `folder`.
+    """Renames `folder` to `aside` and `temporary` to `folder`.
 
-    Where another process is faster, its folder is replaced too.
+    If another process has put a folder there in the meantime, that folder is replaced, too.
     """
     while True:
         with contextlib.suppress(FileNotFoundError):
@@ -256,8 +266,8 @@ def check_replaceable(
 
 
 def contents(folder: str | os.PathLike[str]) -> str:
-    """Returns what is in a folder, in a few words: "capture.json, images (60 files)"; empty if
-    there is nothing.
+    """Returns a short list of what a folder holds, such as "capture.json, images (60 files)". It is
+    empty if the folder holds nothing or does not exist.
     """
     entries, most = _entries(folder), 12
     shown = ", ".join(_described(Path(folder, entry)) for entry in entries[:most])
@@ -267,7 +277,9 @@ def contents(folder: str | os.PathLike[str]) -> str:
 
 
 def _described(entry: Path) -> str:
-    """Names an entry of a folder; a folder with the number of its files."""
+    """Returns the name of a folder's entry. The name of a folder is followed by its number of
+    files.
+    """
     if entry.is_symlink() or not entry.is_dir():
         return entry.name
     count = sum(len(files) for _, _, files in os.walk(entry))
@@ -276,8 +288,8 @@ def _described(entry: Path) -> str:
 
 
 def _entries(folder: str | os.PathLike[str]) -> list[str]:
-    """Returns the names in a folder, sorted; none if it does not exist (any more: another process
-    may be replacing it).
+    """Returns the sorted names of a folder's entries. The list is empty if the folder does not
+    exist, for example because another process is replacing it.
     """
     try:
         return sorted(os.listdir(folder))
@@ -295,21 +307,21 @@ def add_files(
     first: str | os.PathLike[str] | None = None,
     ours: Callable[[Path], bool] | None = None,
 ) -> None:
-    """Calls write(temporary folder), then moves its files to the same places in `folder`; other
-    files there stay.
+    """Calls write(temporary folder), then moves the files in it to the same places in `folder`.
+    Other files of `folder` stay.
 
-    The folder is made if needed. Nothing is moved if `write` raises; the moves follow each other at
-    once, so that a kill seldom falls between two, and those of two processes do not mix. The folder
-    may be a mount point or the working folder.
+    The folder is made if needed. Nothing is moved if `write` raises. The moves follow each other at
+    once, so a kill seldom falls between two of them, and the moves of two processes do not mix. The
+    folder may be a mount point or the working folder.
 
-    Arguments: without: files in the folder that are out of date; those that are not replaced are
-    deleted after the last move.
-    invalid: files that must never lie beside the new ones; they are deleted before the first move.
-    last: the file that is moved last: where it was not there before, it says that all others are in
-    place. first: the one that is moved first: it says that the others are ours. ours: whether a
-    file that is there may be replaced or deleted; None: all.
-    Raises: ValueError for a file that is there and not ours, see `check_ours`; OSError, naming
-        `folder`, if it cannot be written; whatever `write` raises.
+    Arguments: without: files in the folder that are out of date. Those that are not replaced are
+    deleted after the last move. invalid: files that must never lie beside the new ones. They are
+    deleted before the first move. last: the file that is moved last. If it was not there before, it
+    shows that all others are in place. first: the file that is moved first. It shows that the
+    others are ours. ours: says whether an existing file may be replaced or deleted; None: all may
+    be.
+    Raises: ValueError for an existing file that is not ours, see `check_ours`; OSError, which names
+    `folder`, if a file cannot be written; anything that `write` raises.
     """
     folder = Path(folder)
     # in it where it exists: then on the same disk, even if others hold what is beside it
@@ -349,11 +361,11 @@ def add_files(
 def check_ours(
     files: Iterable[Path], ours: Callable[[Path], bool], advice: str = MOVE_AWAY
 ) -> None:
-    """Checks that files can be written without losing what others wrote there, to be asked before
-    the work, too.
+    """Checks that files can be written without losing what others wrote there. It can also be
+    called before the work begins.
 
-    Arguments: ours: whether a file that is there may be replaced. advice: what the user can do.
-    Raises: ValueError, naming the first that may not.
+    Arguments: ours: says whether an existing file may be replaced. advice: what the user can do.
+    Raises: ValueError, which names the first file that may not be replaced.
     """
     foreign = [file for file in files if file.exists() and not ours(file)]
     if foreign:
@@ -365,15 +377,15 @@ def check_ours(
 
 @contextlib.contextmanager
 def only_writer(folder: str | os.PathLike[str], *, replaced: bool = False) -> Generator[None]:
-    """Keeps other processes out of a folder while this one writes to it.
+    """Keeps other processes out of a folder while this process writes to it.
 
-    The lock ends with the process, however that ends. Where there are no locks (Windows, some
-    network disks), nothing is checked.
+    The lock ends with the process, even if the process is killed. Where there are no locks
+    (Windows, some network disks), nothing is checked.
 
-    Arguments: replaced: whether the work makes or replaces the folder. Then a file beside it is
-    locked, which is removed at the end.
-    Raises: BlockingIOError, an OSError, if another process holds the folder; OSError, naming it, if
-    it cannot be locked.
+    Arguments: replaced: whether the work makes or replaces the folder. Then a file beside the
+    folder is locked, and removed at the end.
+    Raises: BlockingIOError, an OSError, if another process holds the folder; OSError, which names
+    the folder, if it cannot be locked.
     """
     folder = Path(folder)
     if not replaced:
@@ -387,7 +399,7 @@ def only_writer(folder: str | os.PathLike[str], *, replaced: bool = False) -> Ge
 
 
 def remove_abandoned_lock(folder: str | os.PathLike[str]) -> None:
-    """Remove the lock that a killed process left beside a folder; one that a process holds
+    """Removes the lock file that a killed process left beside a folder. A lock that a process holds
     stays.
     """
     lock = _lock_of(Path(folder))
@@ -404,8 +416,10 @@ def _lock_of(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def _locked(folder: Path, wait: bool, lock: Path | None = None) -> Generator[None]:
-    """Holds the lock of a folder. wait: until another process gives it back; else that is an error.
-    lock: a file that is made for this and stands for the folder.
+    """Holds the lock of a folder during the block.
+
+    wait: whether to wait until another process releases the lock; False: raise BlockingIOError.
+    lock: a file that is made and locked instead of the folder.
     """
     try:
         import fcntl
@@ -447,11 +461,11 @@ def _naming(path: Path, temporary: Path) -> Generator[None]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Checks that a file, or a folder with all above it, can be made, to be asked before the work
-    begins.
+    """Checks that a file can be made, or a folder with its parents. Call it before the work begins.
 
-    Tried, because permissions do not tell of full, read-only and network disks. Raises: OSError,
-    naming `path`.
+    It makes a temporary file, because permissions do not tell of full, read-only and network disks.
+
+    Raises: OSError, which names `path`.
     """
     path = Path(path)
     place = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
@@ -464,15 +478,16 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 
 def _tag() -> str:
-    """Returns what makes a temporary name unique."""
+    """Returns a part of a temporary name that is unique: machine, process id and random digits."""
     return f"{MACHINE}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
 
 
 @functools.cache
 def _sweep(parent: Path) -> None:
-    """Remove what killed processes left in a folder.
+    """Removes the temporary files that killed processes left in a folder, and puts old folders
+    back.
 
-    Once per process: folders may have very many files.
+    It runs once per process and folder, because folders may have very many files.
     """
     with contextlib.suppress(OSError):  # another process sweeps too, or the folder cannot be listed
         for entry in list(parent.iterdir()):
@@ -487,7 +502,9 @@ def _sweep(parent: Path) -> None:
 
 
 def _abandoned(path: Path, machine: str, pid: int) -> bool:
-    """Says whether nobody writes a temporary file any more."""
+    """Says whether no process writes a temporary file any more. False if the file does not
+    exist.
+    """
     try:
         age = time.time() - path.stat().st_mtime
     except FileNotFoundError:
@@ -496,7 +513,7 @@ def _abandoned(path: Path, machine: str, pid: int) -> bool:
 
 
 def _runs(pid: int) -> bool:
-    """Says whether a process of this machine runs."""
+    """Says whether a process with this id runs on this machine."""
     try:
         if os.name == "posix":  # elsewhere it would end the process
             os.kill(pid, 0)

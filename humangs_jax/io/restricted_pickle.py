@@ -1,13 +1,14 @@
-"""Pickles of arrays, without running anything in them.
+"""Reads pickles of arrays without running anything that they contain.
 
 A pickle is a program: it names functions and classes, and calls them. `RestrictedUnpickler` is
-Python's own unpickler, which finds no name but those of a table of inert stand-ins. Before it gets
-an instruction, `_Looked` has had one look at it: an instruction that no pickle of arrays has, a
-number or an index larger than files need, and tuples within tuples as the key of a dict are
-refused. So loading takes no more than the file can hold.
+Python's own unpickler, but the only names that it finds are those of a table, and they stand for
+inert stand-ins. `_Looked` looks at each instruction before the unpickler gets it. It refuses an
+instruction that no pickle of arrays has, a number or an index larger than files need, and a dict
+whose key is made of tuples within tuples. So loading takes no more memory than the file can hold.
 
 For body models and motions the table has numpy's arrays, scipy's sparse matrices and chumpy's
-arrays. numpy itself sees a type and bytes in the end, when `as_array` makes an array of numbers.
+arrays. numpy itself gets a type and bytes only in the end, when `as_array` makes an array of
+numbers.
 """
 
 import io
@@ -29,13 +30,17 @@ REFUSED = {
 }
 """Instructions that no pickle of arrays has."""
 LARGEST_INTEGER = 1 << 64
-"""Integers below it; greater ones can be chosen so that a dict becomes very slow."""
+"""Integers of a pickle must be smaller than this. Greater ones can be chosen so that a dict becomes
+very slow.
+"""
 LARGEST_KEY = 256
-"""Values that the key of a dict may be made of: the key is hashed, all of it."""
+"""Largest number of values that the key of a dict may be made of, because all of them are hashed.
+"""
 COUNTED = 1 << 30
-"""Values are counted up to here: tuples within tuples can stand for any number of them."""
+"""Counts of values stop here, because tuples within tuples can stand for any number of values."""
 LONGEST_LIST = 1 << 24
-"""Numbers in a nested list; the same list may stand in others many times."""
+"""Largest count of numbers in a nested list. A list counts each time that it stands in another one.
+"""
 
 
 # Instructions
@@ -43,11 +48,11 @@ LONGEST_LIST = 1 << 24
 
 
 class _Looked:
-    """A file of pickles whose instructions are looked at before they are handed out.
+    """A file of pickles that checks each instruction before it hands the instruction out.
 
     A look ends behind a BUILD, where joblib writes the bytes of an array, or at the end of the
-    pickle. `stack` and `memo` stand for those of the unpickler: for each of their values they have
-    the count of values that it was made of, or None for a mark.
+    pickle. `stack` and `memo` mirror the stack and the memo of the unpickler. For each value they
+    hold the count of values that it was made of; the stack holds None for a mark.
     """
 
     def __init__(self, file: Any):
@@ -57,7 +62,7 @@ class _Looked:
         self.memo: dict[int, int] = {}
 
     def read(self, count: int) -> bytes:
-        """Reads the next bytes, after they were checked."""
+        """Returns the next `count` bytes, after checking the instructions in them."""
         # a frame is handed out as a whole: it may have several looks in it
         while self.file.tell() + count > self.seen:
             self.look()
@@ -76,10 +81,10 @@ class _Looked:
         return data
 
     def look(self) -> None:
-        """Looks at the instructions behind those that have been seen.
+        """Checks the instructions that follow the last checked one, up to a BUILD or STOP.
 
-        Raises: InvalidFileError; ValueError, from `pickletools`, for what is no instruction or is
-        cut off.
+        Raises: InvalidFileError for a refused instruction; ValueError, from `pickletools`, for
+        bytes that are no instruction or are cut off.
         """
         here = self.file.tell()
         self.file.seek(self.seen)
@@ -106,7 +111,12 @@ class _Looked:
         self.file.seek(here)
 
     def follow(self, opcode: Any, argument: Any) -> None:
-        """Does to `stack` and `memo` what an instruction does to those of the unpickler."""
+        """Changes `stack` and `memo` as an instruction changes the stack and the memo of the
+        unpickler.
+
+        Raises: InvalidFileError for an index of the memo without a value, for an instruction that
+        takes more from the stack than there is, and for a dict with large keys.
+        """
         name, stack = opcode.name, self.stack
         if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
             index = argument
@@ -158,12 +168,12 @@ class _Looked:
 
 
 class Call(NamedTuple):
-    """What a name of a pickle may stand for: a function of this module, with no way to change
-    it.
+    """A function of this module that a name of a pickle may stand for. A pickle cannot change the
+    function.
     """
 
     function: Callable[..., Any]
-    """It is called with arguments of the file."""
+    """The function, which is called with arguments from the file."""
 
     def __call__(self, *arguments: Any) -> Any:
         """Returns what the function returns."""
@@ -178,22 +188,25 @@ class Named(NamedTuple):
 
 
 class StandIn:
-    """An object of a pickle whose class is not loaded; its state as a dict.
+    """An object of a pickle whose class is not loaded. `state` holds its state as a dict.
 
-    A pickle cannot change the class itself: it has `__setstate__`, which takes an object.
+    A pickle cannot change the class itself, because BUILD calls `__setstate__`, which needs an
+    object.
     """
 
     def __init__(self, *_: Any) -> None:
         self.state: dict[str, Any] = {}
 
     def __new__(cls, *_: Any) -> Any:  # not Self: beartype in tests checks functions, not classes
-        """Makes an object whose state is empty: a pickle may make it without `__init__`."""
+        """Makes an object with an empty state, because a pickle may make objects without
+        `__init__`.
+        """
         made = super().__new__(cls)
         made.state = {}
         return made
 
     def __setstate__(self, state: Any) -> None:
-        """Takes what BUILD hands over: a dict, or a pair of dicts."""
+        """Updates `state` by what BUILD hands over: a dict, or a tuple whose dicts are taken."""
         parts = state if isinstance(state, tuple) else (state,)
         for part in parts:
             if isinstance(part, dict):
@@ -201,19 +214,19 @@ class StandIn:
 
 
 class PlainDict(dict):
-    """A dict of a class that is not loaded, whose attributes are of no use."""
+    """A dict that stands for a dict of a class that is not loaded. It ignores attributes."""
 
     __slots__ = ()
 
     def __setstate__(self, state: Any) -> None:
-        """Leaves the attributes out."""
+        """Ignores the attributes of the dict."""
 
 
 class RestrictedUnpickler(pickle.Unpickler):
-    """Reads one pickle of a file, from where it stands.
+    """Reads one pickle of a file, from the file's current position.
 
-    names: what each (module, name) of a pickle stands for; what is in no table is refused. purpose:
-    ends the message of a refusal. Strings of Python 2 are taken for latin1.
+    names: the stand-in for each (module, name) of a pickle. A name that is not in the table is
+    refused. purpose: ends the message of a refusal. Strings of Python 2 are read as latin1.
     """
 
     def __init__(self, file: Any, names: Mapping[tuple[str, str], Any], purpose: str):
@@ -221,7 +234,10 @@ class RestrictedUnpickler(pickle.Unpickler):
         super().__init__(self.looked, encoding="latin1")
 
     def find_class(self, module: str, name: str) -> Any:
-        """Returns the stand-in for a name."""
+        """Returns the stand-in for a name of a module.
+
+        Raises: InvalidFileError if the table has no such name.
+        """
         key = module, name
         if module.startswith("scipy.sparse"):  # its classes have moved between modules
             key = "scipy.sparse", name
@@ -235,7 +251,10 @@ class RestrictedUnpickler(pickle.Unpickler):
         return found
 
     def persistent_load(self, pid: Any) -> Any:
-        """Refuses persistent objects: only torch's files have them."""
+        """Refuses persistent objects, which no pickle of arrays has.
+
+        Raises: InvalidFileError.
+        """
         raise InvalidFileError("refused to load a persistent object")
 
 
@@ -244,7 +263,9 @@ class RestrictedUnpickler(pickle.Unpickler):
 
 
 class _Dtype(StandIn):
-    """A type of numbers or strings; `dtype` is None for every other one (objects, records)."""
+    """A numpy type. `dtype` is that type for numbers or strings, and None for others (objects,
+    records).
+    """
 
     def __setstate__(self, state: Any) -> None:
         self.state["parts"] = state if isinstance(state, tuple) else ()
@@ -275,7 +296,7 @@ def _dtype(code: Any = "", *_: Any) -> "_Dtype":
 
 
 class _Array(StandIn):
-    """An array that numpy has not seen: a type, a shape and bytes."""
+    """An array as a type, a shape and bytes, before numpy has seen it."""
 
     def __setstate__(self, state: Any) -> None:
         if isinstance(state, tuple) and len(state) == 5:
@@ -316,7 +337,9 @@ def _made_array(shape: Any, dtype: Any, columns_first: Any, data: Any) -> "_Arra
 
 
 def _scalar(dtype: Any, data: Any = b"") -> Any:
-    """Returns one number. An integer is Python's, as it may be the key of a dict."""
+    """Returns one number: an int for an integer, because it may be the key of a dict, else an
+    `_Array`.
+    """
     array = _made_array((), dtype, False, data)
     plain = dtype.dtype if isinstance(dtype, _Dtype) else None
     if plain is not None and plain.kind in "iu":
@@ -325,12 +348,14 @@ def _scalar(dtype: Any, data: Any = b"") -> Any:
 
 
 class _Joblib(_Array):
-    """What joblib writes for an array, whose bytes follow it in the file: behind a count of others
-    that align them, or none.
+    """An array as joblib writes it. The bytes of the array follow the object in the file.
+
+    Some versions of joblib write padding before these bytes: one byte with the length of the
+    padding, then the padding.
     """
 
     looked: _Looked
-    """The file, of the class that `find_class` makes."""
+    """The file that the bytes are read from. `find_class` makes a subclass that holds it."""
 
     def __setstate__(self, state: Any) -> None:
         if not isinstance(state, dict):
@@ -357,9 +382,11 @@ def _encode(text: Any = "", encoding: Any = "latin1", *_: Any) -> str:
 
 
 def _numbers(value: Any) -> np.ndarray:
-    """Returns a part of a sparse or chumpy array as numbers.
+    """Returns the numbers of an `_Array`, which is a part of a sparse or chumpy array.
 
-    Never one of these again: shared ones could be nested to any size.
+    Sparse and chumpy arrays are refused as parts, because shared ones could be nested to any size.
+
+    Raises: ValueError for anything but an `_Array`.
     """
     if not isinstance(value, _Array):
         raise ValueError(f"expected an array, got {type(value).__name__}")
@@ -367,8 +394,8 @@ def _numbers(value: Any) -> np.ndarray:
 
 
 class _Sparse(StandIn):
-    """A matrix by the coordinates of its entries, or compressed along one axis, whose entries are
-    counted.
+    """A sparse matrix. Its entries are given by coordinates, or are compressed along `axis`, which
+    then has index pointers that count the entries.
     """
 
     axis: int | None = None
@@ -428,14 +455,14 @@ class _SparseColumns(_Sparse):
 
 
 class _Chumpy(StandIn):
-    """An array of chumpy."""
+    """A chumpy array, which holds its numbers as `x`."""
 
     def to_array(self) -> np.ndarray:
         return _numbers(self.state["x"])
 
 
 class _ChumpySelection(StandIn):
-    """Some of the numbers of an array of chumpy."""
+    """A chumpy array of some of the numbers of another array."""
 
     def to_array(self) -> np.ndarray:
         if isinstance(self.state["a"], _Chumpy):
@@ -482,15 +509,18 @@ NAMES: dict[tuple[str, str], Any] = {
 
 
 def _instance(cls: Any) -> StandIn:
-    """Makes a stand-in of one of the classes of this module."""
+    """Makes an object of a subclass of `StandIn`.
+
+    Raises: InvalidFileError for any other class.
+    """
     if not isinstance(cls, type) or not issubclass(cls, StandIn):
         raise InvalidFileError("refused to make an object of another class")
     return cls()
 
 
 def objects(value: Any) -> Any:
-    """Returns the list in an array of Python objects, or the only object in it; everything else
-    as it is.
+    """Returns the list in an array of Python objects, or the only object of an array without axes.
+    Any other value is returned unchanged.
     """
     held = None
     if isinstance(value, _Array):
@@ -503,8 +533,12 @@ def objects(value: Any) -> Any:
 
 
 def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    """Makes an array of the machine's byte order of bytes of a file, which may hold what numpy
-    itself never writes.
+    """Returns an array in the machine's byte order, made from bytes of a file.
+
+    The bytes may hold what numpy itself never writes: any byte of a boolean other than 0 becomes
+    True.
+
+    Raises: InvalidFileError for strings with characters that do not exist.
     """
     if dtype.itemsize:
         array = np.frombuffer(data, dtype).reshape(shape)
@@ -523,8 +557,8 @@ def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarra
 
 
 def as_array(value: Any) -> np.ndarray:
-    """Makes a full array of what `read_pickle` returned: array, number, list of numbers or stand-in
-    (with a method `to_array`).
+    """Returns a full array of a value from `read_pickle`: an array, a number, a list of numbers, or
+    a stand-in with a method `to_array`.
 
     Raises: ValueError for anything else.
     """
@@ -547,8 +581,11 @@ def as_array(value: Any) -> np.ndarray:
 
 
 def _check_leaves(value: Any) -> None:
-    """Refuses lists that are large, deep or hold other things than numbers; in pickles one list may
-    stand in many places.
+    """Checks that nested lists are not too large or too deep, and hold only numbers and arrays.
+
+    In a pickle one list may stand in many places, so a small file can hold a huge nested list.
+
+    Raises: ValueError.
     """
     waiting, left = [(value, 0)], LONGEST_LIST
     while waiting:
@@ -567,11 +604,10 @@ def _check_leaves(value: Any) -> None:
 
 
 def read_pickle(path: str | Path) -> dict[str, Any]:
-    """Reads the dict in a pickle (of Python 2 or 3); its arrays are still to be passed through
-    `as_array`.
+    """Returns the dict in a pickle of Python 2 or 3. Pass its arrays through `as_array`.
 
-    Raises: FileNotFoundError; FileError, naming the file, if it is no pickle of a dict or names
-    anything that arrays do not need.
+    Raises: FileNotFoundError; FileError, which names the file, if it is no pickle of a dict or
+    names anything that arrays do not need.
     """
     with reading(path, "pickle"):
         data = io.BytesIO(read_bytes(path, "array_bytes"))

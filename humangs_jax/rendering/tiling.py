@@ -1,29 +1,29 @@
-"""Tiles: which splats (or triangles) touch which square of pixels, one list per tile in one buffer
-of fixed size.
+"""Tiles: finds which splats (or triangles) touch which square of pixels, and keeps one list per
+tile in one buffer of fixed size.
 
-A rasterizer uses it in five steps, all with static shapes and none of them differentiated:
+A rasterizer takes five steps. All have static shapes, and none is differentiated:
 
-1. `expand` the counts of the tiles that each item touches: slot -> item (or item -> rows of tiles
-   -> tiles: `emit_pairs`).
-2. `sort_into_tiles`: the (tile, item) pairs by tile, and by item inside a tile. Number the items by
-   depth first (`depth_order`) and every list runs front to back.
-3. `blocks_by_length`: tiles by falling list length, so that a block of consecutive ones has lists
-   of about the same length, and empty tiles come last and are never visited.
-4. its own loop over blocks, and over chunks of their lists; pixels of a tile are one axis of
-   `tile_size`^2 values, row by row, at `grid.offsets` from the tile's centre.
-5. `tiles_to_image`.
+1. `expand` the counts of the tiles that each item touches: slot -> item. Splats take two such
+   steps, item -> rows of tiles -> tiles (`emit_pairs`).
+2. `sort_into_tiles` sorts the (tile, item) pairs by tile, and by item inside a tile. Number the
+   items by depth first (`depth_order`), and every list runs front to back.
+3. `blocks_by_length` orders tiles by falling list length. A block of consecutive tiles then has
+   lists of about the same length, and empty tiles come last and are never visited.
+4. The rasterizer loops over blocks and over chunks of their lists. The pixels of a tile are one
+   axis of `tile_size`^2 values, row by row, at `grid.offsets` from the tile's centre.
+5. `tiles_to_image` puts the image together.
 
 What does not fit in a buffer is counted: `Expansion.needed` is exact whatever the capacity. Where
-the last row and column of tiles reach beyond the image, those pixels are cut off.
+the last row and column of tiles reach beyond the image, the pixels outside are cut off.
 
 A splat's footprint is the ellipse d^T cov2d^-1 d <= reach around its centre, outside of which alpha
-< alpha_min. It meets a tile if it meets the rectangle spanned by the tile's pixel centres. With D
-the determinant of cov2d, the ellipse at height dy above its centre spans
+< alpha_min. The footprint meets a tile if it meets the rectangle spanned by the tile's pixel
+centres. With D the determinant of cov2d, the ellipse at height dy above its centre spans
 
-    dx = (xy / yy) dy -+ sqrt(D / yy (reach - dy^2 / yy)),     |dy| <= sqrt(reach yy),
+    dx = (xy / yy) dy -+ sqrt(D / yy (reach - dy^2 / yy)),     |dy| <= sqrt(reach yy).
 
-so inside one row of tiles it reaches farthest right at dy = xy sqrt(reach / xx), clamped to the
-row, and farthest left at the opposite point.
+So inside one row of tiles the ellipse reaches farthest right at dy = xy sqrt(reach / xx), clamped
+to the row, and farthest left at the opposite point.
 """
 
 import dataclasses
@@ -38,8 +38,8 @@ from humangs_jax.rendering.projection import ProjectedGaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, SplatConfig
 
 SUM_LIMIT = 1 << 30
-"""Running sums stop here instead of wrapping past 2^31: far above any buffer, so a sum there only
-says "too many".
+"""Running sums stop here instead of wrapping past 2^31. The limit is far above any buffer, so a sum
+of this size only says "too many".
 """
 
 _ROW = 64
@@ -47,13 +47,15 @@ _ROW = 64
 
 
 Size = Any
-"""An integer, or where only counts are asked for an array of JAX without axes."""
+"""An integer; where only counts are computed, also an array of JAX without axes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TileGrid:
-    """An image cut into squares of `tile_size` pixels, numbered row by row. Static (hashable),
-    except for `count_pairs`, which takes traced sizes, too: one program counts for all of them.
+    """An image cut into squares of `tile_size` pixels, numbered row by row.
+
+    A grid is static (hashable). Only `count_pairs` also takes a grid of traced sizes, so that one
+    program counts for all sizes.
     """
 
     width: Size
@@ -65,26 +67,27 @@ class TileGrid:
 
     @property
     def columns(self) -> Size:
-        """Tiles per row of tiles."""
+        """Number of tiles in a row of tiles."""
         return -(-self.width // self.tile_size)
 
     @property
     def rows(self) -> Size:
-        """Rows of tiles."""
+        """Number of rows of tiles."""
         return -(-self.height // self.tile_size)
 
     @property
     def tiles(self) -> Size:
-        """Number of tiles; also the tile number of "no tile"."""
+        """Number of tiles. It is also the tile number that means "no tile"."""
         return self.columns * self.rows
 
     @property
     def pixels(self) -> int:
-        """Pixels per tile."""
+        """Number of pixels in a tile."""
         return self.tile_size**2
 
     def offsets(self, dtype: np.dtype | type = np.float32) -> np.ndarray:
-        """Gives x and y of a tile's pixel centres, (2, pixels), relative to the tile's centre.
+        """Returns x and y of a tile's pixel centres, (2, pixels), relative to the tile's centre,
+        pixels.
 
         Such small numbers keep the moments of the backward pass accurate.
         """
@@ -99,9 +102,11 @@ class Expansion(NamedTuple):
     """Slots divided among items, item by item."""
 
     source: Int[Array, " capacity"]
-    """Item of each slot, (capacity,); of slots >= `needed`, the last item."""
+    """Item of each slot, (capacity,). Slots from `needed` on have the last item."""
     first: Int[Array, " n"]
-    """First slot of each item, (n,), so that slot - first[source] counts the slots of one item."""
+    """First slot of each item, (n,). The difference slot - first[source] numbers the slots of one
+    item from 0.
+    """
     needed: Int[Array, ""]
     """Number of slots that were asked for, even beyond the capacity (saturates at `SUM_LIMIT`).
     Slot s is used if s < needed.
@@ -109,34 +114,36 @@ class Expansion(NamedTuple):
 
 
 class TileLists(NamedTuple):
-    """A list of items for each tile: items[starts[t] : starts[t] + counts[t]], ascending."""
+    """A list of items for each tile. Tile t has items[starts[t] : starts[t] + counts[t]],
+    ascending.
+    """
 
     items: Int[Array, " capacity"]
     """The items of all lists, (capacity,)."""
     starts: Int[Array, " t"]
-    """Place of each tile's first item in `items`, (t,)."""
+    """Index in `items` of each tile's first item, (t,)."""
     counts: Int[Array, " t"]
     """Length of each tile's list, (t,)."""
 
 
 class TileBlocks(NamedTuple):
-    """Tiles by falling list length, padded to whole blocks."""
+    """Tile numbers ordered by falling list length, padded to whole blocks."""
 
     tiles: Int[Array, " t_padded"]
     """Tile numbers, (blocks * block,). The padding has the number "no tile" (t), which is out of
-    bounds on purpose: gather with a fill value, scatter with mode="drop".
+    bounds on purpose. Gather with a fill value, and scatter with mode="drop".
     """
     used: Int[Array, ""]
-    """How many blocks hold a tile whose list is not empty."""
+    """Number of blocks that hold a tile whose list is not empty."""
 
 
 def cumsum(x: Int[Array, " n"]) -> Int[Array, " n"]:
     """Returns the inclusive running sum of int32 numbers >= 0, saturating at `SUM_LIMIT`.
 
-    Any 64 consecutive ones must sum to less than 2^24. Three levels: rows of 64 by a triangular
-    matrix product, rows of 64 of their totals by another, and the few numbers left by comparing
-    all with all. It is faster than `jnp.cumsum` on a CPU, does not wrap, and does not have
-    logarithmically many steps to compile.
+    Any 64 consecutive numbers must sum to less than 2^24. There are three levels: rows of 64
+    numbers are summed by a product with a triangular matrix, rows of 64 of their totals by another
+    product, and the few totals left by comparing all with all. This is faster than `jnp.cumsum` on
+    a CPU, does not wrap, and does not have logarithmically many steps to compile.
     """
     n = x.shape[0]
     within = _sums_in_rows(_in_rows(x))
@@ -169,9 +176,9 @@ def _sums_in_rows(rows: Int[Array, "rows 64"]) -> Int[Array, "rows 64"]:
 
 
 def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
-    """Divides `capacity` slots: item i takes the next counts[i] >= 0 of them.
+    """Returns which item owns each of `capacity` slots: item i takes the next counts[i] >= 0 slots.
 
-    For the counts, the limits of `cumsum` hold.
+    The counts must keep the limits of `cumsum`.
     """
     if counts.shape[0] == 0:
         return Expansion(jnp.zeros(capacity, jnp.int32), counts, jnp.zeros((), jnp.int32))
@@ -183,12 +190,12 @@ def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
 def owners(
     first: Int[Array, " n"], size: int, start: Int[Array, ""] | int = 0
 ) -> Int[Array, " size"]:
-    """Returns which item owns each of the slots start .. start + size, if item i owns those from
-    first[i] to first[i + 1].
+    """Returns the item that owns each of the slots start .. start + size - 1, (size,). Item i owns
+    the slots from first[i] up to, but without, first[i + 1].
 
-    As many items begin at or before a slot as the running sum of marks says, and the last of them
-    owns the slot: items without slots begin together with the next one that has any. (Exact below
-    2^24 items, see `cumsum`.)
+    A running sum counts the items that begin at or before a slot, and the last of these items owns
+    the slot. Items without slots begin together with the next item that has any. The result is
+    exact below 2^24 items, see `cumsum`.
     """
     marks = jnp.zeros(size, jnp.int32).at[jnp.maximum(first - start, 0)].add(1, mode="drop")
     return _materialized(cumsum(marks) - 1)
@@ -197,8 +204,8 @@ def owners(
 def take(
     table: Shaped[Array, "n *rest"], indices: Int[Array, " slots"]
 ) -> Shaped[Array, "slots *rest"]:
-    """Takes rows of a table at indices that are known to be in range: no clamping, no wrapping of
-    negative ones.
+    """Returns rows of a table at indices that must be in range. They are not clamped, and negative
+    ones do not wrap.
     """
     return (
         _materialized(table).at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
@@ -206,23 +213,25 @@ def take(
 
 
 def _materialized(array: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
-    """Stores numbers before they are used.
+    """Returns the array, stored in memory before it is used.
 
-    XLA's CPU backend would evaluate the expression behind a table anew for each number that a
-    gather takes from it. It respects the barrier where a program is compiled with
+    Without this, XLA's CPU backend would evaluate the expression behind a table anew for each
+    number that a gather takes from it. XLA respects the barrier where a program is compiled with
     `core.processes.compiler_options`.
     """
     return lax.optimization_barrier(array)
 
 
 def _bits_for(count: int) -> int:
-    """Counts the bits that hold the numbers 0 .. count - 1 (at least one)."""
+    """Returns the number of bits that hold the numbers 0 .. count - 1 (at least one)."""
     return max(1, (count - 1).bit_length())
 
 
 def sort_keys(keys: UInt[Array, " n"]) -> UInt[Array, " n"]:
-    """Sorts keys, ascending. Equal keys are identical, so a sort need not be stable; XLA's stable
-    sort is a third faster on CPUs, and elsewhere has to carry the positions along.
+    """Returns keys in ascending order.
+
+    Equal keys are identical, so the sort need not be stable. XLA's stable sort is used on CPUs,
+    where it is a third faster; elsewhere it would have to carry the positions along.
     """
     return lax.platform_dependent(
         keys, cpu=jnp.sort, default=lambda keys: lax.sort(keys, is_stable=False)
@@ -232,11 +241,12 @@ def sort_keys(keys: UInt[Array, " n"]) -> UInt[Array, " n"]:
 def sort_into_tiles(
     tiles: Int[Array, " capacity"], items: Int[Array, " capacity"], tile_count: int, item_count: int
 ) -> TileLists:
-    """Sorts pairs (tile, item) into lists by tile, ascending by item. Pairs of tile `tile_count`
-    ("no tile") are left out.
+    """Sorts pairs (tile, item) into one list per tile, ascending by item. Pairs of tile
+    `tile_count` ("no tile") are left out.
 
-    One sort of one uint32 where the tile number and the item number fit it together (sorting a key
-    with a payload costs several times as much); otherwise a sort by two keys.
+    If the tile number and the item number fit together in a uint32, one sort of such keys is enough
+    (sorting a key with a payload costs several times as much). Otherwise the pairs are sorted by
+    two keys.
     """
     bits = _bits_for(item_count)
     if (tile_count + 1) << bits <= 1 << 32:
@@ -250,8 +260,10 @@ def sort_into_tiles(
 
 
 def blocks_by_length(counts: Int[Array, " t"], block: int) -> TileBlocks:
-    """Puts tiles into blocks of `block`, by falling list length; equal ones, and ones too long for
-    the key, by number.
+    """Puts tiles into blocks of `block` tiles, by falling list length.
+
+    Tiles with lists of the same length, and tiles with lists too long for the sort key, are ordered
+    by their number.
     """
     t = counts.shape[0]
     bits = _bits_for(t)
@@ -266,7 +278,9 @@ def blocks_by_length(counts: Int[Array, " t"], block: int) -> TileBlocks:
 
 
 def tiles_to_image(tiles: Float[Array, "t c p"], grid: TileGrid) -> Float[Array, "h w c"]:
-    """Puts the pixels of all tiles together; pixels beyond the image are cut off."""
+    """Returns the image (h, w, c) of all tiles' pixels (t, c, p). Pixels beyond the image are cut
+    off.
+    """
     size, c = grid.tile_size, tiles.shape[1]
     image = tiles.reshape(grid.rows, grid.columns, c, size, size).transpose(0, 3, 1, 4, 2)
     return image.reshape(grid.rows * size, grid.columns * size, c)[: grid.height, : grid.width]
@@ -277,8 +291,8 @@ def tiles_to_image(tiles: Float[Array, "t c p"], grid: TileGrid) -> Float[Array,
 
 
 SLACK = 2e-3
-"""Pixels by which footprints are widened, against rounding of positions (a float32 at 1000 pixels
-has 6e-5).
+"""Pixels by which footprints are widened, so that rounding of positions loses no tile (at 1000
+pixels, a float32 has steps of 6e-5).
 """
 
 
@@ -301,14 +315,16 @@ class Footprints(NamedTuple):
     """d^T cov2d^-1 d on the border of the ellipse, (g,); 0 where nothing is drawn."""
 
     def rows(self, grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
-        """Returns the first row of tiles of each splat, and how many."""
+        """Returns the first row of tiles that each splat touches, (g,), and how many rows it
+        touches, (g,).
+        """
         half = jnp.sqrt(self.reach * self.yy)
         row0 = _first(self.y - half, grid.tile_size, grid.rows)
         row1 = _last(self.y + half, grid.tile_size, grid.rows)
         return row0, jnp.where(self.reach > 0, jnp.maximum(row1 - row0 + 1, 0), 0)
 
     def half_sides(self) -> Float[Array, "g 2"]:
-        """Returns half the width and height of each, pixels."""
+        """Returns half the width and half the height of each footprint, (g, 2), pixels."""
         return jnp.sqrt(self.reach[:, None] * jnp.stack([self.xx, self.yy], axis=-1))
 
     def bands(self) -> "_Bands":
@@ -327,7 +343,9 @@ class Footprints(NamedTuple):
 
 
 class _Bands(NamedTuple):
-    """What a row of tiles needs of an ellipse, planes of (g,)."""
+    """The numbers of each ellipse that its span within a row of tiles is computed from, planes of
+    (g,).
+    """
 
     x: Float[Array, " g"]
     """x of the centre, pixels."""
@@ -338,18 +356,20 @@ class _Bands(NamedTuple):
     tip: Float[Array, " g"]
     """How high above the centre the rightmost point is, pixels."""
     slope: Float[Array, " g"]
-    """xy / yy."""
+    """xy / yy, no unit."""
     ratio: Float[Array, " g"]
-    """D / yy, pixels^2."""
+    """D / yy, the determinant of the covariance over its yy, pixels^2."""
     inverse: Float[Array, " g"]
-    """1 / yy, 1 / pixels^2."""
+    """1 / yy, pixels^-2."""
     reach: Float[Array, " g"]
-    """The squared reach."""
+    """d^T cov2d^-1 d on the border of the ellipse."""
 
     def columns(
         self, row: Int[Array, " g"], grid: TileGrid
     ) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
-        """Returns the first and last tile of each ellipse within one row of tiles."""
+        """Returns the first and last tile column that each ellipse touches within row `row`, (g,)
+        each.
+        """
         size = grid.tile_size
         top = jnp.maximum(row * size + 0.5 - SLACK - self.y, -self.height)
         bottom = jnp.minimum((row + 1) * size - 0.5 + SLACK - self.y, self.height)
@@ -364,8 +384,8 @@ class _Bands(NamedTuple):
 
 
 class Squares(NamedTuple):
-    """INRIA's footprints, planes of (g,): the tiles that meet a square, as its rasterizer counts
-    them.
+    """Footprints as squares, planes of (g,). A splat touches the tiles that INRIA's rasterizer
+    counts for it.
     """
 
     x: Float[Array, " g"]
@@ -373,15 +393,17 @@ class Squares(NamedTuple):
     y: Float[Array, " g"]
     """y of the centres, (g,), pixels."""
     radius: Float[Array, " g"]
-    """Half a side, (g,), whole pixels; 0 where nothing is drawn."""
+    """Half a side of the square, (g,), whole pixels; 0 where nothing is drawn."""
 
     def rows(self, grid: TileGrid) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
-        """Returns the first row of tiles of each splat, and how many."""
+        """Returns the first row of tiles that each splat touches, (g,), and how many rows it
+        touches, (g,).
+        """
         first, last = self._range(self.y, grid.tile_size, grid.rows)
         return first, jnp.where(self.radius > 0, jnp.maximum(last - first + 1, 0), 0)
 
     def half_sides(self) -> Float[Array, "g 2"]:
-        """Returns half the sides of each, pixels."""
+        """Returns half the width and half the height of each square, (g, 2), pixels."""
         return jnp.stack([self.radius, self.radius], axis=-1)
 
     def bands(self) -> "Squares":
@@ -390,7 +412,9 @@ class Squares(NamedTuple):
     def columns(
         self, row: Int[Array, " g"], grid: TileGrid
     ) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
-        """Returns the first and last tile of each square, the same in all its rows."""
+        """Returns the first and last tile column of each square, (g,) each. They are the same in
+        all rows.
+        """
         return self._range(self.x, grid.tile_size, grid.columns)
 
     def _range(self, center: Array, size: int, tiles: Size) -> tuple[Array, Array]:
@@ -402,24 +426,25 @@ class Squares(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """(tile, splat) pairs, splat by splat."""
+    """(tile, splat) pairs, ordered by splat."""
 
     tiles: Int[Array, " capacity"]
     """Tile of each pair, (capacity,); unused pairs have the tile number "no tile"."""
     splats: Int[Array, " capacity"]
     """Splat of each pair, (capacity,)."""
     needed: Int[Array, ""]
-    """How many pairs there are in all."""
+    """Number of pairs that the scene has in all."""
     overflow: Int[Array, ""]
-    """How many of them are missing here."""
+    """Number of pairs that did not fit and are missing here."""
 
 
 def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
-    """Returns the stable order of positive depths, nearest first.
+    """Returns the stable order of positive depths, (g,), nearest first.
 
-    float32: radix passes, each a sort of ONE uint32 (digit of the depth, then position), which
-    XLA's CPU backend does four times as fast as an argsort. The bits of positive floats are ordered
-    like the floats.
+    float32 depths are sorted in radix passes. Each pass sorts single uint32 keys (a digit of the
+    depth, then the position), which XLA's CPU backend does four times as fast as an argsort. This
+    works because the bits of positive floats are ordered like the floats. Other types take an
+    argsort.
     """
     g = depths.shape[0]
     if depths.dtype != jnp.float32:
@@ -437,10 +462,10 @@ def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
 def squared_reach(
     opacities: Float[Array, " g"], alpha_min: float = ALPHA_MIN
 ) -> Float[Array, " g"]:
-    """Returns the d^T cov2d^-1 d at which a splat's alpha falls to `alpha_min`; 0 if it starts
-    below.
+    """Returns the d^T cov2d^-1 d, (g,), at which a splat's alpha falls to `alpha_min`. It is 0 for
+    a splat whose opacity is not above `alpha_min`.
 
-    No gradient.
+    No gradient passes.
     """
     opacities = lax.stop_gradient(opacities)
     seen = opacities > alpha_min
@@ -448,7 +473,7 @@ def squared_reach(
 
 
 def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Footprints:
-    """Returns ellipses of the visible splats, a little widened against rounding; the others get
+    """Returns the ellipses of all splats, a little widened against rounding. Invisible splats get
     reach 0.
     """
     # a little more, against rounding of alpha at its threshold
@@ -460,8 +485,8 @@ def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Foot
 def _square_footprints(
     projected: ProjectedGaussians, reach: Float[Array, " g"], radius_sigma: float
 ) -> Squares:
-    """Returns squares of `radius_sigma` times the larger standard deviation, rounded up to pixels,
-    where reach is positive.
+    """Returns squares around the splats. Half a side is `radius_sigma` times the larger standard
+    deviation, rounded up to pixels, or 0 where the splat is invisible or its reach is 0.
     """
     p = lax.stop_gradient(projected)
     middle = 0.5 * (p.xx + p.yy)
@@ -474,8 +499,10 @@ def _square_footprints(
 def footprints_by(
     projected: ProjectedGaussians, opacities: Float[Array, " g"], config: SplatConfig
 ) -> Footprints | Squares:
-    """Returns the footprints that a configuration asks for: ellipses that end at `alpha_min` or
-    `radius_sigma`, or squares.
+    """Returns the footprints that a configuration asks for.
+
+    These are ellipses that end at `alpha_min`, or at `radius_sigma` standard deviations if that is
+    nearer, or squares.
     """
     reach = squared_reach(opacities, config.alpha_min)
     if config.radius_sigma is None:
@@ -488,9 +515,10 @@ def footprints_by(
 def radii_on_image(
     footprints: Footprints | Squares, width: int, height: int
 ) -> Float[Array, "g 2"]:
-    """Returns half the sides of the footprints in pixels, 0 for those that lie beside the image.
+    """Returns half the sides of the footprints, (g, 2), pixels; 0 for footprints that lie beside
+    the image.
 
-    No gradient.
+    Footprints carry no gradient.
     """
     half = footprints.half_sides()
     center = jnp.stack([footprints.x, footprints.y], axis=-1)
@@ -502,8 +530,8 @@ def radii_on_image(
 def count_pairs(
     footprints: Footprints | Squares, grid: TileGrid
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Counts the (rows, pairs) that `emit_pairs` needs, without any buffer; both saturate at
-    `SUM_LIMIT`.
+    """Returns the numbers of rows and pairs that `emit_pairs` needs, without making any buffer.
+    Both saturate at `SUM_LIMIT`.
     """
     _, counts = footprints.rows(grid)
     return _saturating_sum(counts), _count_row_by_row(footprints, grid, jnp.max(counts, initial=0))
@@ -512,8 +540,8 @@ def count_pairs(
 def emit_pairs(
     footprints: Footprints | Squares, grid: TileGrid, max_rows: int, max_pairs: int
 ) -> Pairs:
-    """Lists all pairs, splat by splat, in buffers of fixed size; if they overflow, the last splats
-    lose theirs.
+    """Lists all (tile, splat) pairs, splat by splat, in buffers of fixed size. If a buffer
+    overflows, the pairs of the last splats are missing.
     """
     bands = footprints.bands()
     first, counts = footprints.rows(grid)
@@ -542,20 +570,20 @@ def emit_pairs(
 
 
 def _first(v: Array, tile_size: int, tiles: Size) -> Array:
-    """Returns the first tile whose last pixel centre is not left of v."""
+    """Returns the first tile whose last pixel centre is not left of v (or above v, for rows)."""
     return jnp.clip(jnp.ceil((v - (tile_size - 0.5) - SLACK) / tile_size), 0, tiles).astype(
         jnp.int32
     )
 
 
 def _last(v: Array, tile_size: int, tiles: Size) -> Array:
-    """Returns the last tile whose first pixel centre is not right of v."""
+    """Returns the last tile whose first pixel centre is not right of v (or below v, for rows)."""
     return jnp.clip(jnp.floor((v - 0.5 + SLACK) / tile_size), -1, tiles - 1).astype(jnp.int32)
 
 
 def _count_row_by_row(footprints: Footprints | Squares, grid: TileGrid, most_rows: Array) -> Array:
-    """Counts the pairs of all splats: in their first rows of tiles, then in their second ones,
-    and so on.
+    """Returns the number of pairs of all splats. A loop counts first the pairs in each splat's
+    first row of tiles, then those in its second row, and so on.
     """
     bands = footprints.bands()
     first, counts = footprints.rows(grid)
