@@ -1,9 +1,9 @@
-"""Motions in files of arrays: the keys decide the format (`data.formats`), whose rows say what is
-under them.
+"""Reads motions from files of named arrays.
 
-SMPL-X has 55 joints (165 numbers), SMPL-H 52 (156), SMPL 24 (72), of which the last two are whole
-hands; 22 (66) are the body. _Rotations are axis-angles or matrices (three times as many numbers).
-What a file does not have (fingers, eyes) is 0.
+The names (keys) decide the format; the table in `data.formats` has the keys of each. Poses have 55
+joints in SMPL-X (165 numbers), 52 in SMPL-H (156), and 24 in SMPL (72), of which the last two are
+whole hands. The body alone is 22 joints (66 numbers). Rotations are axis-angles, or matrices, which
+have three times as many numbers. Rotations that a file does not have (fingers, eyes) are 0.
 """
 
 from pathlib import Path
@@ -37,19 +37,19 @@ from humangs_jax.motion.vectors import frames_first
 
 _HEAD = JOINT_NAMES.index("head")
 _Rotations = Float[np.ndarray, "m n 3"]
-"""Axis-angles of the frames."""
+"""Axis-angles of n joints in m frames, radians."""
 _SOMA_JOINTS = 77
-"""Joints of Kimodo's skeleton, which is not SMPL-X's."""
+"""Number of joints of Kimodo's skeleton, which is not that of SMPL-X."""
 _NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat"
-"""A note about hands that are not read."""
+"""The note about hands in a form that is not read."""
 _MISSING_RATE = (
     "missing: how many frames are a second? expected --motion-fps (in Python fps=), or this key"
 )
-"""What is wrong with a file that has no rate."""
+"""The problem that the error of a file without a rate names."""
 
 
 def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
-    """The poses of one person. Raises: MotionError, naming the key."""
+    """Reads the poses of one person. Raises: MotionError, which names the key that is wrong."""
     # the person that is asked for, and the format by its keys
     person = _chosen(path, read_people(path), options.person)
     form = format_of(person.values)
@@ -85,14 +85,16 @@ def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
 
 
 _EXPRESSIONS = ("expressions", "expression", "expressionParameters", "expr")
-"""Keys of SMPL-X's expressions, the first that is there; ours have names."""
+"""Keys that may hold the expressions of SMPL-X. The first one that a file has is read."""
 
 
 def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
-    """The expressions of a person; those of other programs that do not fit the frames are left
-    out, with a note.
+    """Reads the expressions of a person; None if the file has none.
 
-    Raises: MotionError for a file of ours.
+    count: number of frames. If expressions in a file of another program do not fit the frames, a
+    note is added and None is returned.
+
+    Raises: MotionError if expressions in a file of this package do not fit the frames.
     """
     ours = form.kind == "ours"
     key = "expressions" if ours else file.first(_EXPRESSIONS)
@@ -120,7 +122,10 @@ def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
 
 
 def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
-    """The person of a number, or the only one. Raises: MotionError, which lists the people."""
+    """Returns the person of a number, or the only person.
+
+    Raises: MotionError, which lists the people, if the number is missing or fits no person.
+    """
     names = [person.name for person in people]
     if number is None and len(people) == 1:
         return people[0]
@@ -144,7 +149,7 @@ def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
 
 
 def _frames(person: Person) -> int:
-    """In how many frames the person is."""
+    """Returns the number of frames that show the person; 0 if the format is unknown."""
     form = format_of(person.values)
     if form:
         return max(len(np.atleast_1d(as_array(person.values[key]))) for key in form.keys)
@@ -156,8 +161,9 @@ def _frames(person: Person) -> int:
 
 
 def _posed(file: "_MotionFile", form: ArrayKeys) -> _Rotations:
-    """The rotations of all joints, from those of its parts: the first key says how many frames
-    there are.
+    """Reads the rotations of all joints (m, 55, 3) from the keys of the parts of the body.
+
+    The number of frames m is that of the first key.
     """
     rotations: _Rotations | None = None
     for place, key in form.poses.items():
@@ -198,7 +204,13 @@ def _part(
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
 ) -> _Rotations:
-    """The rotations of a part of the body. Raises: MotionError for another number of joints."""
+    """Returns the rotations of one part of the body.
+
+    place: name of the part in `PLACES`. values: the array under the key. flat: the same array with
+    one row for each frame.
+
+    Raises: MotionError if the array does not fit the number of joints of the part.
+    """
     most, (count, width) = PLACES[place][1], flat.shape
     of_smpl = place in ("limbs", "body")
     counts = (most, most + 2) if of_smpl else (most,)
@@ -221,8 +233,12 @@ def _all(
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
 ) -> _Rotations:
-    """Of a pose under one key: what is behind the body of SMPL is left out, of SMPL-H it is the
-    fingers.
+    """Returns the rotations of a pose of which all joints are under one key.
+
+    For SMPL these are the joints of the body, for SMPL-H also those of the fingers. values, flat:
+    as in `_part`.
+
+    Raises: MotionError if no known layout has that many numbers.
     """
     count, width = flat.shape
     # layouts of single programs: root, body, hands and jaw; without the root; with coefficients of
@@ -261,7 +277,10 @@ def _all(
 def _axis_angles(
     file: "_MotionFile", key: str, flat: Float[np.ndarray, "m columns"], joints: int
 ) -> _Rotations:
-    """Axis-angles of axis-angles or matrices. Raises: MotionError where these are no rotations."""
+    """Returns axis-angles (m, joints, 3) for rows of axis-angles or of rotation matrices.
+
+    Raises: MotionError if matrices are not rotations.
+    """
     if flat.shape[1] == 3 * joints:
         return flat.reshape(len(flat), joints, 3)
     matrices = flat.reshape(-1, 3, 3)
@@ -281,7 +300,11 @@ def _axis_angles(
 def _placed(
     file: "_MotionFile", form: ArrayKeys, rotations: _Rotations
 ) -> Float[np.ndarray, "m 3"]:
-    """(m, 3) translations; turns roots where cameras or the format's convention ask for it."""
+    """Returns the translations (m, 3), metres.
+
+    Where the file has cameras that move, translations and the root's rotations, which are changed
+    in place, become those in the world.
+    """
     # a file may have no positions
     count, key = len(rotations), file.first(form.moves)
     if key not in file.values and form.stays and key not in file.pickled:
@@ -325,8 +348,9 @@ def _placed(
 def _cameras(
     file: "_MotionFile", count: int
 ) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]] | None:
-    """Rotations and places of the cameras in the world for each frame, where files tell; None: they
-    do not.
+    """Reads the rotations (m, 3, 3) and positions (m, 3) of the camera in the world.
+
+    There is one of each for all frames, or for each frame. None: the file has no cameras.
     """
     # one camera, or one of each frame
     if "cam2world" in file.values:
@@ -363,7 +387,7 @@ def _cameras(
 
 
 class _MotionFile(ArrayFile):
-    """The values of a person, and notes about them."""
+    """The arrays of one person, the rate that is asked for, and notes for the user."""
 
     def __init__(self, path: Path, person: Person, fps: float | None):
         super().__init__(path, person.values, person.pickled, MotionError)
@@ -371,11 +395,14 @@ class _MotionFile(ArrayFile):
         self.notes: list[str] = []
 
     def first(self, keys: tuple[str, ...]) -> str:
-        """The first key that the file has; the first of all if it has none."""
+        """Returns the first of the keys that the file has, or keys[0] if it has none."""
         return next((key for key in keys if key in self.values), keys[0])
 
     def rate(self, form: ArrayKeys) -> float:
-        """Frames per second: those asked for, or under the first of the keys that is there."""
+        """Returns frames per second: those asked for, the file's, or the format's default.
+
+        Raises: MotionError if there is none of these, or if the file's rate is not positive.
+        """
         if self.fps is not None:
             return self.fps
         key = self.first(form.rates) if form.rates else ""
@@ -423,13 +450,16 @@ RIG = {
     40: ("right_elbow", 39),
     42: ("right_wrist", 40),
 }
-"""Of the rig's 127: name and the joint above."""
+"""Joints of the rig that are used, by index: the name, and the index of the parent."""
 RIG_JOINTS = 127
-"""Joints of the rig."""
+"""Number of joints of the rig."""
 
 
 def _clip_of_points(file: Any, fps: float) -> Clip:
-    """The skeleton in motion of an `ArrayFile`. Raises: the file's error, naming the key."""
+    """Reads a moving skeleton from the points of an `ArrayFile`.
+
+    Raises: the file's error, which names the key that is wrong.
+    """
     points = _of_frames(file, "pred_joint_coords", (RIG_JOINTS, 3))[:, list(RIG)]
     if "pred_cam_t" in file.values:
         points = points + _of_frames(file, "pred_cam_t", (3,), len(points))[:, None]
@@ -455,9 +485,12 @@ def _clip_of_points(file: Any, fps: float) -> Clip:
 def _of_frames(
     file: Any, key: str, shape: tuple[int, ...], count: int | None = None
 ) -> Float[np.ndarray, "m ..."]:
-    """Numbers of a shape for each frame; one frame, or an axis of one person, is accepted.
+    """Reads an array that has numbers of a given shape for each frame.
 
-    Raises: the file's error, naming the key.
+    A single frame may lack the axis of frames, and an axis of one person is removed. count: number
+    of frames. None: any.
+
+    Raises: the file's error, which names the key, if the shape is another.
     """
     values = file.numbers(key, None)
     if values.size == np.prod(shape):
@@ -472,8 +505,10 @@ def _of_frames(
 def _carried(
     places: Float[np.ndarray, "m s 3"], parents: tuple[int, ...]
 ) -> Float[np.ndarray, "m s 3 3"]:
-    """Rotations of bones from the first frame on, where a file has none: the smallest turns down
-    the tree.
+    """Returns rotations of the bones relative to the first frame, for a file that has none.
+
+    They are the smallest turns that move the bones from their directions in the first frame,
+    applied from the root down.
     """
     turns = np.tile(np.eye(3), (*places.shape[:2], 1, 1))
     for i, p in enumerate(parents):

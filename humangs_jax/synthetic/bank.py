@@ -1,17 +1,17 @@
-"""Dressed people as textured meshes, for renderers that know no materials, and as scans; and banks
-of them, ready for a device.
+"""Bakes dressed people into textured meshes, writes these as scans, and stacks them into banks.
 
-Texels between charts repeat the nearest chart, so that bilinear lookups and smaller copies of the
-texture stay clean at seams. Folds that are painted into the normals become a second texture.
-Skinning is cut down to a few joints per vertex.
+A baked person needs a renderer without materials. Texels between charts repeat the nearest chart,
+so that bilinear lookups and smaller copies of the texture stay clean at seams. Folds that are
+painted into the normals become a second texture. Skinning is cut down to a few joints per vertex.
 
-A scan is such a mesh, lit, in a folder, like a scanner's: scan.obj with material.mtl and
-material_0.png, scan.glb, and scan.json with seed, shape and pose. Metres, y up, texture coordinates
-with v up; a vertex is written once per chart that it is in.
+A scan is a baked and lit mesh in a folder, like that of a scanner: scan.obj with material.mtl and
+material_0.png, scan.glb, and scan.json with seed, shape and pose. Lengths are in metres, y is up,
+and texture coordinates have v up. A vertex is written once for each chart that it is in.
 
-A bank is made on the host once, all of one shape, and used by `on_the_fly_example`. It holds people
-of ONE range of seeds (see `subject.SPLITS`), so no key of a training bank makes a person of the
-test range. About 3 MB a person at 512 texels a side.
+A bank holds people as arrays of one shape. It is made on the host once, and `on_the_fly_example`
+reads it on the device. All people of a bank are from ONE range of seeds (see `subject.SPLITS`), so
+that no key of a training bank makes a person of the test range. A person takes about 3 MB at 512
+texels a side.
 """
 
 import dataclasses
@@ -58,15 +58,15 @@ from humangs_jax.synthetic.surroundings import cameras_around, spread_azimuths
 
 
 JOINTS_PER_VERTEX = 6
-"""Bodies have up to 7, smoothed garments up to 12; six lose at most 0.4 % of the weight, under a
-millimetre in any pose.
+"""Number of joints that are kept for each vertex. Bodies have up to 7, smoothed garments up to 12.
+Six lose at most 0.4 % of the weight, less than a millimetre in any pose.
 """
 SLOPE_STEP = 1 / 100
-"""One step of the slope texture's bytes: slopes up to 1.27."""
+"""Slope of one step of the slope texture's bytes, which hold slopes up to 1.27."""
 SLOPE_ZERO = 128
-"""The byte of no slope."""
+"""The byte that stands for a slope of 0."""
 FACE_DENSITY = 2.0
-"""Texels per metre of skin and eyes of the head, relative to everything else."""
+"""Texels per metre on skin and eyes of the head, divided by those on everything else."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,20 +76,22 @@ class BakedSubject:
     atlas: Atlas
     """Texture coordinates of the mesh."""
     albedo: UInt8[np.ndarray, "t t 3"]
-    """Colors without light, (t, t, 3) bytes, 255 is 1, row 0 on top (v = 1)."""
+    """Colors without light, (t, t, 3), as bytes where 255 is 1. Row 0 is on top (v = 1)."""
     slopes: UInt8[np.ndarray, "t t 3"]
-    """Gradients of painted folds, (t, t, 3) bytes, `SLOPE_ZERO` + steps of `SLOPE_STEP`, in the
-    axes of `Spots.cloth`.
+    """Gradients of painted folds along the axes of `Spots.cloth`, (t, t, 3), as bytes: `SLOPE_ZERO`
+    plus a number of steps of `SLOPE_STEP`.
     """
 
 
 def bake_subject(
     subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1
 ) -> BakedSubject:
-    """The textures of a subject, texture_size texels a side, each the mean of samples x samples
-    points.
+    """Bakes the materials of a subject into textures.
 
-    No chart of the atlas is across two materials; faces (of people) are in finer detail.
+    Each chart of the atlas has one material. The person's face has finer detail than the rest.
+
+    texture_size: texels a side. samples: each texel is the mean of samples x samples points.
+
     Raises: ValueError if the size is no multiple of the packing's `atlas.CELLS`.
     """
     surface, pieces = subject.surface, subject.face_materials
@@ -117,8 +119,10 @@ def bake_subject(
 def strongest_joints(
     weights: Float[np.ndarray, "n j"], count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The `count` joints (n, k) of most weight of each vertex, strongest first, and their weights
-    (n, k) scaled to sum 1.
+    """Keeps the `count` joints of most weight of each vertex.
+
+    Returns: indices of the joints (n, k), strongest first, and their weights (n, k), scaled so that
+    they sum to 1.
     """
     ids = np.argsort(-weights, axis=1, kind="stable")[:, :count]
     kept = np.take_along_axis(weights, ids, axis=1)
@@ -126,9 +130,9 @@ def strongest_joints(
 
 
 def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 2048) -> None:
-    """Write a posed subject as a mesh whose texture carries its light, whole or not at all.
+    """Writes a posed subject as a mesh whose texture contains the light, whole or not at all.
 
-    An existing folder is replaced.
+    An existing scan in the folder is replaced. texture_size: texels a side.
     """
     import trimesh
     from PIL import Image
@@ -165,7 +169,7 @@ def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 204
 
 
 def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "t t 3"]:
-    """(t, t, 3) the texture of a pose as its light makes it, seen from outside."""
+    """Returns the texture (t, t, 3) of a posed subject in its light, seen from outside."""
     ids, weights = texels(baked.atlas)
     known = ids >= 0
     albedo = baked.albedo[known].astype(np.float32) / 255
@@ -184,15 +188,16 @@ _FORMAT = "humangs-people"
 _VERSION = 2
 """Version of the format that is written and read."""
 UV_STEPS = 65535
-"""Texture coordinates are stored in steps of one part of this."""
+"""Number of steps from 0 to 1 in which texture coordinates are stored."""
 _MOST_MATERIALS = 32
-"""Materials of a person, at most: arrays have room for as many."""
+"""Largest number of materials of a person; arrays of materials have this length."""
 
 
 @pytree_dataclass
 class PeopleBank:
-    """Dressed people p, padded to one size (by a repeated vertex, and faces without area) and
-    stacked.
+    """Stacked arrays of p dressed people, whose meshes are padded to one size.
+
+    The padding is a repeated vertex, and faces without area.
     """
 
     seeds: Int[Array, " p"]
@@ -202,41 +207,41 @@ class PeopleBank:
     joints: Float[Array, "p j 3"]
     """Joints at rest, (p, j, 3), metres."""
     vertex_counts: Int[Array, " p"]
-    """Vertices of each mesh without padding, (p,)."""
+    """Number of vertices of each mesh without padding, (p,)."""
     vertices: Float[Array, "p n 3"]
     """Vertices at rest, (p, n, 3), metres."""
     normals: Float[Array, "p n 3"]
     """Unit normals at rest, (p, n, 3)."""
     joint_ids: UInt8[Array, "p n k"]
-    """The joints that move each vertex, (p, n, k)."""
+    """Indices of the joints that move each vertex, (p, n, k)."""
     joint_weights: Float[Array, "p n k"]
     """Skinning weights of these joints, (p, n, k); rows sum to 1."""
     faces: UInt[Array, "p f 3"]
     """Triangles, (p, f, 3)."""
     uvs: UInt[Array, "p f 3 2"]
-    """Texture coordinates of the faces' corners, (p, f, 3, 2), steps of 1 / `UV_STEPS`, v DOWN."""
+    """Texture coordinates of the faces' corners, (p, f, 3, 2), in 1 / `UV_STEPS`, with v DOWN."""
     face_pieces: UInt8[Array, "p f"]
-    """Number of the piece that each face belongs to, (p, f), below m."""
+    """Index of the piece that each face belongs to, (p, f), below m."""
     sheen: Float[Array, "p m"]
-    """Soft highlight of each piece, (p, m), 0 to 1."""
+    """Strength of the soft highlight of each piece, (p, m), 0 to 1."""
     groups: UInt8[Array, "p m"]
     """Group of each piece, (p, m); pieces of one group are dyed alike."""
     dyeable: Float[Array, "p m"]
     """1 where a piece is cloth that may have another color, else 0, (p, m)."""
     texture: UInt8[Array, "p t t 6"]
-    """Albedo (255 is 1) and slopes (see `BakedSubject`), (p, t, t, 6)."""
+    """Albedo (3) and slopes (3) of each person as bytes, (p, t, t, 6), see `BakedSubject`."""
     rotations: Float[Array, "p q j 3"]
     """Poses of each person, (p, q, j, 3), axis-angle, radians."""
     nearest: Int[Array, "p q"]
-    """Number of the pose that is most like each one, (p, q)."""
+    """For each pose, the index of the same person's pose that is most similar to it, (p, q)."""
     displacements: Float[Array, "p b 3"]
-    """Offsets of a body's vertices to the silhouettes of the dressed person
-    (`data.vertex_offsets`), (p, b, 3), metres; b is 0 in a bank without.
+    """Offsets that move a body's vertices to the silhouettes of the dressed person (see
+    `data.vertex_offsets`), (p, b, 3), metres. b is 0 in a bank without displacements.
     """
     parents: tuple[int, ...] = static_field(default=())
-    """Parent of each joint. Static."""
+    """Index of each joint's parent. Static."""
     mirrored_joints: tuple[int, ...] = static_field(default=())
-    """Mirror image of each joint. Static."""
+    """Index of the joint on the other side of each joint. Static."""
     split: str = static_field(default="")
     """Name of the range that the seeds are from, see `subject.SPLITS`. Static."""
     generator: int = static_field(default=GENERATOR_VERSION)
@@ -244,7 +249,7 @@ class PeopleBank:
 
     @property
     def people(self) -> int:
-        """How many people there are."""
+        """The number of people."""
         return self.betas.shape[0]
 
 
@@ -259,15 +264,17 @@ def build_bank(
     processes: int = 1,
     progress: bool = False,
 ) -> PeopleBank:
-    """The people of some seeds, which must all lie in the range `split` of `subject.SPLITS`.
+    """Makes a bank of the people of some seeds.
 
-    texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 those of
-    512.
-    displaced: the body to displace, one of `data.views.gaussian_body`; None: none.
-    processes: how many work at once; more than one use the CPU and load the shipped body
-    themselves.
-    Raises: ValueError if there are no seeds, a seed lies in another range, or the body is not the
-    package's own.
+    All seeds must lie in the range `split` of `subject.SPLITS`.
+
+    texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 images
+    of 512. pose_count: number of poses of each person. displaced: the body to displace, one of
+    `data.views.gaussian_body`. None: the bank has no displacements. processes: number of processes
+    that make people; if more than one, they use the CPU and load the shipped body themselves.
+
+    Raises: ValueError if there are no seeds, if a seed lies in another range, or if the body is not
+    the package's body.
     """
     seeds = list(seeds)
     if not seeds:
@@ -287,13 +294,13 @@ def build_bank(
 
 
 def save_bank(path: str | Path, bank: PeopleBank) -> None:
-    """Write one .npz, whole or not at all."""
+    """Writes a bank as one .npz file, whole or not at all."""
     fields = {name: np.asarray(getattr(bank, name)) for name in (*_ARRAYS, *_STATIC)}
     write_npz(path, fields | {"format": np.asarray(_FORMAT), "version": np.asarray(_VERSION)})
 
 
 def load_bank(path: str | Path) -> PeopleBank:
-    """Read a bank. Raises: FileNotFoundError; FileError if it holds no bank."""
+    """Reads a bank. Raises: FileNotFoundError; FileError if the file holds no bank."""
     with reading(path, "bank of people"):
         arrays, _ = read_npz(path)
         if str(arrays.get("format")) != _FORMAT:
@@ -319,9 +326,9 @@ _ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in _STAT
 
 
 def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
-    """Sizes that fit each other, real and finite numbers, indices that exist.
+    """Checks that sizes fit each other, numbers are real and finite, and indices exist.
 
-    Raises: InvalidFileError.
+    Raises: InvalidFileError if one of these does not hold.
     """
     sizes: dict[str, int] = {}
     fields = array_fields(PeopleBank)
@@ -360,7 +367,10 @@ def _person(
     pose_count: int,
     displaced: BodyModel | None,
 ) -> dict[str, np.ndarray]:
-    """One subject's share of the bank, unpadded: name -> array."""
+    """Makes the arrays of one person for a bank, without padding, by name.
+
+    body: None for the shipped body. Other arguments are those of `build_bank`.
+    """
     subject = make_subject(seed, _shipped_body() if body is None else body)
     supersample = 2 if texture_size <= 512 else 1  # fine patterns on coarse texels
     baked = bake_subject(subject, texture_size, supersample)
@@ -372,7 +382,7 @@ def _person(
     u, v = np.moveaxis(atlas.uvs[atlas.faces], -1, 0)
 
     def pad(values: Sequence[Any], kind: type) -> np.ndarray:
-        """Numbers of the materials, with zeros up to the most that there may be."""
+        """Pads numbers of the materials with zeros to `_MOST_MATERIALS`."""
         return np.pad(np.asarray(values), (0, _MOST_MATERIALS - len(materials))).astype(kind)
 
     identities = [id(material) for material in materials]
@@ -413,8 +423,9 @@ def _person(
 def to_silhouettes(
     subject: SyntheticSubject, body: BodyModel, rotations: Float[np.ndarray, "j 3"]
 ) -> Float[np.ndarray, "b 3"]:
-    """The displacement of a body to what four cameras around the dressed person see in a pose,
-    metres.
+    """Fits displacements of a body's vertices (b, 3), metres, to silhouettes of the dressed person.
+
+    Four cameras around the person see the silhouettes in one pose. rotations: that pose, (j, 3).
     """
     views, side = 4, 960  # pixels
     rng, nowhere = np.random.default_rng([subject.seed, 23]), np.zeros(3, np.float32)
@@ -433,7 +444,7 @@ def to_silhouettes(
 
 
 def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: str) -> PeopleBank:
-    """People padded to one size."""
+    """Pads the arrays of people to one size, and stacks them into a bank."""
     # the sizes of the largest mesh, rounded up: few shapes are compiled
     vertices = -(-max(len(p["vertices"]) for p in people) // 1024) * 1024
     faces = -(-max(len(p["faces"]) for p in people) // 2048) * 2048
@@ -457,7 +468,10 @@ def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: st
 
 
 def mirrored_joints(names: tuple[str, ...]) -> tuple[int, ...]:
-    """For each joint the one on the other side; joints in the middle are their own."""
+    """Returns for each joint the index of the joint on the other side.
+
+    A joint in the middle has its own index.
+    """
     other = {"left": "right", "right": "left"}
     swapped = []
     for name in names:

@@ -1,8 +1,7 @@
-"""Haircuts and beards: how they are drawn, and their shells, tubes, buns and tails; also knitted
-caps.
+"""Draws haircuts and beards at random, and builds their surfaces: shells, tubes, buns and tails.
 
-A hairline is a template height for each azimuth around the skull (0 in front, pi at the nape), the
-same on both sides.
+Hats and hoods are built by the same functions. A hairline is a template height for each azimuth
+around the skull (0 in front, pi at the nape), the same on both sides.
 """
 
 import dataclasses
@@ -42,7 +41,7 @@ CUTS = {
     "bun": (0.03, 0.08, 0.008),
     "braid": (0.01, 0.05, 0.008),
 }
-"""Odds for men and women, thickness (metres, or their range)."""
+"""Cuts by name: odds for men, odds for women, and thickness or its range, metres."""
 LONG_CUTS = ("bob", "long")
 """Cuts that fall over the ears."""
 _SHELLS = {
@@ -51,15 +50,15 @@ _SHELLS = {
     "quiff": (0.2, 0.05, 1),
     "short": (0.22, 0.035, 1),
 }
-"""Height of the bumps of hair on the scalp as a share of the thickness, their width in metres, and
-1 if the hair is parted.
+"""Short cuts by name: height of the bumps of hair as a share of the thickness, width of the bumps,
+metres, and 1 if the hair is parted, else 0.
 """
 _TAILS = {"ponytail": ((0.2, 0.38), 0.0), "braid": ((0.28, 0.42), 0.028)}
-"""Range of their lengths; distance of the knots, metres."""
+"""Tails by name: range of the length, and distance between knots (0 for none), metres."""
 _FRINGES = {"straight": 0.28, "parted": 0.34, "side": 0.38}
-"""Odds of a fringe of longer hair."""
+"""Fringes of longer hair, and their odds."""
 BEARDS = {"none": 0.5, "stubble": 0.2, "moustache": 0.05, "goatee": 0.09, "full": 0.16}
-"""Odds for men."""
+"""Beards, and their odds for men."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +70,7 @@ class Haircut:
     fringe: str
     """Kind of fringe, one of _FRINGES."""
     side: float
-    """Side of the parting and of a braid, +1 or -1."""
+    """Side of the parting and the fringe, +1 or -1."""
     thickness: float
     """Thickness of the hair on the scalp, metres."""
     bottom: float
@@ -89,7 +88,7 @@ class Haircut:
 
 
 def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set[str]) -> Haircut:
-    """A random cut that fits under the headwear; old men lose hair."""
+    """Draws a haircut and a beard. worn: kinds of garments; the cut fits under their headwear."""
     # what a hat would not leave room for is not drawn, or is thinner
     headwear = bool(worn & set(HEADWEAR))
     odds = {name: value[0 if male else 1] for name, value in CUTS.items()}
@@ -143,10 +142,11 @@ SHORT_LINE = (
     [0.0, 0.55, 0.95, 1.2, 1.36, 1.42, 1.86, 1.95, 2.3, 3.15],
     [0.392, 0.388, 0.368, 0.325, 0.312, 0.353, 0.353, 0.275, 0.234, 0.226],
 )
-"""Azimuths and heights: forehead, temple, sideburn before the ear, above and behind the ear, nape.
+"""The hairline: azimuths, and heights at them. In order: forehead, temple, sideburn before the ear,
+above and behind the ear, nape.
 """
 CAP_LINE = ([0.0, 0.8, 1.5, 2.2, 3.15], [0.375, 0.37, 0.345, 0.325, 0.315])
-"""The same of a cap's edge."""
+"""The edge of a cap: azimuths, and heights at them."""
 
 _FRINGE_LINES = {
     "straight": (
@@ -162,16 +162,18 @@ _FRINGE_LINES = {
         [-9.0, -9.0, 0.30, 0.352, 0.374, 0.402, 0.415, 0.405, 0.37, 0.30, -9.0, -9.0],
     ),
 }
-"""Signed azimuths and heights above which longer hair covers the face: blunt, parted in the middle,
-combed to the right.
+"""Edges of fringes by name: signed azimuths, and the heights above which longer hair covers the
+face. A straight fringe is blunt, a parted one is parted in the middle, and a side one is combed to
+the right.
 """
 
 
 def style(
     rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: float = 0.0
 ) -> list[Surface]:
-    """The surfaces of a haircut, beard included, over clothes that are `over` metres from the
-    skin.
+    """Builds the surfaces of a haircut and a beard.
+
+    over: distance of the clothes below the hair from the skin, metres.
     """
     kind, parts = haircut.cut, []
     # long hair falls as a tube, short hair is a shell of the scalp
@@ -204,17 +206,18 @@ def style(
 
 
 _Opening = Callable[[Field, Field], Field]
-"""Azimuths in (-pi, pi] and template heights -> positive where hair or cloth leaves the face free.
+"""A function of azimuths in (-pi, pi] and template heights, both (n,). It returns (n,) numbers that
+are positive where hair or cloth is, and negative where the face is free.
 """
 
 
 def _fringe(rng: np.random.Generator, haircut: Haircut) -> _Opening:
-    """Metres above the ragged edge of hair around the face."""
+    """Returns the function that tells how far points are above the edge of a fringe, metres."""
     angles, heights = (np.asarray(x) for x in _FRINGE_LINES[haircut.fringe])
     phase = rng.uniform(0, 6.28, 3)
 
     def above(azimuths, height):
-        """How far points are above the edge, which has waves."""
+        """Returns the height of points above the edge, which is wavy."""
         a = azimuths * haircut.side
         waves = zip((0.0035, 0.0025, 0.003), (23, 41, 9), phase, strict=True)
         return (
@@ -227,13 +230,16 @@ def _fringe(rng: np.random.Generator, haircut: Haircut) -> _Opening:
 
 
 def ears(template: Points) -> np.ndarray:
-    """(n,) whether a vertex is on the outer part of an ear."""
+    """Returns for each vertex whether it is on the outer part of an ear, (n,)."""
     x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
     return (x > 0.0765) & (y > 0.265) & (y < 0.36) & (z < 0.03)
 
 
 def above_line(template: Points, line: tuple, shift: float = 0.0) -> Field:
-    """(n,) height above a hairline; strongly negative away from the head."""
+    """Returns the height of points above a hairline (n,); -1 away from the head.
+
+    line: azimuths and heights. shift: metres by which the line is raised.
+    """
     azimuths = np.abs(
         np.arctan2(np.abs(template[:, 0]), template[:, 2] - SKULL[2])
     )  # 0 in front, pi at the nape
@@ -253,13 +259,14 @@ def scalp_shell(
     quiff: float = 0.0,
     side: float | int = 0,
 ) -> Surface:
-    """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the
-    hairline.
+    """Builds short hair or a hat: the scalp, moved outwards by a thickness.
 
-    bumps: share of the thickness, `size` metres wide. crown, quiff: metres that the top and the
-    front rise above that.
-    side: +1 or -1 for a parting on that side of the head, 0 for none. hat: with a straight edge
-    that stands off.
+    The thickness is in metres, and gets smaller towards the hairline.
+
+    bumps: height of the bumps as a share of the thickness. size: width of the bumps, metres. hat:
+    whether to make a hat, with a straight edge that stands off. shift: metres by which the hairline
+    is raised. crown, quiff: metres by which the top and the front rise further. side: +1 or -1 for
+    a parting on that side of the head, 0 for none.
     """
     template = anatomy.skin.template
     above = above_line(template, CAP_LINE if hat else SHORT_LINE, shift)
@@ -301,11 +308,12 @@ def falling_tube(
     ends: float | None = None,
     over: float = 0.0,
 ) -> Surface:
-    """Long hair, a hood or a headscarf: the skull's silhouette scaled up, then falling to the
-    height `bottom` at the back.
+    """Builds long hair, a hood or a headscarf: the enlarged skull, from which a tube falls.
 
-    ends: height at which it ends in front; None: hair, which ends on the shoulders at the sides.
-    over: metres between skin and what is worn below it.
+    thickness: by which the skull is enlarged, metres. bottom: template height where the tube ends
+    at the back. opening: where the face is free. wave: height of waves, metres. ends: template
+    height where the tube ends in front. None: that of hair, which ends on the shoulders. over:
+    distance of the clothes below from the skin, metres.
     """
     skin, template = anatomy.skin, anatomy.skin.template
     to_rest, center = _skull(anatomy)
@@ -357,7 +365,7 @@ def falling_tube(
 
 
 def _bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
-    """A ball of hair on the back of the head."""
+    """Builds a ball of hair on the back of the head. elevation: above the horizontal, radians."""
     direction = np.asarray([0, np.sin(elevation), -np.cos(elevation)])
     center = _skull(anatomy)[1] + direction * (0.095 + 0.55 * radius)
     directions, faces = surfaces.ball(12, 20)
@@ -366,8 +374,9 @@ def _bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
 
 
 def _tail(rng: np.random.Generator, anatomy: Anatomy, length: float, knots: float) -> Surface:
-    """A tapering tail from the back of the head down the back; a braid has knots, `knots` metres
-    apart.
+    """Builds a tapering tail of hair that hangs down the back. length: metres.
+
+    knots: distance between the knots of a braid, metres; 0 for a tail without knots.
     """
     start = np.asarray([0, _skull(anatomy)[0](0.36), anatomy.joints[Joint.HEAD, 2] - 0.105])
     rows = 40 if knots else 16
@@ -388,7 +397,7 @@ def _tail(rng: np.random.Generator, anatomy: Anatomy, length: float, knots: floa
 
 
 def beard_field(template: Points, kind: str) -> Field:
-    """Positive where a beard grows: full, goatee or moustache."""
+    """Returns a field (n,) that is positive where a beard of a kind grows."""
     x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
     lips = 1 - (x / 0.027) ** 2 - ((y - 0.262) / 0.0115) ** 2
     cheek = 0.279 + 0.30 * np.maximum(x - 0.03, 0) - 0.1 * np.maximum(0.02 - x, 0)
@@ -401,7 +410,7 @@ def beard_field(template: Points, kind: str) -> Field:
 
 
 def _beard(rng: np.random.Generator, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
-    """A beard that thins out towards the cheeks."""
+    """Builds a beard that gets thinner towards the cheeks. thickness: metres."""
     template = anatomy.skin.template
     field = beard_field(template, kind)
     ragged = np.where(field > -0.5, field + 0.002 * ripples(rng, template, 0.012), -1.0)
@@ -415,16 +424,18 @@ def _beard(rng: np.random.Generator, anatomy: Anatomy, thickness: float, kind: s
 
 
 def _painted(surface: Surface) -> Surface:
-    """Template and cloth coordinates of hair that does not come from the scalp: its own
-    position.
+    """Adds template and cloth coordinates to hair that is not cut from the scalp.
+
+    Both are positions relative to the middle of the hair.
     """
     flat = surface.vertices - surface.vertices.mean(0)
     return surface.painted(flat + SKULL, flat, 0.09)
 
 
 def eyeballs(anatomy: Anatomy) -> Surface:
-    """Two balls in the sockets; their `template` attribute is the unit direction from the ball's
-    middle.
+    """Builds the two eyeballs.
+
+    Their `template` attribute is the unit direction from the middle of the ball.
     """
     parts, (directions, faces) = [], surfaces.ball(14, 22)
     directions = directions.astype(np.float32)
@@ -437,8 +448,10 @@ def eyeballs(anatomy: Anatomy) -> Surface:
 
 
 def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
-    """Template heights of head and neck -> rest heights of the person; the skull's middle (3,) at
-    rest.
+    """Returns how the head of a person at rest differs from the template.
+
+    Returns: a function that maps template heights of head and neck to the person's heights, and the
+    middle of the person's skull (3,), metres.
     """
     neck = anatomy.joints[Joint.NECK, 1]
     factor = (anatomy.skin.vertices[:, 1].max() - neck) / (_CROWN - _NECK_HEIGHT)
@@ -452,7 +465,10 @@ def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
 def _falling_weights(
     anatomy: Anatomy, vertices: Points, template_y: Field
 ) -> Float[np.ndarray, "n j"]:
-    """Weights of the head above the jaw, blending into those of the nearest skin further down."""
+    """Returns skinning weights (n, j): the head's at the top, the nearest skin's further down.
+
+    template_y: template heights of the vertices (n,).
+    """
     x, y, _ = anatomy.skin.template.T
     near = np.flatnonzero((np.abs(x) < 0.15) & (y > -0.3) & (y < 0.26))[::2]
     head = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)

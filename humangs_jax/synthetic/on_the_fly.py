@@ -1,10 +1,11 @@
-"""People on the fly: a pure, jittable function of a key, from a bank of dressed people to views to
-learn from; its `Source`.
+"""Renders training examples of synthetic people on the device, from a bank of dressed people.
 
-A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two
-similar poses of the person's own), light and cameras. The same key gives the same bits on the same
-platform. Differences from `subject.render_view`: colors come from baked textures, normals are
-skinned, vertices follow a few joints each.
+`on_the_fly_example` is a pure, jittable function of the bank and a random key;
+`on_the_fly_source` makes a `Source` of it. The key picks a person of the bank, colors of the
+clothes, whether left and right are exchanged, poses (each between two similar poses of the
+person), light and cameras. The same key gives the same bits on the same platform. Images differ
+from those of `subject.render_view`: colors come from baked textures, normals are skinned, and
+each vertex follows a few joints.
 
     bank = load_bank("people.npz")
     example = jax.jit(on_the_fly_example, static_argnames="config")(bank, key, OnTheFlyConfig())
@@ -40,9 +41,10 @@ from humangs_jax.synthetic.subject import APPEARANCES, SPLITS, SUPERSAMPLING, su
 from humangs_jax.synthetic.surroundings import pick
 
 _POSES = 2
-"""Poses of an example."""
+"""Number of poses of an example."""
 _Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
-"""Numbers for the cameras of views, azimuths, poses, and shares of close cameras."""
+"""A plan of v views: random numbers for their cameras (v, c), azimuths in radians (v,), indices of
+their poses (v,), and probabilities of a close camera (v,)."""
 
 
 @configuration
@@ -52,8 +54,9 @@ class OnTheFlyConfig:
     input_views: Count = 4
     """How many views the network reads."""
     view_counts: tuple[Count, ...] = ()
-    """If given, how many of the `input_views` an example has, one of these at random. The last one
-    is repeated after them, so that one program serves all numbers (`SubjectViews.view_count`)."""
+    """Numbers of different input views that an example may have; each example has one of them, at
+    random. Empty: all have `input_views`. Copies of the last view fill up to `input_views`, so that
+    one program serves all numbers (see `SubjectViews.view_count`)."""
     target_views: Count = 3
     """How many views the rendering is compared with."""
     input_size: Side = 256
@@ -61,29 +64,29 @@ class OnTheFlyConfig:
     target_size: Side = 256
     """Side of the targets, pixels."""
     mixed_pose_share: Share = 0.3
-    """Share of examples whose inputs show any of the `_POSES`, as targets do; in the others all
-    inputs show the first.
+    """Probability that each input of an example shows a random one of the poses, as each target
+    does. Otherwise all inputs show the first pose.
     """
     jitter: Spread = 0.7
     """See `surroundings.azimuths_from`."""
     scattered_share: Share = 0.2
     """See `surroundings.azimuths_from`."""
     mirrored_share: Share = 0.5
-    """Share of examples that are mirrored."""
+    """Probability that left and right of an example are exchanged."""
     displaced_share: Share = 0.0
-    """Share of examples whose body is displaced to the silhouettes of the clothes; they are not
-    mirrored.
+    """Probability that an example has a body displaced to the silhouettes of the clothes. Such an
+    example is not mirrored.
     """
     depths: bool = False
-    """Whether every view has its depths, too."""
+    """Whether the views have depths."""
     views_at_once: Count = knob(
         1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md"
     )
-    """Views drawn side by side: 1 suits CPUs, all of them accelerators."""
+    """Number of views that are drawn at a time: 1 suits CPUs, all views suit accelerators."""
     pixels_per_step: Capacity = knob(
         1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md"
     )
-    """Pixels of the person that are colored at a time: few for CPUs, whole images for
+    """Number of the person's pixels that are colored at a time: few suit CPUs, whole images suit
     accelerators.
     """
 
@@ -99,10 +102,10 @@ ON_THE_FLY = OnTheFlyConfig()
 
 @pytree_dataclass
 class Scene:
-    """What all views of an example share: a person in several poses o, dyes and light."""
+    """What all views of an example share: a person in o poses, the dyes and the light."""
 
     person: Int[Array, ""]
-    """Number of the person in the bank, ()."""
+    """Index of the person in the bank, ()."""
     rotations: Float[Array, "o j 3"]
     """Poses, (o, j, 3), axis-angle, radians."""
     translations: Float[Array, "o 3"]
@@ -110,11 +113,11 @@ class Scene:
     vertices: Float[Array, "o n 3"]
     """Posed vertices of the dressed person, (o, n, 3), metres."""
     corners: Float[Array, "o f 15"]
-    """Normal (3), openness and share of the key light that arrives at each of a face's three
-    corners, (o, f, 15).
+    """Values of the three corners of each face, (o, f, 15). Each corner has five: normal (3),
+    openness, and the share of the key light that arrives there.
     """
     dyes: Float[Array, "m 3 3"]
-    """Color matrix of every piece, (m, 3, 3)."""
+    """Matrix that recolors each piece, (m, 3, 3), see `surroundings.dyes_from`."""
     lights: surroundings.Lights
     """What the person stands in."""
 
@@ -125,10 +128,11 @@ def on_the_fly_example(
     config: OnTheFlyConfig = ON_THE_FLY,
     person: Int[Array, ""] | int | None = None,
 ) -> Example:
-    """Views of a person of the bank: inputs and targets. person: its number in the bank; None: the
-    key chooses.
+    """Renders the input and target views of a person of the bank.
 
-    Raises: ValueError for a `displaced_share` of a bank that has none.
+    person: the index of the person in the bank. None: the key chooses.
+
+    Raises: ValueError if `config.displaced_share` is not 0 and the bank has no displacements.
     """
     if config.displaced_share and not bank.displacements.shape[1]:
         raise ValueError(
@@ -179,7 +183,7 @@ def on_the_fly_example(
 def _draw_numbers(
     bank: PeopleBank, key: Key, config: OnTheFlyConfig
 ) -> dict[str, Float[Array, "..."]]:
-    """All random numbers of an example, in [0, 1), by name."""
+    """Draws all random numbers of an example, in [0, 1), by name."""
     shapes = {
         "person": (),
         "poses": (_POSES, 2),
@@ -194,7 +198,10 @@ def _draw_numbers(
 
 
 def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:
-    """Who, in which poses, colors and light; numbers in [0, 1) by name."""
+    """Makes the scene that random numbers describe.
+
+    numbers: in [0, 1), as `_draw_numbers` returns them.
+    """
     person = pick(numbers["person"], bank.people)
     faces = bank.faces[person].astype(jnp.int32)
     which = pick(numbers["poses"][:, 0], bank.rotations.shape[1])
@@ -221,8 +228,9 @@ def scene_from(numbers: dict[str, Array], bank: PeopleBank) -> Scene:
 def _pose_person(
     bank: PeopleBank, person: Int[Array, ""], rotations: Float[Array, "j 3"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "3"]]:
-    """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the
-    translation (3,).
+    """Poses a person of the bank so that the lowest vertex has y = 0.
+
+    Returns: vertices (n, 3) in metres, unit normals (n, 3), and the body's translation (3,).
     """
     nowhere = jnp.zeros(3, rotations.dtype)
     transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[
@@ -250,10 +258,10 @@ def _pose_person(
 def _plans(
     numbers: dict[str, Float[Array, "..."]], config: OnTheFlyConfig, count: Int[Array, ""] | None
 ) -> tuple[_Plan, _Plan]:
-    """The plans of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses
-    (v,), shares of close cameras (v,).
+    """Makes the plans of the inputs and of the targets, see `_Plan`.
 
-    count: of the inputs; after them the last one is repeated. None: all.
+    count: the number of different inputs; the last of these is repeated to fill up the plan. None:
+    all inputs differ.
     """
     azimuths = surroundings.azimuths_from(
         numbers["input_azimuths"], config.jitter, config.scattered_share, count
@@ -273,7 +281,7 @@ def _plans(
 def _views(
     bank: PeopleBank, scene: Scene, plan: _Plan, config: OnTheFlyConfig, size: int
 ) -> SubjectViews:
-    """Views of some of the scene's poses."""
+    """Renders the views of a plan as square images of `size` pixels."""
 
     def view(plan):
         u, azimuth, pose, close_share = plan
@@ -302,8 +310,10 @@ def draw_view(
     camera: Camera,
     config: OnTheFlyConfig = ON_THE_FLY,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
-    """(h, w, 3) image on white and (h, w) coverage of one of the scene's poses, both in [0, 1], and
-    (h, w) mean z of what is covered, metres, 0 in the background.
+    """Renders one pose of a scene.
+
+    Returns: the image (h, w, 3) on white, in [0, 1]; the covered share of each pixel (h, w); and
+    the mean depth z of the covered part of each pixel (h, w), metres, 0 in the background.
     """
     fine = camera.resized(camera.width * SUPERSAMPLING, camera.height * SUPERSAMPLING)
     vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
@@ -319,8 +329,9 @@ def draw_view(
 
 
 def _box_average(samples: Float[Array, "samples c"], camera: Camera) -> Float[Array, "h w c"]:
-    """Means of s x s samples of each pixel; added one by one: XLA's CPU backend reduces two axes
-    slowly.
+    """Returns the mean of the s x s samples of each pixel, where s is SUPERSAMPLING.
+
+    The samples are added one by one, because XLA's CPU backend reduces two axes slowly.
     """
     s = SUPERSAMPLING
     samples = samples.reshape(camera.height, s, camera.width, s, -1)
@@ -335,8 +346,9 @@ def _light_pixels(
     fragments: Fragments,
     step: int,
 ) -> Float[Array, "hw 3"]:
-    """(h w, 3) colors of all pixels, white in the background; covered pixels are colored `step` at
-    a time.
+    """Returns the colors of all pixels (h w, 3), white in the background.
+
+    Covered pixels are colored `step` at a time.
     """
     ids, weights = fragments.face_ids.reshape(-1), fragments.barycentrics.reshape(-1, 3)
     covered = ids >= 0
@@ -374,8 +386,11 @@ def _color_points(
     weights: Float[Array, "p 3"],
     behind: Bool[Array, " p"],
 ) -> Float[Array, "p 3"]:
-    """(p, 3) colors of points on faces (p,): corners (p, 15), see `Scene`; their weights (p, 3);
-    inner sides (p,).
+    """Returns the colors (p, 3) of points on faces.
+
+    faces: index of each point's face (p,). corners: values of the corners of that face (p, 15), see
+    `Scene`. weights: the point's weights of the three corners (p, 3). behind: whether the inner
+    side of the face is seen (p,).
     """
     person = scene.person
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
@@ -394,7 +409,10 @@ def _color_points(
 def _sample(
     texture: UInt8[Array, "people t t 6"], person: Int[Array, ""], at: Float[Array, "p 2"]
 ) -> Float[Array, "p 6"]:
-    """(p, 6) texture of a person at (p, 2) places in [0, 1], v down, bilinear; bytes as floats."""
+    """Returns a person's texture (p, 6) at uv coordinates `at` (p, 2) in [0, 1], with v down.
+
+    Values are interpolated bilinearly; they are those of the bytes, as floats in 0 to 255.
+    """
     size = texture.shape[1]
     at = jnp.clip(at * size - 0.5, 0, size - 1)
     low = jnp.floor(at)
@@ -412,9 +430,9 @@ def _sample(
 
 
 def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
-    """The views of a world with left and right exchanged; joints: each one's mirror image.
+    """Returns views of the same person with left and right exchanged. The cameras are batched.
 
-    Batched cameras.
+    joints: for each joint, the index of the joint on the other side.
     """
     flip = jnp.asarray(MIRROR, views.images.dtype)
     side = jnp.asarray([-1.0, 1.0, 1.0], views.images.dtype)
@@ -434,27 +452,28 @@ def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
 
 @dataclasses.dataclass(frozen=True)
 class GeneratedSource:
-    """Examples that `make` computes from keys; all keys are of people of one split
-    (`subject.SPLITS`).
+    """Source of examples that `make` computes from random keys.
 
-    Raises: ValueError if there is no such split.
+    All keys are those of people of one split, see `subject.SPLITS`.
+
+    Raises: ValueError if there is no split of that name.
     """
 
     make: Callable[[Key, int], Example]
-    """Pure function, called as make(key, input_count); runs wherever it is jitted to run, usually
-    with the count static.
+    """Pure function that makes an example, called as make(key, input_count). The caller jits it,
+    usually with input_count static.
     """
     split: str = "train"
     """Name of the split that the people are from."""
     input_counts: tuple[int, ...] = (4,)
-    """How many photos an example may have as input, see `ViewSampling`."""
+    """Numbers of input photos that an example may have, see `ViewSampling`."""
     on_host: bool = False
-    """Whether arrays are brought to the host, where they mix with those of files and are divided
-    among devices.
+    """Whether the arrays of an example are copied to the host. There they can be mixed with
+    examples from files and divided among devices.
     """
     person_of: Callable[[Key, int], int] | None = None
-    """Called as person_of(key, input_count); gives the seed of the person that `make` shows. None:
-    the seed of the key.
+    """Function that returns the seed of the person that `make` shows, called as
+    person_of(key, input_count). None: the key was made from that seed.
     """
 
     def __post_init__(self):
@@ -470,8 +489,9 @@ class GeneratedSource:
         return len(SPLITS[self.split])
 
     def drawn_key(self, seed: int, index: int) -> Key:
-        """The key of the index-th example of a run: a random subject of the split, in its index-th
-        appearance.
+        """Returns the key of example number `index` of a run that `seed` starts.
+
+        The key is that of a random person of the split, in appearance number `index`.
         """
         return subject_key(self._person(seed, index), index)
 
@@ -500,7 +520,7 @@ def _described(person: int, appearance: int) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class EachPerson:
-    """Each person of a bank once, in order: people to compare on."""
+    """Source that shows each person of a bank once, in order, for comparisons."""
 
     bank: PeopleBank
     """The people."""
@@ -524,7 +544,7 @@ class EachPerson:
         return _described(int(self.bank.seeds[index % self.bank.people]), index)
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
-        """See `Source`. Who it is depends on the index alone, how they look on both."""
+        """See `Source`. The index decides the person, seed and index decide the appearance."""
         person = index % self.bank.people
         appearance = int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(APPEARANCES))
         key = subject_key(int(self.bank.seeds[person]), appearance)
@@ -536,8 +556,9 @@ class EachPerson:
 def jitted_example(
     bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY, person: int | None = None
 ) -> Example:
-    """`on_the_fly_example`, compiled once per configuration and shape of the bank; with
-    `CPU_COMPILER_OPTIONS` on a CPU.
+    """Calls `on_the_fly_example`, compiled once for each configuration and shape of the bank.
+
+    On a CPU it is compiled with `CPU_COMPILER_OPTIONS`.
     """
     return _compiled()(bank, key, config=config, person=person)
 
@@ -556,10 +577,10 @@ def on_the_fly_source(
     on_host: bool = False,
     each_once: bool = False,
 ) -> GeneratedSource | EachPerson:
-    """Examples of a bank for `Loader` and `Mixture`: random people of it, or each of them once, in
-    order.
+    """Makes a source of examples of a bank, for `Loader` and `Mixture`.
 
-    input_counts replace `config.input_views`; each is compiled once. on_host: see
+    each_once: whether each person of the bank is shown once, in order; otherwise people are random.
+    input_counts: replace `config.input_views`; each is compiled once. on_host: see
     `GeneratedSource`.
     """
     if each_once:
@@ -572,7 +593,7 @@ def on_the_fly_source(
         return jitted_example(bank, key, config=drawn(count))
 
     def person_of(key: Key, count: int) -> int:
-        """The seed of the person that `make` shows."""
+        """Returns the seed of the person that `make` shows."""
         number = _draw_numbers(bank, key, drawn(count))["person"]
         return int(bank.seeds[pick(number, bank.people)])
 

@@ -1,10 +1,9 @@
-"""What people wear, as choices: kinds of garments, their lengths and widths, their fabrics. No
-geometry.
+"""Chooses at random what a person wears: kinds of garments, their lengths, widths and fabrics.
 
-Lengths are in template coordinates (see `anatomy`): heights y for hems, |x| for the ends of
-sleeves. The tables below hold specifications of random numbers, see `drawn`. All rows of a table
-are drawn, whichever is used: a new row changes what every seed makes, so raise
-`subject.GENERATOR_VERSION` with it.
+The geometry is made elsewhere, in `wardrobe`. Lengths are in template coordinates (see `anatomy`):
+a height y for a hem, |x| for the end of a sleeve. The tables below hold specifications of random
+values, see `drawn`. `row` draws all rows of a table and uses one. A new row therefore changes what
+every seed makes: raise `subject.GENERATOR_VERSION` with it.
 """
 
 import dataclasses
@@ -50,11 +49,11 @@ class Garment:
     kind: str
     """Kind of garment, one of KINDS."""
     fabric: Fabric
-    """What it is made of."""
+    """The cloth, with its color and pattern."""
     sizes: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Numbers that its builder needs, by name."""
+    """Numbers that the builder of this kind needs, such as "sleeve" or "bottom", by name."""
     details: frozenset[str] = frozenset()
-    """Names of the features that it has, such as a hood or pockets."""
+    """Names of the garment's features, such as "hood" or "pockets"."""
 
 
 Odds = Mapping[str, float | int]
@@ -62,7 +61,7 @@ Odds = Mapping[str, float | int]
 
 @dataclasses.dataclass(frozen=True)
 class _Style:
-    """Clothes that go together."""
+    """Odds and probabilities of the clothes of one style, such as "casual"."""
 
     men: float
     """Odds of the style for men."""
@@ -77,9 +76,9 @@ class _Style:
     coats: Odds = dataclasses.field(default_factory=lambda: {"hooded_jacket": 1, "jacket": 1})
     """Odds of the kinds of coats and jackets."""
     outer: float = 0.06
-    """Probability of a coat or jacket over the others."""
+    """Probability of a coat or jacket over the other clothes."""
     tucked: float = 0.22
-    """Probability of a top that is tucked in."""
+    """Probability that the top is tucked in, where its kind allows that."""
     skirt: float = 0.12
     """Probability of a skirt, for women."""
     scarf: float = 0.1
@@ -196,19 +195,20 @@ _STYLES = {
 
 @dataclasses.dataclass(frozen=True)
 class _OneOf:
-    """One of some specifications, all of which are drawn."""
+    """Several specifications: `drawn` draws a value of each, and returns one of the values."""
 
     options: tuple
     """The specifications."""
     odds: tuple[float, ...] | None = None
-    """Odds of each; None for equal ones."""
+    """Probabilities of the specifications, which sum to 1. None: all are equal."""
 
 
 def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
-    """A random value: of (low, high) a uniform number, of a dict of odds a name, of `_OneOf` an
-    option, of a name a given value.
+    """Draws the random value that a specification describes.
 
-    Numbers stand for themselves.
+    The kind of the specification decides: (low, high) gives a uniform number in that range, a dict
+    of odds one of its names, `_OneOf` a value of one of its options. A name that is in `named`
+    gives that value. Anything else, such as a number, is returned as it is.
     """
     if isinstance(specification, tuple):
         return rng.uniform(*specification)
@@ -222,8 +222,9 @@ def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
 
 
 def row(rng: np.random.Generator, table: Mapping[str, Any], kind: str, **named: float) -> Any:
-    """The value of a kind of garment in a table of specifications, or that of "other"; all rows are
-    drawn.
+    """Draws all rows of a table of specifications, and returns the value of one kind of garment.
+
+    A kind without a row has the value of the row "other", or None where there is no such row.
     """
     values = {name: drawn(rng, specification, **named) for name, specification in table.items()}
     return values.get(kind, values.get("other"))
@@ -259,7 +260,7 @@ _TOP_DETAILS = (
     ("pocket", ("shirt", "polo", "blouse"), 0.5),
     ("open", ("shirt",), 0.2),
 )
-"""Feature, kinds that can have it, how often they do."""
+"""Features of tops: name, kinds of tops that can have it, probability for those kinds."""
 _LEG_ENDS = {"shorts": (-0.77, -0.56), "cropped": (-1.1, -0.93), "other": (-1.172, -1.14)}
 _LEG_WIDTHS = {
     "wide": (0.025, 0.065),
@@ -299,7 +300,7 @@ _SHAFTS = {
 
 
 def sample_outfit(rng: np.random.Generator, male: bool, years: float) -> tuple[Garment, ...]:
-    """Clothes that go together, innermost first; shoes and what is carried last."""
+    """Chooses clothes that go together, innermost first; shoes and accessories come last."""
     name = drawn(rng, {name: style.men if male else style.women for name, style in _STYLES.items()})
     style = _STYLES[name]
     outer = rng.random() < style.outer
@@ -327,7 +328,7 @@ def _made(
 
 
 def _separates(rng: np.random.Generator, name: str, male: bool, outer: bool) -> list[Garment]:
-    """A top with trousers or a skirt, and what is worn below an open shirt."""
+    """Chooses a top, and trousers or a skirt; an open shirt has a tee under it."""
     style = _STYLES[name]
     kind = drawn(rng, style.tops)
     if male and kind == "blouse":
@@ -360,7 +361,10 @@ def _top(
     tucked: bool,
     outer: bool,
 ) -> Garment:
-    """A top of a kind. outer: whether something is worn over it."""
+    """Chooses sizes, details and fabric of a top.
+
+    outer: whether a coat or jacket is worn over the top.
+    """
     long, short = WRIST - rng.uniform(0.0, 0.035), rng.uniform(0.27, 0.40)
     sleeve = row(rng, _SLEEVES, kind, long=long, short=short)
     necks = _NECKS
@@ -408,7 +412,7 @@ def _top(
 def _trousers(
     rng: np.random.Generator, style: _Style, male: bool, waist: float, tucked: bool, top: Garment
 ) -> Garment:
-    """Trousers that go with a top."""
+    """Chooses trousers of a style; `top` decides how low they may sit."""
     kind = drawn(rng, style.bottoms)
     if kind == "leggings" and male and rng.random() < 0.7:
         kind = "shorts"
@@ -442,7 +446,7 @@ def _trousers(
 
 
 def _skirt(rng: np.random.Generator, waist: float, tucked: bool) -> Garment:
-    """A skirt, narrow or flared."""
+    """Chooses a skirt, narrow or flared, that begins at height `waist`."""
     kind = drawn(rng, {"short_skirt": 3, "pleated_skirt": 1.5, "long_skirt": 2})
     if kind == "long_skirt":
         end = rng.uniform(-1.1, -0.84)
@@ -465,7 +469,7 @@ def _skirt(rng: np.random.Generator, waist: float, tucked: bool) -> Garment:
 
 
 def _pleats(rng: np.random.Generator, kind: str) -> dict[str, float]:
-    """How many pleats a skirt has, and their depth in metres."""
+    """Draws the number of pleats of a skirt and their depth in metres, by name."""
     count, depth = (4, 10), (0.004, 0.016)
     if kind == "pleated_skirt":
         count, depth = (14, 24), (0.008, 0.014)
@@ -473,7 +477,7 @@ def _pleats(rng: np.random.Generator, kind: str) -> dict[str, float]:
 
 
 def _dress(rng: np.random.Generator, outer: bool) -> list[Garment]:
-    """A dress. outer: whether something is worn over it."""
+    """Chooses a dress. outer: whether a coat or jacket is worn over it."""
     kind = drawn(rng, {"short_dress": 4, "long_dress": 3, "shirt_dress": 1.5})
     if kind == "long_dress":
         end = rng.uniform(-1.14, -0.85)
@@ -500,7 +504,7 @@ def _dress(rng: np.random.Generator, outer: bool) -> list[Garment]:
 
 
 def _outer(rng: np.random.Generator, style: _Style, worn: Sequence[Garment]) -> Garment:
-    """A jacket or a coat over what is worn."""
+    """Chooses a jacket or a coat over the clothes `worn`; a blazer may match the trousers."""
     kind = drawn(rng, style.coats)
     often_open = {"puffer": 0.4, "coat": 0.5, "cardigan": 0.85, "vest": 0.5}
     is_open = rng.random() < often_open.get(kind, 0.75)
@@ -531,7 +535,10 @@ def _outer(rng: np.random.Generator, style: _Style, worn: Sequence[Garment]) -> 
 def _shoes(
     rng: np.random.Generator, style: _Style, male: bool, worn: Sequence[Garment]
 ) -> list[Garment]:
-    """Shoes, and socks where they can be seen; boots go over narrow trousers only."""
+    """Chooses shoes, and socks where they can be seen.
+
+    Only women wear boots, and not with trousers that are too wide for them.
+    """
     lower = next(g for g in worn if g.kind in BOTTOMS + SKIRTS + DRESSES)
     kind = drawn(rng, style.shoes)
     covered = lower.kind in BOTTOMS and lower.sizes["end"] < -1.0
@@ -556,7 +563,7 @@ def _shoes(
 def _fastened(
     rng: np.random.Generator, style: str, male: bool, worn: Sequence[Garment]
 ) -> list[Garment]:
-    """Belt and tie: worn below what is worn outside."""
+    """Chooses a belt and a tie, or neither; a coat or jacket goes over both."""
     result = []
     trousers = next((g for g in worn if g.kind in BOTTOMS), None)
     belted = (
@@ -580,7 +587,7 @@ def _fastened(
 def _extras(
     rng: np.random.Generator, style: _Style, male: bool, years: float, worn: Sequence[Garment]
 ) -> list[Garment]:
-    """What is carried, or worn around the neck, on the head and on the wrist."""
+    """Chooses accessories: scarf, headwear, glasses, bag, watch and necklace, each or none."""
     kinds = {g.kind for g in worn}
     hooded = any("hood_up" in g.details for g in worn)
     result: list[Garment] = []

@@ -1,10 +1,9 @@
-"""A pose prior: plausible standing, striding, crouching and reaching people, within joint limits,
-their soles on the ground.
+"""A pose prior: draws plausible poses of people who stand, stride, crouch or reach.
 
-Stances place the feet and the pelvis. An arm draws many candidates within its limits and keeps the
-one whose wrist comes nearest to a goal, among those whose forearm and hand stay out of the trunk,
-the head, the legs and the other arm. Hands blend a few gestures. `anatomy` has the joints, their
-limits and the conventions.
+Poses keep to the limits of the joints, and soles are on the ground. A stance places the feet and
+the pelvis. For each arm many candidates are drawn. The one is kept whose wrist comes nearest to a
+goal and whose forearm and hand stay out of the trunk, the head, the legs and the other arm. Hands
+blend a few gestures. `anatomy` has the joints, their limits and the conventions.
 """
 
 import dataclasses
@@ -18,35 +17,36 @@ from humangs_jax.synthetic.anatomy import Joint
 from humangs_jax.synthetic.surfaces import choice
 
 _HAND_LENGTH = 0.6
-"""Length from the wrist to a little beyond the knuckles, in lengths of the forearm."""
+"""Distance from the wrist to a little beyond the knuckles, in lengths of the forearm."""
 _Capsule = tuple[kin.Vector, kin.Vector, float]
-"""Two ends and a radius, metres."""
+"""The two ends of a capsule (3,) and its radius, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Stance:
-    """Feet and pelvis before the person is turned.
+    """Where feet and pelvis are before the person is turned by a heading.
 
-    Lengths are in lengths of a leg, x to the left of the pelvis, z in front of it; angles in
-    radians.
+    Distances are in lengths of a leg, with x to the left of the pelvis and z in front of it. Angles
+    are in radians.
     """
 
     feet: kin.Feet
-    """Left and right foot."""
+    """The left and the right foot."""
     sink: float = 0.0
-    """How much lower the pelvis is than it could be."""
+    """How far the pelvis is below the highest place that the legs allow."""
     tilt: float = 0.0
     """Tilt of the pelvis forward."""
     roll: float = 0.0
     """Roll of the pelvis, positive with the left side up."""
     lean: float = 0.0
-    """How far forward the trunk bends to keep the balance."""
+    """Angle by which the trunk bends forward to keep the balance."""
 
 
 def _sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations) -> Stance:
-    """Set legs and pelvis in `rotations`, keeping the pelvis's heading; returns the stance.
+    """Draws a stance and sets legs and pelvis in `rotations`; returns the stance.
 
-    Stances beyond the limits of the joints are drawn again; after 20 the person stands upright.
+    The heading of the pelvis stays. A stance that exceeds the limits of the joints is drawn again;
+    after 20 such stances the person stands upright.
     """
     heading, width = rotations[Joint.PELVIS, 1], build.hip_width / build.leg
     for _ in range(20):
@@ -64,8 +64,12 @@ def _sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Ro
 def take_stance(
     build: kin.Build, rotations: kin.Rotations, heading: float, stance: Stance
 ) -> tuple[kin.Vector, float]:
-    """Set pelvis and legs. Returns the pelvis's position, the ground at y = 0, and the larger error
-    of the two feet, metres.
+    """Sets pelvis and legs of a stance in `rotations`.
+
+    heading: turn of the person about y, radians.
+
+    Returns: the position of the pelvis (3,) over the ground at y = 0, and the larger distance by
+    which an ankle misses its place, both in metres.
     """
     turn = kin.turned(y=heading) @ kin.turned(x=stance.tilt, z=stance.roll)
     rotations[Joint.PELVIS] = kin.rotation_vector(turn)
@@ -77,7 +81,10 @@ def take_stance(
 
 
 def in_world(feet: kin.Feet, leg: float, heading: float) -> kin.Feet:
-    """The feet of a stance (lengths in legs, unturned) in metres, turned by the heading."""
+    """Converts the feet of a stance to metres, and turns them by the heading (radians).
+
+    leg: length of a leg, metres.
+    """
     placed = []
     for foot in feet:
         x, _, z = kin.turned(y=heading) @ np.asarray([foot.x * leg, 0.0, foot.z * leg])
@@ -93,7 +100,11 @@ def _pair(
     apart: tuple[float, float] = (0.0, 0.06),
     turn_out: tuple[float, float] = (-0.05, 0.35),
 ) -> list[kin.Foot]:
-    """Two flat feet about as far apart as the hips."""
+    """Draws two flat feet, left and right, each about as far from the middle as its hip.
+
+    width: distance of a hip from the middle. spread: range of what is added to it. apart: range of
+    the shift of a foot forward or back. turn_out: range of the angle outwards.
+    """
     feet = []
     for sign in (1, -1):
         x = sign * (width + rng.uniform(*spread))
@@ -106,12 +117,12 @@ def _pair(
 
 
 def _stand(rng: np.random.Generator, width: float) -> Stance:
-    """Both feet on the ground."""
+    """Draws a stance with both feet flat on the ground."""
     return Stance(tuple(_pair(rng, width)), sink=rng.uniform(0.0, 0.015), roll=rng.normal(0, 0.02))
 
 
 def _contrapposto(rng: np.random.Generator, width: float) -> Stance:
-    """The weight on one foot, the other one relaxed in front."""
+    """Draws a stance with the weight on one foot and the relaxed foot in front."""
     feet, relaxed = _pair(rng, width), int(rng.integers(2))
     sign = 1 if relaxed == 0 else -1
     shift = rng.uniform(0.4, 1.0) * width * sign  # the standing foot comes below the pelvis
@@ -124,7 +135,7 @@ def _contrapposto(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _stride(rng: np.random.Generator, width: float) -> Stance:
-    """One foot in front of the other, as in walking."""
+    """Draws a stance with one foot in front of the other, as in walking."""
     feet = _pair(rng, 0.75 * width, spread=(-0.02, 0.03), turn_out=(-0.05, 0.2))
     front = int(rng.integers(2))
     length, share = rng.uniform(0.25, 0.85), rng.uniform(0.35, 0.6)
@@ -144,7 +155,7 @@ def _stride(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _wide(rng: np.random.Generator, width: float) -> Stance:
-    """Feet wide apart."""
+    """Draws a stance with the feet wide apart."""
     feet = _pair(rng, width, spread=(0.12, 0.35), turn_out=(0.05, 0.5))
     return Stance(
         tuple(feet), sink=rng.choice([0.0, rng.uniform(0, 0.15)]), roll=rng.normal(0, 0.03)
@@ -152,7 +163,7 @@ def _wide(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _squat(rng: np.random.Generator, width: float) -> Stance:
-    """Knees bent, on the heels or, further down, on the toes."""
+    """Draws a stance with bent knees. In a deep squat only the toes touch the ground."""
     depth = rng.uniform(0.08, 0.42)
     feet = _pair(rng, width, spread=(0.03, 0.2), turn_out=(0.1, 0.6))
     heels = rng.uniform(0.2, 0.6) if depth > 0.3 else 0.0
@@ -161,7 +172,7 @@ def _squat(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _lunge(rng: np.random.Generator, width: float) -> Stance:
-    """One foot far in front, the other one far behind on its toes."""
+    """Draws a stance with one foot far in front and the other far behind, on its toes."""
     feet, front = _pair(rng, width, turn_out=(-0.05, 0.2)), int(rng.integers(2))
     feet[front] = dataclasses.replace(feet[front], z=rng.uniform(0.4, 0.7))
     feet[1 - front] = dataclasses.replace(
@@ -176,7 +187,7 @@ def _lunge(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _side_lunge(rng: np.random.Generator, width: float) -> Stance:
-    """Feet far apart, the weight on a bent leg."""
+    """Draws a stance with feet far apart and the weight on one bent leg."""
     feet, bent = _pair(rng, width, spread=(0.2, 0.4), turn_out=(0.1, 0.5)), int(rng.integers(2))
     sign = 1 if bent == 0 else -1
     feet = [dataclasses.replace(foot, x=foot.x - sign * rng.uniform(0.1, 0.3)) for foot in feet]
@@ -189,7 +200,7 @@ def _side_lunge(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _one_leg(rng: np.random.Generator, width: float) -> Stance:
-    """One foot in the air: a raised knee, a kick, a foot behind."""
+    """Draws a stance with one foot in the air: raised knee, kick, foot behind, or foot aside."""
     feet, raised = _pair(rng, width), int(rng.integers(2))
     sign = 1 if raised == 0 else -1
     feet = [dataclasses.replace(foot, x=foot.x + 0.6 * width * sign) for foot in feet]
@@ -209,7 +220,7 @@ def _one_leg(rng: np.random.Generator, width: float) -> Stance:
 
 
 def _tiptoe(rng: np.random.Generator, width: float) -> Stance:
-    """On the toes of both feet."""
+    """Draws a stance on the toes of both feet."""
     pitch = rng.uniform(0.3, 0.8)
     feet = [dataclasses.replace(foot, pitch=pitch) for foot in _pair(rng, width)]
     return Stance(tuple(feet), sink=rng.uniform(0, 0.03))
@@ -226,20 +237,20 @@ STANCES: dict[str, tuple[float, Callable[[np.random.Generator, float], Stance]]]
     "one leg": (0.07, _one_leg),
     "tiptoe": (0.02, _tiptoe),
 }
-"""Name -> probability, and a function of a generator and the distance of a hip from the middle in
-legs.
+"""Stances by name: the probability, and the function that draws such a stance.
+
+It takes a generator and the distance of a hip from the middle, in lengths of a leg.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class _Goal:
-    """Target of a wrist. Angles are in radians; pairs are ranges."""
+    """Where a wrist should be, and how the arm may bend. Pairs are ranges, angles in radians."""
 
     odds: float
-    """Odds of being drawn."""
+    """Odds of this goal."""
     place: tuple[float, float, float]
-    """Place of the left wrist relative to the shoulder, in arm lengths, in the axes of the chest.
-    """
+    """Place of the left wrist relative to the shoulder: axes of the chest, lengths of the arm."""
     raised: tuple[float, float] = (-1.45, -0.1)
     """Elevation of the upper arm; 0 is horizontal."""
     forward: tuple[float, float] = (-0.5, 1.4)
@@ -247,7 +258,7 @@ class _Goal:
     flexed: tuple[float, float] = (0.05, 2.2)
     """Bend of the elbow."""
     collar: float = -0.08
-    """How much the collar is raised, radians."""
+    """Angle by which the collar is raised."""
 
 
 _GOALS = {
@@ -272,7 +283,7 @@ ARMS = (
 
 
 def draw_goal(rng: np.random.Generator) -> str:
-    """The name of a goal."""
+    """Draws the name of a goal."""
     return choice(rng, {name: goal.odds for name, goal in _GOALS.items()})
 
 
@@ -284,11 +295,14 @@ def bend_arm(
     side: int,
     other_arm: bool = False,
 ) -> float:
-    """Set collar, shoulder, elbow and wrist of one side (0 left, 1 right) in `rotations`; trunk,
-    head and legs must be set.
+    """Sets collar, shoulder, elbow and wrist of one side in `rotations`.
 
-    other_arm: keep clear of the other arm, too. Returns how clear the arm is (metres, negative: it
-    is not).
+    Trunk, head and legs must be set before.
+
+    goal: a name that `draw_goal` returns. side: 0 for left, 1 for right. other_arm: whether to keep
+    clear of the other arm too; it must then be set before.
+
+    Returns: the distance of forearm and hand from the body, metres; negative where they are inside.
     """
     matrix, vector = kin.rotation_matrix, kin.rotation_vector
     collar, shoulder, elbow, wrist = ARMS[side]
@@ -339,8 +353,9 @@ def bend_arm(
 
 
 def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
-    """How far (metres) both forearms and hands are from the body and each other; negative if one is
-    inside.
+    """Returns the least distance of the forearms and hands from the body and from the other arm.
+
+    In metres; negative if a forearm or hand is inside.
     """
     world, positions = kin.joint_positions(build, rotations)
     body, worst = _body_capsules(build, world, positions), np.inf
@@ -355,7 +370,10 @@ def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
 def _body_capsules(
     build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations
 ) -> list[_Capsule]:
-    """Trunk, legs and head of a posed body: two ends (3,) and a radius each, metres."""
+    """Returns capsules that stand for trunk, legs and head of a posed body.
+
+    world: rotations of the joints in the world. positions: of the joints, metres.
+    """
     sideways = 0.25 * (positions[Joint.LEFT_HIP] - positions[Joint.RIGHT_HIP])
     top = positions[Joint.NECK] + world[Joint.SPINE3] @ np.asarray([0, -0.06, 0])
     head = positions[Joint.HEAD] + world[Joint.HEAD] @ np.asarray([0, 0.09, 0.03])
@@ -371,7 +389,10 @@ def _body_capsules(
 
 
 def _arm_capsules(build: kin.Build, positions: kin.Rotations, side: int) -> list[_Capsule]:
-    """Upper arm, forearm and hand of one side."""
+    """Returns two capsules of one side: the upper arm, and the forearm with the hand.
+
+    side: 0 for left, 1 for right.
+    """
     _, shoulder, elbow, wrist = (positions[joint] for joint in ARMS[side])
     radius = build.arm_radius + 0.01
     return [(shoulder, elbow, radius), (elbow, wrist + _HAND_LENGTH * (wrist - elbow), radius)]
@@ -380,7 +401,10 @@ def _arm_capsules(build: kin.Build, positions: kin.Rotations, side: int) -> list
 def _clearance(
     build: kin.Build, capsules: list[_Capsule], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
+    """Returns the distance of an arm around each point from the nearest capsule (n,), metres.
+
+    The radii of arm and capsule are subtracted; the distance is negative inside.
+    """
     distances = []
     for a, b, radius in capsules:
         axis = b - a
@@ -392,14 +416,14 @@ def _clearance(
 def _along(
     elbows: Float[np.ndarray, "*n 3"], wrists: Float[np.ndarray, "*n 3"]
 ) -> list[Float[np.ndarray, "*n 3"]]:
-    """Points of the forearm and the hand that must not touch the body."""
+    """Returns five points from elbow to knuckles, which must not touch the body."""
     tips = wrists + _HAND_LENGTH * (wrists - elbows)
     return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]
 
 
 _FINGERS = ((0, 1.0), (1, 0.15), (3, -1.2), (2, -0.6))
-"""Index, middle, pinky, ring, in the order of SMPL-X's joints: place among a gesture's curls, share
-of its spread.
+"""Index, middle, pinky and ring finger, in the order of SMPL-X's joints. Each has its place among a
+gesture's curls, and the factor of the gesture's spread.
 """
 _GESTURES = {
     "relaxed": (0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25),
@@ -411,13 +435,15 @@ _GESTURES = {
     "thumb up": (0.03, (1.2, 1.3, 1.3, 1.3), 0.0, -0.4),
     "hold": (0.11, (0.65, 0.7, 0.75, 0.8), 0.05, 0.6),
 }
-"""Odds; curl of index, middle, ring and pinky, radians a knuckle; angle between fingers; how far
-the thumb lies across the palm, 0 beside it, 1 across."""
+"""Gestures by name. Each has its odds; the curl of index, middle, ring and pinky, radians per
+knuckle; the angle between fingers, radians; and how far the thumb lies across the palm, from 0
+(beside the palm) to 1 (across it)."""
 
 
 def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> None:
-    """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a
-    random gesture.
+    """Sets the 15 joints of one hand in `rotations`, between relaxed and a random gesture.
+
+    side: 0 for left, 1 for right.
     """
     if side == 0:
         first, mirror = Joint.LEFT_HAND, np.ones(3)
@@ -447,8 +473,9 @@ def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> 
 
 
 def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotations:
-    """(j, 3) rotation vectors of a random plausible pose; the lowest points of planted feet are at
-    one height.
+    """Draws the rotation vectors (j, 3) of a plausible pose, radians.
+
+    The lowest points of all feet that stand on the ground are at one height.
     """
     rotations = np.zeros((kin.JOINTS, 3))
     rotations[Joint.PELVIS] = [0.0, rng.uniform(-0.7, 0.7), 0.0]
@@ -469,10 +496,10 @@ def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotation
 def bend_trunk(
     rng: np.random.Generator, rotations: kin.Rotations, lean: float, roll: float
 ) -> None:
-    """Set spine, neck and head in `rotations`.
+    """Sets spine, neck and head in `rotations`, at random around given angles.
 
-    lean: how far the trunk bends forward, about. roll: of the pelvis, left side up, which the spine
-    evens out.
+    lean: mean angle by which the trunk bends forward, radians. roll: angle of the pelvis, radians,
+    positive with the left side up; the spine bends against it.
     """
     bowed = rng.random() < 0.08
     lean = lean + rng.normal(0.03, 0.07) + (rng.uniform(0.2, 0.7) if bowed else 0.0)

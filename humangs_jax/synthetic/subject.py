@@ -1,15 +1,14 @@
-"""A synthetic person from a seed: who it is (`describe`), and its mesh, materials, lights and build
-(`make_subject`).
+"""Makes a synthetic person from a seed, and renders the person in a pose.
 
-Also its views in a pose: rasterized at twice the size, shaded per pixel, box-averaged.
+`describe` makes the description: a few numbers, in milliseconds, so that thousands of people can be
+counted without any geometry. `make_subject` builds mesh, materials and lights from it, and the
+measures that the pose prior needs. Views are rasterized at twice their size, shaded at each sample,
+and averaged.
 
-A description is a few numbers and takes milliseconds; thousands can be counted without building any
-geometry.
-
-Seeds and keys are for training, validation, test and documentation; the ranges share no person. A
-seed names a person. Written people are made from the seed by numpy; people made on the fly from its
-keys, whose words are (appearance, seed), so that the person, and the split, can be read off every
-key.
+A seed names a person. Each purpose, such as training or testing, has a range of seeds (`SPLITS`),
+and the ranges share no person. People that are written to files are made from the seed, by numpy.
+People on the fly are made from keys, whose two words are (appearance, seed): every key shows which
+person and which split it belongs to.
 """
 
 import dataclasses
@@ -70,13 +69,16 @@ SPLITS = {
     # people that the presets of speed and accuracy are chosen on
     "tradeoff": range(5_000_000, 5_001_000),
 }
-"""Seeds by what they are for; the ranges share no person."""
+"""Ranges of seeds by purpose. No person is in two ranges."""
 APPEARANCES = 2**32
-"""How many appearances a person has."""
+"""Number of appearances that a person has."""
 
 
 def split_of(seed: int) -> str:
-    """Name of the range that a seed lies in. Raises ValueError if it lies in none."""
+    """Returns the name of the split that a seed belongs to.
+
+    Raises: ValueError if it belongs to none.
+    """
     for name, seeds in SPLITS.items():
         if seed in seeds:
             return name
@@ -85,9 +87,9 @@ def split_of(seed: int) -> str:
 
 
 def seeds_of(split: str, first: int, count: int) -> range:
-    """`count` seeds of a split from its `first`-th on.
+    """Returns `count` seeds of a split, from number `first` on.
 
-    Raises ValueError if they reach beyond the split.
+    Raises: ValueError if the split has no such seeds.
     """
     people = SPLITS[split]
     if first < 0 or count < 1 or first + count > len(people):
@@ -99,7 +101,7 @@ def seeds_of(split: str, first: int, count: int) -> range:
 
 
 def subject_key(seed: int, appearance: int = 0) -> Key:
-    """The key of a person; further appearances (other clothes, pose, light) have further keys.
+    """Returns the random key of a person in an appearance: dyes of the clothes, poses and light.
 
     Raises: ValueError if the seed lies in no range of `SPLITS`.
     """
@@ -124,7 +126,7 @@ class Person:
     """The description of a synthetic person."""
 
     seed: int
-    """Seed that everything about the person is drawn from."""
+    """The seed of the person, from which all fields are drawn."""
     betas: Float[np.ndarray, " s"]
     """Shape coefficients of the body, (s,)."""
     male: bool
@@ -140,11 +142,11 @@ class Person:
     garments: tuple[Garment, ...]
     """Clothes, shoes and accessories, innermost first."""
     lights: Lights
-    """What the person stands in."""
+    """The light around the person."""
 
 
 def describe(seed: int, body: BodyModel) -> Person:
-    """The person of a seed, unbuilt."""
+    """Describes the person of a seed, without building any geometry."""
     rng = np.random.default_rng([seed, 0])
     male = bool(rng.random() < 0.5)
     years = float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS))
@@ -161,7 +163,7 @@ def describe(seed: int, body: BodyModel) -> Person:
 def _sample_shape(
     rng: np.random.Generator, body: BodyModel, male: bool, years: float
 ) -> tuple[np.ndarray, float]:
-    """(s,) shape coefficients and the stature in metres that they give."""
+    """Draws shape coefficients (s,); returns them and the stature in metres that they give."""
     at = {name: i for i, name in enumerate(body.shape_names)}
     # coefficients without another rule: standard deviation 0.55, at most twice that
     betas = np.clip(rng.normal(0, 1, len(at)), -2, 2) * 0.55
@@ -199,24 +201,27 @@ class SyntheticSubject:
     betas: Float[np.ndarray, " s"]
     """Shape coefficients of the body, (s,)."""
     surface: Surface
-    """The mesh at rest with attributes `template`, `cloth`."""
+    """The mesh at rest, with the attributes `template` and `cloth` of its vertices."""
     face_materials: Int[np.ndarray, " f"]
     """Index of each face's material, (f,)."""
     materials: tuple[Material, ...]
     """Materials of skin, eyes, clothes and hair, in this order."""
     lights: Lights
-    """What the person stands in."""
+    """The light around the person."""
     build: Build
-    """What the pose prior knows of the body."""
+    """Joints and radii of the body, which the pose prior needs."""
     cover: Field
-    """How far a vertex of the skin lies inside of a hem, (n,), metres; negative on bare skin and on
-    everything else.
+    """How far each vertex of the skin lies inside of a hem, (n,), metres. Negative on bare skin and
+    on everything that is not skin.
     """
     person: Person
-    """The description that all of this was built from."""
+    """The description that the other fields were built from."""
 
     def posed_vertices(self, rotations: Rotations, translation: Vector) -> Points:
-        """(n, 3) world positions of the mesh in a pose: rotations (j, 3), translation (3,)."""
+        """Returns the mesh's vertices in a pose, in the world (n, 3), metres.
+
+        rotations: of the joints (j, 3), axis-angle, radians. translation: of the body (3,), metres.
+        """
         # by the pose prior's own kinematics: no compilation, the same on every backend
         world, positions = joint_positions(self.build, np.asarray(rotations, np.float64))
         moved = positions - np.einsum("jab,jb->ja", world, self.build.joints) + translation
@@ -225,23 +230,27 @@ class SyntheticSubject:
         return np.einsum("nij,nj->ni", blended[..., :3], self.surface.vertices) + blended[..., 3]
 
     def vertices_of(self, piece: int) -> Bool[np.ndarray, " n"]:
-        """Which vertices belong to a piece, by the number of its material."""
+        """Returns for each vertex whether it belongs to a piece (n,).
+
+        piece: the index of the piece's material in `materials`.
+        """
         found = np.zeros(len(self.surface.vertices), bool)
         found[self.surface.faces[self.face_materials == piece]] = True
         return found
 
 
 SKIN = 0
-"""The number of the skin's material."""
+"""Index of the skin in `SyntheticSubject.materials`."""
 _shape = jax.jit(shape_body)
 
 
 def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> SyntheticSubject:
-    """The person of a seed. person: another description than that of the seed, such as one in other
-    clothes.
+    """Builds the person of a seed.
 
-    Raises: ValueError if the body is not the package's own: cuts and paint are given in its
-    coordinates.
+    person: the description to build, such as one with other clothes. None: that of the seed.
+
+    Raises: ValueError if the body is not the package's body; the cuts and the paint of clothes are
+    given in the coordinates of that one.
     """
     if (body.name, len(body.template)) != BODY:
         raise ValueError(f"synthetic people need the shipped body '{BODY[0]}', got '{body.name}'")
@@ -291,9 +300,10 @@ def _host_arrays(
 ) -> tuple[
     Points, Int[np.ndarray, "f 3"], Float[np.ndarray, "n j"], float, Float[np.ndarray, " s"]
 ]:
-    """Template, faces, weights; height of the mean body, metres (s,) that each coefficient adds.
+    """Returns numpy arrays of a body, which are kept for the body that was used last.
 
-    Kept for the body used last.
+    Returns: template (n, 3), faces (f, 3), skinning weights (n, j), the height of the mean body in
+    metres, and the metres (s,) that a unit of each shape coefficient adds to that height.
     """
     if id(body) not in _HOST:
         template, faces, weights = (
@@ -317,7 +327,10 @@ def _host_arrays(
 def _hair(
     rng: np.random.Generator, anatomy: Anatomy, person: Person, over: float, hooded: bool
 ) -> list[wardrobe.Piece]:
-    """The pieces of hair; what a hat or hood covers is left out."""
+    """Makes the pieces of hair, without what a hat or hood covers.
+
+    over: how far clothes stand off the trunk, as `hair.style` takes it.
+    """
     material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
     haircut = person.haircut
     if hooded:
@@ -333,7 +346,7 @@ def _hair(
 
 
 def _build(anatomy: Anatomy, surface: Surface) -> Build:
-    """Radii of the dressed body for the pose prior."""
+    """Measures the radii of the dressed body for the pose prior."""
     chest = anatomy.trunk.radii[(anatomy.trunk.levels > -0.35) & (anatomy.trunk.levels < 0.0)]
     depth = float(np.median(0.5 * (chest[:, 0] + chest[:, chest.shape[1] // 2])))
     thigh = float(
@@ -360,10 +373,11 @@ def _build(anatomy: Anatomy, surface: Surface) -> Build:
 def expressed_subject(
     subject: SyntheticSubject, body: BodyModel, coefficients: Float[np.ndarray, " e"]
 ) -> SyntheticSubject:
-    """The person with another face: coefficients of the body's expressions. Eyes do not turn, and
-    there are no teeth.
+    """Returns the person with an expression of the face. Eyes do not turn, and there are no teeth.
 
-    Raises: ValueError for a body without expressions.
+    coefficients: of the body's expressions (e,).
+
+    Raises: ValueError if the body has no expressions.
     """
     if body.expressions is None:
         raise ValueError(f"body '{body.name}' has no expressions")
@@ -384,9 +398,9 @@ def expressed_subject(
 
 
 SUPERSAMPLING = 2
-"""Samples of a pixel in each direction."""
+"""Number of samples of a pixel along each of its sides."""
 _POINT_STEP = 1 << 15
-"""Points that are colored at once."""
+"""Number of points that are colored at a time."""
 
 _shaded_vertices = jax.jit(surroundings.shaded_vertices)
 _seen_from_behind = jax.jit(surroundings.seen_from_behind)
@@ -397,7 +411,7 @@ _Values = Float[np.ndarray, "m 3"]
 
 @dataclasses.dataclass(frozen=True)
 class PosedSubject:
-    """A person in one pose, with what its light needs."""
+    """A person in one pose, with the values at vertices that shading needs."""
 
     subject: SyntheticSubject
     """The dressed person."""
@@ -418,7 +432,7 @@ class PosedSubject:
 def pose_subject(
     subject: SyntheticSubject, rotations: Rotations, translation: Vector
 ) -> PosedSubject:
-    """Skin the mesh and gather what its shading needs."""
+    """Poses the mesh of a person, and computes the values at vertices that shading needs."""
     faces, count = subject.surface.faces, len(subject.surface.vertices)
     vertices = subject.posed_vertices(rotations, translation).astype(np.float32)
     normals = vertex_normals(vertices, faces)
@@ -433,8 +447,10 @@ def pose_subject(
 def padded(
     vertices: Points, faces: Faces
 ) -> tuple[Float[Array, "n_padded 3"], Int[Array, "f_padded 3"]]:
-    """A mesh with repeated vertices and faces without area up to the next multiple of 4096 and of
-    8192: few shapes are compiled.
+    """Pads a mesh, so that functions are compiled for few shapes.
+
+    Vertices are padded to a multiple of 4096 with copies of the first vertex, faces to a multiple
+    of 8192 with faces without area.
     """
     spare_vertices, spare_faces = -len(vertices) % 4096, -len(faces) % 8192
     vertices = np.concatenate([vertices, np.repeat(vertices[:1], spare_vertices, axis=0)]).astype(
@@ -446,7 +462,10 @@ def padded(
 def render_view(
     posed: PosedSubject, camera: Camera, background: float = 1.0
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """(h, w, 3) image on the background and (h, w) coverage of one camera, both in [0, 1]."""
+    """Renders a posed person in one camera.
+
+    Returns: the image (h, w, 3), and the covered share of each pixel (h, w), both in [0, 1].
+    """
     s, subject = SUPERSAMPLING, posed.subject
     fine = camera.resized(camera.width * s, camera.height * s)
     fragments = rasterize_mesh(*padded(posed.vertices, subject.surface.faces), fine)
@@ -470,11 +489,11 @@ def light_points(
     slopes: _Values,
     eye: Array | None = None,
 ) -> _Values:
-    """Colors (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the
-    weights of the corners.
+    """Returns the colors (m, 3) of points on faces, in the subject's light.
 
-    eye: camera centre (3,), which decides whether the inner side of cloth is seen; None: everything
-    is seen from outside.
+    face_ids: index of each point's face (m,). weights: the point's weights of the three corners (m,
+    3). albedo, slopes: as `paint` returns them. eye: centre of the camera (3,), which decides where
+    the inner side of cloth is seen. None: everything is seen from outside.
     """
     subject, faces = posed.subject, posed.subject.surface.faces
     values = np.concatenate([posed.normals, posed.openness[:, None], posed.lit[:, None]], axis=1)
@@ -502,7 +521,11 @@ def light_points(
 
 
 def spots_at(subject: SyntheticSubject, face_ids: _Ids, weights: _Values) -> Spots:
-    """Points on faces, given by the weights of their corners, as materials see them."""
+    """Returns coordinates of points on faces, as materials take them.
+
+    face_ids: index of each point's face (m,). weights: the point's weights of the three corners (m,
+    3).
+    """
     attributes = subject.surface.attributes
     values = np.concatenate([attributes["cloth"], attributes["template"]], axis=1)
     corners = subject.surface.faces[face_ids]
@@ -511,8 +534,9 @@ def spots_at(subject: SyntheticSubject, face_ids: _Ids, weights: _Values) -> Spo
 
 
 def paint(subject: SyntheticSubject, face_ids: _Ids, spots: Spots) -> tuple[_Values, _Values]:
-    """The materials at points on given faces: albedo (m, 3) and slope (m, 3) of the painted
-    folds.
+    """Returns the albedo (m, 3) of points on faces, and the slope (m, 3) of their painted folds.
+
+    face_ids: index of each point's face (m,). spots: the points, as `spots_at` returns them.
     """
     material_ids = subject.face_materials[face_ids]
     albedo = np.empty((len(face_ids), 3), np.float32)

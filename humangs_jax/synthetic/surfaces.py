@@ -1,16 +1,16 @@
-"""Triangle surfaces on the host: cuts along a level set, smoothing, hems, tubes; and convex
-silhouettes of body parts.
+"""Triangle surfaces on the host, convex silhouettes of body parts, and random functions.
 
-A `Surface` carries per-vertex attributes through every operation: a garment cut out of the body
-keeps its skinning weights, its cloth coordinates and the skin point below it. Metres; faces
-counter-clockwise seen from outside; float32.
+Surfaces can be cut along a level set, smoothed, hemmed and joined, and tubes can be made. A
+`Surface` carries the attributes of its vertices through every operation: a garment that is cut out
+of the body keeps its skinning weights, its cloth coordinates and the skin point below it. Lengths
+are in metres, arrays are float32, and faces are counter-clockwise seen from outside.
 
-`Boundaries` say what taut cloth around a part of the body measures. The part is cut across an axis
-into slices; the silhouette of a slice is its radius around the slice's centre at `ANGLES` angles,
-angle 0 at +z and growing towards +x (for slices across y).
+`Boundaries` are the silhouettes of taut cloth around a part of the body. The part is cut across an
+axis into slices. The silhouette of a slice is its radius around the slice's centre at `ANGLES`
+angles. For slices across y, angle 0 is at +z and angles grow towards +x.
 
-Also random choices, and smooth random functions of position: plane waves (cheap, band-limited),
-lattice noise (irregular).
+Random functions of position are sums of plane waves, which are cheap and band-limited, and lattice
+noise, which is irregular.
 """
 
 import dataclasses
@@ -24,14 +24,15 @@ from humangs_jax.rendering.mesh.atlas import Faces, Points, edges_of, unit
 
 
 def choice(rng: np.random.Generator, odds: Mapping[str, float | int]) -> str:
-    """One of the names, by its odds."""
+    """Draws one of the names, by their odds, which need not sum to 1."""
     shares = np.asarray(list(odds.values()), float)
     return str(rng.choice(list(odds), p=shares / shares.sum()))
 
 
 class Ripples:
-    """A random band-limited function of points with features of a wavelength: a sum of plane waves,
-    of unit amplitude or so.
+    """A random smooth function of points: a sum of plane waves around a wavelength in metres.
+
+    The amplitude is about 1.
     """
 
     def __init__(self, rng: np.random.Generator, wavelength: float, waves: int = 6):
@@ -43,20 +44,21 @@ class Ripples:
         self.amplitude = np.float32(np.sqrt(2 / waves) * 0.7)
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """(n,) values at (n, 3) points."""
+        """Returns the values (n,) at points (n, 3)."""
         return self.amplitude * np.sin(points.astype(np.float32) @ self.k + self.phase).sum(-1)
 
 
 def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) -> np.ndarray:
-    """(n,) values of new `Ripples` at points (n, 3)."""
+    """Draws new `Ripples` and returns their values (n,) at points (n, 3)."""
     return Ripples(rng, wavelength)(points)
 
 
 class Folds:
-    """Creases of cloth: ridges in a few directions, each in separate patches. The same object is
-    the same function always.
+    """A random function of points that describes creases of cloth.
 
-    upright: all of them run along y.
+    It has ridges in a few directions, each direction in separate patches. All randomness is drawn
+    when the object is made. wavelength: of the ridges, about, metres. upright: whether all
+    directions are close to the y axis.
     """
 
     def __init__(
@@ -79,7 +81,7 @@ class Folds:
         self.patches = [Ripples(rng, 4 * wavelength) for _ in range(directions)]
 
     def slope(self, points: np.ndarray) -> np.ndarray:
-        """(n, 3) slopes at (n, 3) points, about 1 on the flanks of a crease, 0 between patches."""
+        """Returns slopes (n, 3) at points (n, 3): about 1 beside a ridge, 0 between patches."""
         points = points.astype(np.float32)
         total, warp = np.zeros_like(points), 3.0 * self.warp(points)
         for k, direction, phase, patch in zip(
@@ -95,8 +97,9 @@ class Folds:
 
 
 def lattice(points: np.ndarray, seed: int) -> np.ndarray:
-    """(n,) value noise in [0, 1] of (n, d) points: random values on the integer lattice, blended
-    smoothly; d = 1, 2 or 3.
+    """Returns value noise (n,) in [0, 1] at points (n, d), where d is 1, 2 or 3.
+
+    Points of the integer lattice have random values, which are blended smoothly between them.
     """
     base = np.floor(points)
     t = (points - base).astype(np.float32)
@@ -113,7 +116,10 @@ def lattice(points: np.ndarray, seed: int) -> np.ndarray:
 
 
 def hashed(cells: np.ndarray, seed: int) -> np.ndarray:
-    """(n,) uniform [0, 1) numbers of integer cells (n, d), the same for the same cell and seed."""
+    """Returns a number in [0, 1) for each integer cell: cells (n, d) -> (n,).
+
+    The numbers look uniformly random. Cell and seed decide them.
+    """
     primes = np.asarray([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint64)[: cells.shape[1]]
     mixed = (cells.astype(np.uint64) * primes).sum(-1, dtype=np.uint64) + np.uint64(
         seed * 0x27D4EB2F & 0xFFFFFFFF
@@ -148,46 +154,47 @@ class Surface:
 
     @property
     def template(self) -> Points:
-        """(n, 3) template coordinates, see `anatomy`."""
+        """The template coordinates of the vertices (n, 3), see `anatomy`."""
         return self.attributes["template"]
 
     def moved(self, vertices: Points) -> "Surface":
-        """The same surface with other vertex positions."""
+        """Returns the surface with other positions of its vertices (n, 3)."""
         return dataclasses.replace(self, vertices=np.asarray(vertices, np.float32))
 
     def mapped(self, function: Callable[[np.ndarray], np.ndarray], faces: np.ndarray) -> "Surface":
-        """Other faces, and one function of every array over the vertices."""
+        """Returns a surface with other faces, and a function applied to all arrays of vertices."""
         attributes = {name: function(value) for name, value in self.attributes.items()}
         return Surface(
             function(self.vertices), faces.astype(np.int32), function(self.weights), attributes
         )
 
     def with_attributes(self, **attributes: np.ndarray) -> "Surface":
-        """The same surface with more (or other) attributes."""
+        """Returns the surface with these attributes added, or replaced where the names exist."""
         return dataclasses.replace(self, attributes={**self.attributes, **attributes})
 
     def painted(self, template: Points, cloth: Points, girth: float) -> "Surface":
-        """The same surface with template and cloth coordinates; girth: radius that turns angles
-        into metres.
+        """Returns the surface with template and cloth coordinates, each (n, 3).
+
+        girth: the radius that turns angles into metres; it becomes the fourth cloth coordinate.
         """
         cloth = np.concatenate([cloth, np.full((len(cloth), 1), girth)], 1).astype(np.float32)
         return self.with_attributes(template=np.asarray(template, np.float32), cloth=cloth)
 
 
 def rigid(vertices: Points, faces: Faces, joint: int, joints: int) -> Surface:
-    """A surface whose vertices all follow one joint; joints: how many there are."""
+    """Makes a surface whose vertices all follow one joint. joints: number of all joints."""
     weights = np.zeros((len(vertices), joints), np.float32)
     weights[:, joint] = 1
     return Surface(np.asarray(vertices, np.float32), faces, weights)
 
 
 def vertex_normals(vertices: Points, faces: Faces) -> Points:
-    """(n, 3) area-weighted unit normals."""
+    """Returns the unit normals of vertices (n, 3), where faces count by their area."""
     return unit(vertex_area_vectors(vertices, faces).astype(np.float32))
 
 
 def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
-    """(e, 2) directed edges that only one face has: the hems."""
+    """Returns the directed edges (e, 2) that only one face has; these are the hems."""
     edges = edges_of(faces).astype(np.int64)
     count = int(faces.max()) + 1
     keys = np.minimum(edges[:, 0], edges[:, 1]) * count + np.maximum(edges[:, 0], edges[:, 1])
@@ -196,11 +203,10 @@ def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
 
 
 def smooth(values: _Values, faces: Faces, iterations: int, keep_hems: bool = False) -> _Values:
-    """Laplacian smoothing of vertex values (n, c): each step moves a vertex halfway towards the
-    mean of its neighbours.
+    """Smooths values of vertices (n, c). Each iteration moves them halfway to neighbours' means.
 
-    keep_hems: vertices on the boundary only feel their neighbours on the boundary, so that hems
-    stay crisp and do not shrink.
+    keep_hems: whether vertices on the boundary only follow neighbours on the boundary, so that hems
+    stay crisp.
     """
     count = len(values)
     edges = edges_of(faces)
@@ -224,7 +230,7 @@ def smooth(values: _Values, faces: Faces, iterations: int, keep_hems: bool = Fal
 
 
 def compact(surface: Surface, face_mask: Bool[np.ndarray, " f"]) -> Surface:
-    """The faces chosen by a (f,) mask and only the vertices they use."""
+    """Returns the faces where a mask (f,) is true, with only the vertices that they use."""
     faces = surface.faces[face_mask]
     used = np.zeros(len(surface.vertices), bool)
     used[faces] = True
@@ -232,7 +238,10 @@ def compact(surface: Surface, face_mask: Bool[np.ndarray, " f"]) -> Surface:
 
 
 def cut(surface: Surface, field: Field) -> Surface:
-    """The part where a per-vertex field (n,) is positive, cut exactly along its zero line."""
+    """Returns the part of a surface where a field is positive, cut exactly along its zero line.
+
+    field: one number for each vertex (n,), linear between vertices.
+    """
     field = np.where(np.abs(field) < 1e-6, 1e-6, field).astype(np.float32)
     inside = field > 0
     count = inside[surface.faces].sum(1)
@@ -264,7 +273,7 @@ def cut(surface: Surface, field: Field) -> Surface:
 
 
 def join(surfaces: list[Surface]) -> Surface:
-    """Several surfaces as one; only attributes that all of them have are kept."""
+    """Joins surfaces into one. Only attributes that all surfaces have are kept."""
     offsets = np.cumsum([0] + [len(s.vertices) for s in surfaces[:-1]])
     names = set.intersection(*(set(s.attributes) for s in surfaces))
     return Surface(
@@ -278,8 +287,9 @@ def join(surfaces: list[Surface]) -> Surface:
 
 
 def turn_in_hems(surface: Surface, depth: float) -> Surface:
-    """A strip folded inwards along every boundary, `depth` metres against the normal: cloth seen
-    edge-on has a thickness.
+    """Adds a strip along every boundary that is folded inwards, so that cloth looks thick.
+
+    depth: metres by which the strip goes against the normal.
     """
     hems = boundary_edges(surface.faces)
     if len(hems) == 0:
@@ -294,10 +304,10 @@ def turn_in_hems(surface: Surface, depth: float) -> Surface:
 
 
 def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
-    """Triangles of a (rows, columns) grid of vertices, row-major; `closed`: the last column joins
-    the first.
+    """Returns the triangles of a grid of vertices, which are numbered row by row.
 
-    Counter-clockwise seen from the side where columns run to the right and rows run down.
+    Triangles are counter-clockwise seen from where columns run to the right and rows run down.
+    closed: whether the last column is joined to the first.
     """
     gaps = columns if closed else columns - 1
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(gaps), indexing="ij")
@@ -312,7 +322,10 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
 
 
 def ball(rows: int, columns: int) -> tuple[Points, Faces]:
-    """Unit vectors on a grid of polar angles (from +y) and azimuths (from +z), and its faces."""
+    """Makes the vertices and faces of a unit ball.
+
+    Vertices lie on a grid of polar angles from +y (rows) and azimuths from +z (columns).
+    """
     down, azimuth, faces = tube(
         np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns
     )
@@ -322,7 +335,7 @@ def ball(rows: int, columns: int) -> tuple[Points, Faces]:
 def tube(
     levels: Float[np.ndarray, " r"], angles: Float[np.ndarray, " c"]
 ) -> tuple[Field, Field, Faces]:
-    """The level and the angle of every vertex (n,) of a tube, row by row, and its faces."""
+    """Makes a tube: the level (n,) and the angle (n,) of each vertex, row by row, and the faces."""
     faces = grid_faces(len(levels), len(angles), closed=True)
     return np.repeat(levels, len(angles)), np.tile(angles, len(levels)), faces
 
@@ -334,12 +347,14 @@ def sweep(
     columns: int = 10,
     closed: bool = False,
 ) -> tuple[Points, Faces]:
-    """Vertices (m columns, 3) and faces of a tube of elliptic sections along a path (m, 3).
+    """Makes a tube of elliptic sections along a path (m, 3).
 
-    across: (3,) or (m, 3) along the first half axis, made normal to the path. widths: half axes,
-    metres; one, or (m, 1 or 2).
-    closed: the path's end joins its start; otherwise the ends are open (let the widths run out to
-    close them).
+    across: direction of the first half axis of a section, (3,) or (m, 3); it is made normal to the
+    path. widths: half axes in metres: one number, or (m, 1) or (m, 2). columns: number of vertices
+    of a section. closed: whether the path's end joins its start; otherwise both ends are open.
+    Widths that shrink to 0 close an end.
+
+    Returns: vertices (m columns, 3) and faces.
     """
     if closed:
         along = np.roll(path, -1, 0) - np.roll(path, 1, 0)
@@ -357,15 +372,17 @@ def sweep(
 
 
 def circle(count: int) -> Field:
-    """(count,) angles all around from 0 on."""
+    """Returns evenly spaced angles all around, from 0 on, (count,), radians."""
     return np.arange(count) * (2 * np.pi / count)
 
 
 def around(
     radius: Field | float | int, angle: Field, height: Field, center: np.ndarray | tuple = (0, 0)
 ) -> Points:
-    """(n, 3) points at radii (n,) and angles (n,) around the vertical axis through center (x,
-    z).
+    """Returns points (n, 3) around the vertical axis through center (x, z).
+
+    radius: distances from the axis, one or (n,). angle: from +z towards +x, radians, (n,). height:
+    y of the points (n,).
     """
     return np.stack(
         [center[0] + radius * np.sin(angle), height, center[1] + radius * np.cos(angle)], -1
@@ -373,34 +390,34 @@ def around(
 
 
 ANGLES = 48
-"""Directions of a silhouette."""
+"""Number of directions of a silhouette."""
 _EMPTY = 1e-3
 """Radius of a slice without points, metres."""
 _GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
 _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
-"""radius(a) = min over b of support(b) / cos(a - b)."""
+"""The 1 / cos(a - b) of: radius(a) = min over b of support(b) / cos(a - b)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Boundaries:
-    """Silhouettes of a part of the body, in slices along an axis. Metres."""
+    """Silhouettes of a part of the body, in slices along an axis. All lengths are in metres."""
 
     levels: np.ndarray
     """Positions of the slices along the axis, (l,), increasing."""
     centers: np.ndarray
     """Centres of the slices, across the axis, (l, 2)."""
     radii: np.ndarray
-    """Distances from the centres in each direction, (l, ANGLES)."""
+    """Distance of each silhouette from its centre in each direction, (l, ANGLES)."""
 
     def center(self, level: np.ndarray) -> np.ndarray:
-        """(n, 2) centre of the slice at each position along the axis."""
+        """Returns the centres (n, 2) of slices at positions along the axis (n,), interpolated."""
         return np.stack(
             [np.interp(level, self.levels, self.centers[:, i]) for i in range(2)], -1
         ).astype(np.float32)
 
     def radius(self, level: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        """(n,) radius at positions along the axis and angles around it, bilinear."""
+        """Returns radii (n,) at positions along the axis and angles around it, interpolated."""
         t = np.clip(
             np.interp(level, self.levels, np.arange(len(self.levels))), 0, len(self.levels) - 1.001
         )
@@ -412,7 +429,10 @@ class Boundaries:
 
 
 def polar(across: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Angle and radius of points across the axis (n, 2) = (x, z) around centres (n, 2)."""
+    """Returns the angles (n,), radians, and radii (n,) of points around centres.
+
+    across: (x, z) of the points, (n, 2). center: (n, 2).
+    """
     d = across - center
     return np.arctan2(d[:, 0], d[:, 1]), np.sqrt(np.sum(d * d, -1))
 
@@ -420,10 +440,11 @@ def polar(across: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def boundaries(
     along: Field, across: np.ndarray, levels: np.ndarray, centers: np.ndarray | None, window: float
 ) -> Boundaries:
-    """Silhouettes of the points with position `along` (n,) on the axis and (n, 2) across it.
+    """Measures the convex silhouettes of points in slices along an axis.
 
-    levels: (l,) increasing. centers: (l, 2), or None for the middle of each slice. window: half
-    thickness of a slice, metres.
+    along: positions of the points on the axis (n,). across: the points' other two coordinates (n,
+    2). levels: positions of the slices, increasing (l,). centers: of the slices (l, 2). None: the
+    middle of each slice. window: half of the thickness of a slice, metres.
     """
     directions = np.stack([np.sin(_GRID), np.cos(_GRID)])
     support = np.full((len(levels), ANGLES), _EMPTY)
@@ -448,7 +469,7 @@ def boundaries(
 
 
 def blurred(shape: Boundaries, times: int = 1) -> Boundaries:
-    """Radii averaged over neighbouring slices and angles."""
+    """Averages radii over neighbouring slices and angles, `times` times."""
     radii = shape.radii
     for _ in range(times):
         padded = np.concatenate([radii[:1], radii, radii[-1:]])
@@ -458,8 +479,9 @@ def blurred(shape: Boundaries, times: int = 1) -> Boundaries:
 
 
 def hanging(shape: Boundaries, slope: float) -> Boundaries:
-    """Cloth that hangs: it keeps the largest radius of the slices above it, less `slope` metres per
-    metre.
+    """Returns silhouettes of cloth that hangs from the wider slices above.
+
+    Downwards a radius shrinks by at most `slope` metres per metre.
     """
     radii = shape.radii.copy()
     for i in range(len(radii) - 2, -1, -1):

@@ -1,10 +1,11 @@
-"""What is around a person: cameras and light, for written people from a numpy generator, for those
-made on the fly on the device.
+"""Makes cameras and light around a synthetic person, and shades the person's surface.
 
-Cameras like those of the published protocol: around the person, vertical field of view 60 degrees,
-near the horizon. Soft light: sky and ground, three wide lights, occlusion and soft shadows; a point
-has one color from wherever it is seen. Occlusion and the shadow of the key light are per vertex,
-from a voxel grid that holds the posed person.
+People that are written to files get both from a numpy generator; people made on the fly get both
+from random numbers on the device. Cameras are like those of the published protocol: around the
+person, near the horizon, with a vertical field of view of 60 degrees. The light is soft: sky,
+ground, three wide lights, occlusion and soft shadows. A point has the same color from wherever it
+is seen. Occlusion and the shadow of the key light are computed at vertices, in a voxel grid that
+holds the posed person.
 """
 
 import functools
@@ -29,32 +30,33 @@ _VERTICAL_FOV = np.deg2rad(60.0)
 _ELEVATION = np.deg2rad(np.asarray([-5.0, 15.0]))
 """Range of elevations of cameras, radians."""
 DISTANCE_FACTOR = (1.8, 2.2)
-"""Range of distances in bounding radii: nearer than 1.7 the frame cuts heads and feet."""
+"""Range of distances of cameras, in bounding radii. Nearer than 1.7, heads and feet are cut off."""
 _CLOSE_FACTOR = (0.8, 1.7)
-"""Range of distances of close views, which show parts of the person."""
+"""Range of distances of close cameras, in bounding radii; they show parts of the person."""
 CLOSE_SPREAD = 0.85
-"""Close cameras look at points up to this share of the way from the middle of the person to its
-surface.
+"""A close camera looks at a point between the middle of the person and the surface: at most this
+share of the way to the surface.
 """
 CLEARANCE = 0.3
-"""Metres: close cameras come no nearer to a point of the surface than this."""
+"""Least distance of a close camera from the surface, metres."""
 CAMERA_NUMBERS = 5
-"""Random numbers of a camera."""
+"""Number of random numbers that make a camera."""
 Angles = Float[np.ndarray, " v"]
 _Number = Float[Array, ""] | float
 _Each = Float[Array | np.ndarray, "3 ..."]
-"""Values of three lights or channels."""
+"""Values of three lights or of three color channels."""
 
 
 def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
-    """Middle of the bounding box (3,) and the largest distance from it."""
+    """Returns the middle of the bounding box (3,) and the largest distance from it, metres."""
     center = 0.5 * (vertices.min(0) + vertices.max(0))
     return center, float(np.linalg.norm(vertices - center, axis=1).max())
 
 
 def spread_azimuths(rng: np.random.Generator, count: int) -> Angles:
-    """(count,) sorted azimuths, evenly spread from a random start, each moved by up to 0.3 of the
-    spacing.
+    """Draws sorted azimuths all around (count,), radians.
+
+    They are evenly spaced from a random start, and each is then moved by up to 0.3 of the spacing.
     """
     spacing = 2 * np.pi / count
     start = rng.uniform(0, spacing)
@@ -64,8 +66,9 @@ def spread_azimuths(rng: np.random.Generator, count: int) -> Angles:
 def cameras_around(
     rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int
 ) -> Camera:
-    """A batch of cameras at the azimuths, distances and elevations drawn from the protocol's
-    ranges.
+    """Makes a batch of square cameras that see the whole person, one for each azimuth in radians.
+
+    Distances and elevations are drawn from the ranges of the protocol.
     """
     center, radius = bounding_sphere(vertices)
     distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
@@ -84,8 +87,10 @@ def cameras_around(
 def close_cameras(
     rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int
 ) -> Camera:
-    """A batch of cameras that see parts: `_CLOSE_FACTOR` bounding radii away from points between
-    middle and surface.
+    """Makes a batch of square cameras that see parts of a person, one for each azimuth in radians.
+
+    Each looks at a point between the middle of the person and the surface, `_CLOSE_FACTOR` bounding
+    radii away, and farther where the surface would be nearer than `CLEARANCE`.
     """
     center, radius = bounding_sphere(vertices)
     count = len(azimuths)
@@ -114,7 +119,10 @@ def _orbits(
     azimuths: Float[Array, " v"],
     elevations: Float[Array, " v"],
 ) -> Camera:
-    """Makes a batch of cameras, one for each target that is looked at."""
+    """Makes a batch of square cameras of `size` pixels, one for each target that is looked at.
+
+    distances: from the targets, metres. azimuths, elevations: radians.
+    """
     K = intrinsics_from_fov(_VERTICAL_FOV, size, size)
 
     def one(target, distance, azimuth, elevation):
@@ -132,10 +140,10 @@ def camera_from(
     close: _Number,
     size: int,
 ) -> Camera:
-    """A square camera of `size` pixels that looks at a posed person from an azimuth.
+    """Makes a square camera of `size` pixels that looks at a posed person.
 
-    u: (5,) in [0, 1). count: vertices that are no padding. close: probability of a close camera;
-    others see all of the person.
+    u: random numbers in [0, 1), (5,). count: number of vertices before the padding. azimuth:
+    radians. close: probability of a close camera; any other camera sees the whole person.
     """
     is_close, tilt, spread, outwards, place = u
     low, high = vertices.min(0), vertices.max(0)
@@ -160,8 +168,10 @@ def camera_from(
 def _nearest_distance(
     ahead: Float[Array, " n"], above: Float[Array, " n"], aside: Float[Array, " n"]
 ) -> Scalar:
-    """Least distance from the origin at which a camera that looks at it has all points within 98 %
-    of its square frame.
+    """Returns how far from the origin a camera must be to see all points, metres.
+
+    The camera looks at the origin and has all points within 98 % of its square frame. ahead, above,
+    aside: coordinates of the points along the camera's `_axes`.
     """
     slope = 0.98 * np.tan(_VERTICAL_FOV / 2)
     return jnp.max(jnp.maximum(jnp.abs(above), jnp.abs(aside)) / slope + ahead)
@@ -181,7 +191,10 @@ def _within(limits: tuple[float, float] | Float[np.ndarray, "2"], share: Scalar)
 
 
 def _axes(azimuth: _Number, elevation: Scalar) -> tuple[Vector3, Vector3, Vector3]:
-    """Unit vectors towards a camera, up and right in its image."""
+    """Returns unit vectors (3,) towards a camera, up in its image, and right in its image.
+
+    azimuth, elevation: of the camera, radians.
+    """
     sa, ca, se, ce = jnp.sin(azimuth), jnp.cos(azimuth), jnp.sin(elevation), jnp.cos(elevation)
     zero = jnp.zeros_like(sa)
     return (
@@ -194,8 +207,9 @@ def _axes(azimuth: _Number, elevation: Scalar) -> tuple[Vector3, Vector3, Vector
 def _along_axes(
     points: Float[Array, "n 3"], azimuth: _Number, elevation: Scalar
 ) -> tuple[Float[Array, " n"], ...]:
-    """Coordinates (n,) along `_axes`; written out: matrix products are of low precision on GPU and
-    TPU.
+    """Returns the coordinates of points along the three `_axes`, each (n,).
+
+    Sums are written out, because matrix products have low precision on GPU and TPU.
     """
     return tuple(jnp.sum(points * axis, -1) for axis in _axes(azimuth, elevation))
 
@@ -206,10 +220,13 @@ def azimuths_from(
     scattered_share: float,
     count: Int[Array, ""] | None = None,
 ) -> Float[Array, " v"]:
-    """(v,) azimuths all around from a random start, each off by up to half `jitter` of the spacing;
-    or anywhere.
+    """Makes azimuths of v cameras, radians: evenly spaced, or with a given probability scattered.
 
-    u: 2 + 2 v numbers in [0, 1). count: how many go around once; None: all.
+    Evenly spaced azimuths have a random start, and each is off by up to half of `jitter` times the
+    spacing. Scattered azimuths lie anywhere.
+
+    u: 2 + 2 v random numbers in [0, 1). scattered_share: probability of scattered azimuths. count:
+    number of evenly spaced azimuths that go around once. None: all v.
     """
     v = len(u) // 2 - 1
     scattered, start, offsets, places = u[0], u[1], u[2 : 2 + v], u[2 + v :]
@@ -219,7 +236,7 @@ def azimuths_from(
 
 
 def pick(u: Float[Array, "*b"], count: Int[Array, ""] | int) -> Int[Array, "*b"]:
-    """One of the numbers 0 .. count - 1 for each u in [0, 1)."""
+    """Returns one of the integers 0 .. count - 1 for each u in [0, 1)."""
     return jnp.minimum((u * count).astype(jnp.int32), count - 1)
 
 
@@ -230,17 +247,17 @@ def pick(u: Float[Array, "*b"], count: Int[Array, ""] | int) -> Int[Array, "*b"]
 CELL = 0.025
 """Edge of a voxel of the occupancy grid, metres."""
 GRID = (112, 104, 80)
-"""Voxels along x, y and z, more than any pose takes: what lies outside casts no shadow."""
+"""Numbers of voxels along x, y and z. Any pose fits in; what lies outside casts no shadow."""
 DARKEST = 0.4
-"""Least share of the key light that arrives."""
+"""Least share of the key light that arrives at a point in shadow."""
 SHOULDER = 0.72
 """Brightness from which highlights are compressed."""
 WHITEST = 0.97
-"""Brightness that they approach."""
+"""Brightness that compressed highlights approach."""
 LIGHT_NUMBERS = 28
-"""Random numbers of a scene of lights."""
+"""Number of random numbers that make the lights of a scene."""
 _WARM = np.asarray([1.0, 0.0, -1.0])
-"""Direction of a warm color in RGB."""
+"""Direction in RGB from a neutral to a warm color."""
 
 _SCENES = {
     "studio": (0.34, (-0.8, 0.8), (0.5, 1.0), (0.5, 0.75), (0.18, 0.34), (0.68, 0.82), 0.0, 0.68),
@@ -249,11 +266,11 @@ _SCENES = {
     "room": (0.16, (-2.0, 2.0), (0.8, 1.35), (0.4, 0.7), (0.1, 0.3), (0.6, 0.78), 0.12, 0.78),
     "window": (0.08, (0.9, 1.9), (0.1, 0.5), (0.8, 1.1), (0.04, 0.15), (0.5, 0.66), -0.08, 0.8),
 }
-"""Kinds of light: odds; azimuth and elevation of the key light (radians), its strength, that of the
-fill, the sky's; how much warmer the key is than the sky; and the ground's brightness against the
-sky's."""
+"""Kinds of light. Each row has, in this order: odds of the kind; ranges of the key light's azimuth
+and elevation, radians; ranges of the strengths of key light, fill light and sky; how much warmer
+the key light is than the sky; and the ground's brightness divided by the sky's."""
 _SCENE_ROWS = np.asarray([np.hstack(row) for row in _SCENES.values()], np.float32)
-"""The same as numbers, for the device."""
+"""The rows of `_SCENES` as an array, for the device."""
 
 
 _Vectors = Float[Array, "*p 3"]
@@ -262,7 +279,7 @@ _Values = Float[Array, "*p"]
 
 @pytree_dataclass
 class Lights:
-    """What a person stands in: some lights, ambient light, and a camera that exposes for them."""
+    """The light that a person stands in, and the camera's exposure and white balance."""
 
     directions: Float[Array, "k 3"]
     """Unit directions towards the lights, (k, 3), the key light first."""
@@ -277,8 +294,9 @@ class Lights:
 
 
 def sample_lights(rng: np.random.Generator) -> Lights:
-    """A studio, an overcast or a sunny day, a lit room or a window; exposed and balanced by a
-    camera that errs.
+    """Draws light of a random kind: a studio, an overcast or sunny day, a lit room or a window.
+
+    The camera's exposure and white balance have random errors.
     """
     scene = _SCENES[choice(rng, {name: row[0] for name, row in _SCENES.items()})]
     _, azimuths, heights, key, fill, sky_range, warmth, bounce = scene
@@ -299,7 +317,10 @@ def sample_lights(rng: np.random.Generator) -> Lights:
 
 
 def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
-    """The scenes of `sample_lights` on the device; u: `LIGHT_NUMBERS` numbers in [0, 1)."""
+    """Makes light of the kinds of `sample_lights` on the device.
+
+    u: `LIGHT_NUMBERS` random numbers in [0, 1).
+    """
     odds = np.cumsum(_SCENE_ROWS[:, 0])
     # the first number chooses the scene, as its odds say
     row = jnp.asarray(_SCENE_ROWS)[jnp.sum(u[0] * odds[-1] >= odds[:-1])]
@@ -346,7 +367,12 @@ def _lights(
     ground: _Each,
     gain: _Each,
 ) -> Lights:
-    """numpy: the module of the arrays' kind."""
+    """Makes lights of their angles, strengths and tints.
+
+    numpy: the module that the arrays belong to, numpy or jax.numpy. angles, elevations: of the
+    three lights, radians. power: strengths of the three lights. tint: deviations of their colors
+    (3, 3). warmth: of the key light.
+    """
     flat = numpy.cos(elevations)
     directions = numpy.stack(
         [flat * numpy.sin(angles), numpy.sin(elevations), flat * numpy.cos(angles)], -1
@@ -363,12 +389,14 @@ def shaded_vertices(
     direction: Float[Array, "3"],
     faces: Int[Array, "f 3"] | None = None,
 ) -> tuple[_Values, _Values]:
-    """(n,) openness in [0.35, 1] and (n,) share of the light from `direction` that arrives, in
-    [DARKEST, 1].
+    """Returns how much light reaches each vertex of a posed person.
 
-    faces: where they are given, as for training on the fly, their middles fill the grid as well
-    (meshes may have edges longer than a voxel), and the way to the light is sampled at the nearest
-    voxels, which takes an eighth of the lookups.
+    faces: given for training on the fly. Their middles then fill the grid too, because meshes may
+    have edges longer than a voxel; and the way to the light is sampled at the nearest voxels, which
+    takes an eighth of the lookups.
+
+    Returns: the openness of each vertex to its surroundings (n,), in [0.35, 1], and the share of
+    the light from `direction` that arrives at each vertex (n,), in [DARKEST, 1].
     """
     low = vertices.min(0) - 6 * CELL  # empty voxels around the person
     points, towards_light = vertices, _trilinear
@@ -380,7 +408,7 @@ def shaded_vertices(
     grid = _blurred(jnp.zeros(GRID, points.dtype).at[x, y, z].set(1.0, mode="drop"))
 
     def place(points):
-        """Where points are in the grid, voxels."""
+        """Returns the fractional indices of points in the grid."""
         return (points - low) / CELL - 0.5
 
     # openness: what is found at two distances from the surface, metres
@@ -394,8 +422,9 @@ def shaded_vertices(
 
 
 def _blurred(grid: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
-    """Means over 3 x 3 x 3 voxels, twice; by banded matrices, which XLA does not unroll into one
-    huge expression.
+    """Replaces each voxel twice by the mean over the 3 x 3 x 3 voxels around it.
+
+    It multiplies with banded matrices, which XLA does not unroll into one huge expression.
     """
     for axis, size in enumerate(GRID):
         apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
@@ -407,8 +436,9 @@ def _blurred(grid: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
 
 
 def _nearest(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Grid values (n,) at the voxels nearest to fractional indices (n, 3), 0 outside of the
-    grid.
+    """Returns the grid's values (n,) at the voxels nearest to fractional indices `at` (n, 3).
+
+    Values outside of the grid are 0.
     """
     x, y, z = jnp.round(at).astype(jnp.int32).T
     size = jnp.asarray(GRID)
@@ -418,8 +448,9 @@ def _nearest(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Arra
 
 
 def _trilinear(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Grid values (n,) at fractional indices (n, 3); outside of the grid those of its border, which
-    is empty.
+    """Interpolates the grid's values (n,) at fractional indices `at` (n, 3).
+
+    Outside of the grid they are the values at its border, which is empty.
     """
     base = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, jnp.asarray(GRID) - 2)
     t = jnp.clip(at - base, 0, 1)
@@ -437,7 +468,7 @@ def _trilinear(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Ar
 def seen_from_behind(
     vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], eye: Float[Array, "3"]
 ) -> Bool[Array, " f"]:
-    """(f,) whether a point sees the inner side of a face."""
+    """Returns for each face whether the point `eye` sees the inner side of it, (f,)."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return jnp.sum(jnp.cross(b - a, c - a) * (eye - a), axis=-1) < 0
 
@@ -451,11 +482,12 @@ def light_points(
     slopes: _Vectors,
     sheen: _Values,
 ) -> _Vectors:
-    """Colors (p, 3) of points on faces.
+    """Returns the colors (p, 3) of points on faces.
 
-    corners: (p, 15) normal (3), openness and share of the key light of each corner of the point's
-    face. weights: of the corners.
-    behind: (p,) whether the inner side is seen. albedo, slopes, sheen: of the material there.
+    corners: values of the three corners of each point's face (p, 15). Each corner has five: normal
+    (3), openness, and the share of the key light that arrives. weights: the point's weights of the
+    three corners (p, 3). behind: whether the inner side of the face is seen (p,). albedo, slopes,
+    sheen: of the material at the point.
     """
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
     blended = wa * corners[:, :5] + wb * corners[:, 5:10] + wc * corners[:, 10:]
@@ -475,8 +507,10 @@ def shade(
     lit: _Values,
     sheen: _Values,
 ) -> _Vectors:
-    """Colors in [0, 1] of points; normals are unit, `lit` is the share of the key light that
-    arrives.
+    """Returns the colors in [0, 1] of points under the lights.
+
+    normals: unit vectors. openness: how much of the surroundings a point sees. lit: share of the
+    key light that arrives. sheen: strength of the gloss.
     """
     up = 0.5 + 0.5 * normals[..., 1:2]
     light = (lights.ground + (lights.sky - lights.ground) * up) * openness[..., None]
@@ -494,8 +528,9 @@ def shade(
 
 
 def rolled_off(colors: _Vectors) -> _Vectors:
-    """Colors from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns
-    out at once.
+    """Compresses highlights, as film and cameras do, so that no color is suddenly white.
+
+    Values up to SHOULDER stay, higher ones approach WHITEST, and negative ones become 0.
     """
     reach = WHITEST - SHOULDER
     colors = jnp.maximum(colors, 0)
@@ -511,10 +546,16 @@ def _unit(vectors: _Vectors) -> _Vectors:
 def dyes_from(
     u: Float[Array, "4 m"], groups: Int[Array, " m"], dyeable: Float[Array, " m"]
 ) -> Float[Array, "m 3 3"]:
-    """(m, 3, 3) matrices that recolor each piece: hue, saturation and brightness of cloth.
+    """Makes a matrix for each piece that changes the hue, saturation and brightness of its cloth.
 
-    Pieces of one group are dyed alike. u: in [0, 1). Hues are turned about the grey axis for half
-    of the pieces, brightness changes for all.
+    The hue is turned about the grey axis for half of the groups of pieces; saturation and
+    brightness change for all of them. Pieces of one group are dyed alike, and pieces that are not
+    dyeable have the identity.
+
+    u: random numbers in [0, 1), (4, m). groups: the number of each piece's group (m,). dyeable:
+    more than 0 where a piece may be dyed (m,).
+
+    Returns: matrices (m, 3, 3).
     """
     turned, turn, pale, bright = u
     hue = jnp.where(turned < 0.5, 2 * np.pi * (turn - 0.5), 0.0)

@@ -1,5 +1,6 @@
-"""Clothes built: every `Garment` becomes surfaces with materials, layer on layer, and hides what
-lies well below it.
+"""Dresses a body: builds the surfaces and materials of garments, layer on layer.
+
+Each garment hides the skin and cloth that lie well below it.
 """
 
 import dataclasses
@@ -17,22 +18,22 @@ from humangs_jax.synthetic.tailoring import HEM_MARGIN, Fit, shell, skirt
 from humangs_jax.synthetic.trimmings import PADDED, QUILT, sewn
 
 _Cut = tuple[Callable[..., np.ndarray], *tuple[Any, ...]]
-"""A field of `tailoring` over template points, and its further arguments."""
+"""A function of `tailoring` that takes template points first, and its further arguments."""
 
 _LAYER = 0.006
-"""What one layer is further out than the one below it, metres."""
+"""Distance of a layer from the layer below it, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """One surface of one material."""
+    """A part of a dressed person: one surface, of one material."""
 
     surface: Surface
     """The mesh of the piece."""
     material: Material
-    """How it looks."""
+    """The material of the piece."""
     hidden: np.ndarray | None = None
-    """Vertices that a later layer covers, (n,); None if it knows no template coordinates."""
+    """Whether a later layer covers each vertex, (n,). None: no layer hides any of the piece."""
 
     def visible(self) -> "Piece":
         """The piece without the faces whose corners are all hidden."""
@@ -44,18 +45,18 @@ class Piece:
 
 @dataclasses.dataclass
 class Outfit:
-    """What has been put on so far."""
+    """A body and what has been put on it so far."""
 
     anatomy: Anatomy
     """The body that is dressed."""
     pieces: list[Piece]
-    """What has been put on, innermost first."""
+    """The pieces of clothes that have been put on, innermost first."""
     cover: np.ndarray
-    """How far inside of some hem each body vertex is, (n,), metres; negative on bare skin."""
+    """How far each body vertex is inside of a hem, (n,), metres; negative on bare skin."""
     removed: np.ndarray
-    """Body vertices that are hidden, (n,)."""
+    """Whether clothes hide each body vertex, (n,)."""
     rng: np.random.Generator
-    """Random numbers of the garment that is put on."""
+    """Generator of the garment that is being put on."""
     trunk: float = 0.0
     """Distance of the outermost layer on the trunk from the skin, metres."""
     legs: float = 0.0
@@ -65,26 +66,27 @@ class Outfit:
 
     @property
     def template(self) -> np.ndarray:
-        """Template coordinates (n, 3) of the body's vertices."""
+        """The template coordinates (n, 3) of the body's vertices."""
         return self.anatomy.skin.template
 
     @property
     def lowest(self) -> float:
-        """Template height of the hem of the innermost piece."""
+        """The template height of the lowest vertex of the innermost piece."""
         return float(self.pieces[0].surface.template[:, 1].min())
 
     def add(self, surface: Surface, material: Material, layered: bool = True) -> None:
-        """Put one more piece on. layered: whether later layers can hide parts of it."""
+        """Puts a piece on. layered: whether later layers can hide parts of it."""
         shown = None
         if layered:
             shown = np.zeros(len(surface.vertices), bool)
         self.pieces.append(Piece(surface, material, shown))
 
     def hide(self, cover: Callable[[Points], Field], margin: float, cloth: bool = True) -> None:
-        """Take away what lies further than a margin inside of a garment that is put on next: skin,
-        and cloth if it is below.
+        """Hides what lies more than a margin inside of the hems of the garment that is put on next.
 
-        cover: template points (n, 3) -> (n,) metres inside of its hems, negative outside.
+        cover: function of template points (n, 3) that returns how far they are inside of the
+        garment's hems (n,), metres, negative outside. margin: metres; at least
+        30 mm for cloth. cloth: whether cloth is hidden too; otherwise only skin is.
         """
         field = cover(self.template)
         self.cover = np.maximum(self.cover, field)
@@ -103,8 +105,10 @@ class Outfit:
         finish: Callable[[Surface], Surface] = lambda surface: surface,
         over: bool = True,
     ) -> None:
-        """A shell where all cuts (a function of template points, and its further arguments) are
-        positive, and what it hides.
+        """Puts on a shell around the body, and hides what lies below the shell.
+
+        The shell covers the body where all cuts are positive. finish: a function that changes the
+        shell's surface. margin, over: as `margin` and `cloth` of `hide`.
         """
 
         def fields(points: Points) -> list[Field]:
@@ -115,12 +119,15 @@ class Outfit:
         self.add(surface, material)
 
     def strip(self, field: Field, fit: Fit, material: Material, layered: bool = False) -> None:
-        """A shell that hides nothing. layered: see `add`."""
+        """Puts on a shell around the body that hides nothing. layered: see `add`.
+
+        field: positive where the shell covers the body, (n,).
+        """
         self.add(shell(self.rng, self.anatomy, [field], fit), material, layered)
 
 
 def dress_up(rng: np.random.Generator, anatomy: Anatomy, garments: tuple[Garment, ...]) -> Outfit:
-    """The garments on the body. Each has a separate random stream, spawned in order."""
+    """Puts the garments on the body, in order. Each has a separate random stream."""
     count = len(anatomy.skin.vertices)
     outfit = Outfit(anatomy, [], np.full(count, -1.0), np.zeros(count, bool), rng)
     for garment, own in zip(garments, rng.spawn(len(garments)), strict=True):
@@ -139,8 +146,10 @@ def _bodice(
     margin: float,
     opening: Sequence[_Cut] = (),
 ) -> None:
-    """Cloth on trunk and arms, the outermost so far. sizes: depth of the neckline, ends of the
-    sleeves and of the trunk.
+    """Puts cloth on trunk and arms, over everything so far.
+
+    sizes: depth of the neckline, and template coordinates where the sleeves and the cloth on the
+    trunk end. opening: further cuts, such as an open front.
     """
     depth, sleeve, bottom = sizes
     cuts = [
@@ -153,7 +162,7 @@ def _bodice(
 
 
 def _neck(garment: Garment) -> str:
-    """The neckline of a top or a dress."""
+    """Returns the name of the neckline of a top or a dress."""
     return next(neck for neck in tailoring.NECKLINES if neck in garment.details)
 
 
@@ -164,15 +173,16 @@ def _collar(
     extra: float = 0.004,
     sizes: Sequence[float] = (0.125, 0.178, 0.012),
 ) -> None:
-    """A collar that stands off from its garment by some metres more. sizes: see
-    `tailoring.collar`.
+    """Puts on a collar that stands off from its garment.
+
+    extra: distance from the garment, metres. sizes: low, high and gap of `tailoring.collar`.
     """
     flat = dataclasses.replace(fit, ease=fit.ease + extra, fold=0.0, hem=0.01, quilt=0.0)
     outfit.strip(tailoring.collar(outfit.template, *sizes), flat, material)
 
 
 def _top(outfit: Outfit, garment: Garment) -> None:
-    """A top: its bodice, and a collar or a hood that lies on it."""
+    """Puts on a top: the bodice, and a collar or a hood that lies on it."""
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
     # looser tops stand off further, hang more, and have higher folds; short sleeves stand off too
@@ -206,8 +216,9 @@ def _top(outfit: Outfit, garment: Garment) -> None:
 
 
 def _outer(outfit: Outfit, garment: Garment) -> None:
-    """A jacket or a coat: its bodice, the part of a coat below the waist, and lapels, a hood or a
-    collar.
+    """Puts on a jacket or a coat: the bodice, and lapels, a hood or a collar.
+
+    A coat also has a tube below the waist.
     """
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     gap, spread, bottom = sizes["gap"], sizes["spread"], sizes["bottom"]
@@ -257,7 +268,7 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
 
 
 def _outer_fit(outfit: Outfit, garment: Garment) -> Fit:
-    """How a jacket or coat hangs: padded ones stand off, blazers and padded ones have low folds."""
+    """Returns the fit of a jacket or coat. Padded ones stand off; they and blazers fold little."""
     kind, loose, padded = garment.kind, garment.sizes["loose"], garment.kind in PADDED
     if kind == "coat":
         hang = 1.5
@@ -278,7 +289,7 @@ def _outer_fit(outfit: Outfit, garment: Garment) -> Fit:
 
 
 def _trousers(outfit: Outfit, garment: Garment) -> None:
-    """Trousers: over a top that is tucked in, else below it, as far as they can be seen."""
+    """Puts on trousers, over a top that is tucked in, or below one that hangs over them."""
     sizes, kind = garment.sizes, garment.kind
     top, end, loose, tucked = sizes["top"], sizes["end"], sizes["loose"], sizes["tucked"] > 0
     # loose ones have higher folds, which end below a top that hangs over them
@@ -314,8 +325,9 @@ def _trousers(outfit: Outfit, garment: Garment) -> None:
 
 
 def _let_hang_over(outfit: Outfit, margin: float) -> None:
-    """An untucked top hides the last piece below it, except for a margin inside of the top's
-    hem.
+    """Hides the part of the last piece that the top hangs over.
+
+    margin: metres above the hem of the top that stay.
     """
     lower = outfit.pieces[-1]
     x, y, _ = lower.surface.template.T
@@ -324,7 +336,7 @@ def _let_hang_over(outfit: Outfit, margin: float) -> None:
 
 
 def _skirt(outfit: Outfit, garment: Garment) -> None:
-    """A skirt with a waistband, over a top that is tucked in, else below it."""
+    """Puts on a skirt with a waistband, over a top that is tucked in, or below any other top."""
     sizes, tucked = garment.sizes, garment.sizes["tucked"] > 0
     top, end = sizes["top"], sizes["end"]
     ease = outfit.trunk + 0.004 if tucked else 0.004
@@ -343,14 +355,17 @@ def _skirt(outfit: Outfit, garment: Garment) -> None:
 
 
 def _hem_of(sizes: Mapping[str, float]) -> tuple[float, tuple[int, float]]:
-    """Metres by which a skirt gets wider per metre down, so that the hem of a short one stands off
-    as far as that of a long one; and its pleats.
+    """Returns the flare and the pleats of a skirt.
+
+    The flare is the metres by which a skirt gets wider per metre down. Short skirts have more of
+    it, so that hems of all lengths stand off alike. The pleats are their number and their depth in
+    metres.
     """
     return sizes["flare"] / max(0.3, -0.2 - sizes["end"]), (int(sizes["pleats"]), sizes["depth"])
 
 
 def _dress(outfit: Outfit, garment: Garment) -> None:
-    """A dress: a bodice down to the waist, and a skirt of the same fabric."""
+    """Puts on a dress: a bodice down to the waist, and a skirt of the same fabric."""
     sizes, waist, end = garment.sizes, garment.sizes["waist"], garment.sizes["end"]
     fit = Fit(ease=0.008, hang=1.0, sleeve=0.004 + 0.03 * sizes["loose"], fold=0.002)
     material = Material(sewn(garment, end + 0.02, seams=False), wrinkles=0.3, sheen=0.05)
@@ -365,7 +380,7 @@ def _dress(outfit: Outfit, garment: Garment) -> None:
 
 
 def _socks(outfit: Outfit, garment: Garment) -> None:
-    """Socks of a ribbed fabric."""
+    """Puts on socks of a ribbed fabric."""
 
     def ribbed(s: Spots) -> Points:
         ribs = 0.94 + 0.06 * np.cos(2 * np.pi * s.around / 0.008)
@@ -377,7 +392,7 @@ def _socks(outfit: Outfit, garment: Garment) -> None:
 
 
 def _shoes(outfit: Outfit, garment: Garment) -> None:
-    """Shoes, or the soles and straps of sandals."""
+    """Puts on shoes, or the soles and straps of sandals."""
     height, sole, over = (garment.sizes[name] for name in ("height", "sole", "over"))
     sheen = 0.2 if garment.kind != "sneakers" else 0.08
     material = Material(lambda s: trimmings.leather(s, garment), sheen=sheen)
@@ -401,7 +416,7 @@ def _shoes(outfit: Outfit, garment: Garment) -> None:
 
 
 def _belt(outfit: Outfit, garment: Garment) -> None:
-    """A belt on the trousers, with a buckle."""
+    """Puts on a belt with a buckle, over the trousers."""
     top, width = garment.sizes["top"], garment.sizes["width"]
     fit = Fit(ease=outfit.trunk + 0.009, hang=0.6, fold=0.0, hem=0.006, inner=outfit.trunk + 0.007)
     material = Material(lambda s: trimmings.buckled(s, garment), sheen=0.15)
@@ -409,7 +424,7 @@ def _belt(outfit: Outfit, garment: Garment) -> None:
 
 
 def _tie(outfit: Outfit, garment: Garment) -> None:
-    """A tie that lies on the folds of the shirt."""
+    """Puts on a tie that lies on the folds of the shirt."""
     field = tailoring.necktie(outfit.template, garment.sizes["length"], garment.sizes["width"])
     raised = outfit.trunk + 0.005 + outfit.fit.fold
     fit = dataclasses.replace(outfit.fit, ease=raised, inner=raised - 0.002, fold=0.0, hem=0.004)
@@ -417,14 +432,14 @@ def _tie(outfit: Outfit, garment: Garment) -> None:
 
 
 def _watch(outfit: Outfit, garment: Garment) -> None:
-    """A watch on one wrist."""
+    """Puts a watch on one wrist."""
     field = tailoring.bracelet(outfit.template, garment.sizes["side"], 0.628, 0.650)
     fit = Fit(ease=0.003, fold=0.0, hem=0.002)
     outfit.strip(field, fit, Material(garment.fabric.colors, sheen=0.3))
 
 
 def _bag(outfit: Outfit, garment: Garment) -> None:
-    """A backpack or a shoulder bag, and its straps, which lie on what is worn."""
+    """Puts on a backpack or a shoulder bag, and its straps, which lie on the clothes."""
     on_back = garment.kind == "backpack"
 
     def colors(s):
@@ -456,7 +471,7 @@ def _bag(outfit: Outfit, garment: Garment) -> None:
 
 
 def _accessory(outfit: Outfit, garment: Garment) -> None:
-    """Anything that `accessories` builds, on top of what is worn."""
+    """Puts on any garment that `accessories` builds, over the clothes."""
     for surface, material in accessories.build(outfit.rng, outfit.anatomy, garment, outfit.trunk):
         outfit.add(surface, material, layered=False)
 
@@ -471,4 +486,4 @@ _BUILDERS = {
     **dict.fromkeys(("backpack", "shoulder_bag"), _bag),
     **{"belt": _belt, "tie": _tie, "socks": _socks, "watch": _watch},
 }
-"""What builds a kind of garment; other kinds: `_accessory`."""
+"""The function that puts on each kind of garment. `_accessory` puts on all other kinds."""
