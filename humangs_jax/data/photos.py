@@ -54,17 +54,21 @@ OPTIONAL_TOP_KEYS = {"calibrated"}
 VIEW_KEYS = {"image", "mask", "unknown", "K", "cam_from_world", "frame"}
 Background = Literal["photo", "white"]
 LEAST_UNKNOWN = 0.5
-"""Value from which on a pixel of an image of what is unknown is so."""
+"""Least value of a pixel that is unknown, in an image that marks the unknown pixels."""
 OFF_CENTER = 0.05
-"""Share of a side by which a principal point has to be nearer to the middle of the turned photo to
-be one of that.
+"""Share of a side. If the principal point is nearer to the middle of the turned photo by more than
+this, K is that of the turned photo.
 """
 LARGEST_LABEL = 20 / 255
-"""Masks with nothing above it are labels: 0 and 1, or parts of a person."""
+"""A mask with no value above this holds labels (0 and 1, or parts of a person) in place of
+coverage.
+"""
 NEARLY_WHITE = 0.9
-"""Masks of 0 and one other value below it are labels as well."""
+"""A mask of 0 and one other value below this holds labels as well."""
 LEAST_LABELLED = 1e-3
-"""With a smaller share of pixels, labels are the rim of someone outside the photo."""
+"""A mask with a smaller share of labelled pixels is the rim of somebody outside the photo, and not
+taken for labels.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -84,19 +88,18 @@ class Photos:
     calibrated: bool = True
     """Whether the cameras were calibrated; if not, they were found from the person."""
     unknown: Bool[np.ndarray, "v h w"] | None = None
-    """Where somebody or something in front may hide the person; masks are 0 there.
-
-    None: nowhere.
+    """Where somebody or something in front may hide the person, (v, h, w); masks are 0 there. None:
+    nowhere.
     """
 
     @property
     def frame_count(self) -> int:
-        """Number of frames: one more than the last that a view shows."""
+        """The number of frames: one more than the largest frame number of the views."""
         return int(self.frames.max()) + 1
 
 
 def load_photos(path: str | Path, *, fit_masks: bool = False) -> Photos:
-    """Read the photos of a capture folder, whose body.npz need not exist. fit_masks: see
+    """Read the photos of a capture folder, which need not have a body.npz. fit_masks: see
     `read_photos`.
 
     Raises: CaptureError, one line naming file and field.
@@ -107,8 +110,8 @@ def load_photos(path: str | Path, *, fit_masks: bool = False) -> Photos:
 
 
 def capture_folder(path: str | Path) -> Path:
-    """The folder; "demo_capture", if there is no such folder, means the one that comes with the
-    package.
+    """Returns the path as a folder. "demo_capture" means the capture that comes with the package,
+    unless there is a folder of that name.
     """
     folder = Path(path)
     if not folder.exists() and folder.parts[:1] == (DEMO_CAPTURE,):
@@ -121,9 +124,9 @@ def capture_folder(path: str | Path) -> Path:
 
 
 def read_description(file: Path) -> dict[str, Any]:
-    """capture.json with all keys and types checked, except the matrices.
+    """Read capture.json, and check all of its keys and types, except the matrices.
 
-    Its paths stay in the folder.
+    The paths in it must stay inside the folder.
     """
     description = checked_json(
         file, missing="no such file: a capture is a folder with a capture.json"
@@ -174,7 +177,9 @@ def write_description(
     background: Background = "photo",
     calibrated: bool = True,
 ) -> None:
-    """Write capture.json of views with the keys of the format; the body is in body.npz."""
+    """Write a capture.json with these views, whose keys are those of the format. It names body.npz
+    as the file of the body.
+    """
     description: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
@@ -187,9 +192,10 @@ def write_description(
 
 
 def _is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
-    """Whether the cameras of a capture are of a calibration; true where the capture does not say.
+    """Returns whether the cameras of a capture were calibrated; true where the capture does not
+    say.
 
-    In older captures `humangs start` wrote it into a file beside them.
+    Older captures have this in a file that `humangs start` wrote beside capture.json.
     """
     if "calibrated" in description:
         return description["calibrated"]
@@ -205,8 +211,8 @@ def _is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
 def check_keys(
     mapping: Iterable[str], known: set[str], required: set[str], file: Path, prefix: str = ""
 ) -> None:
-    """Unknown keys are errors: most are misspelt optional ones, which would otherwise be ignored in
-    silence.
+    """Raise CaptureError for keys that are unknown or missing. Most unknown keys are misspelt
+    optional ones, which would otherwise have no effect.
     """
     for key in mapping:
         if key not in known:
@@ -219,7 +225,7 @@ def check_keys(
 
 
 def check_background(background: Any, file: object) -> None:
-    """One of `Background`."""
+    """Raise CaptureError unless the background is one of `Background`."""
     if background not in get_args(Background):
         raise CaptureError(
             file,
@@ -231,9 +237,10 @@ def check_background(background: Any, file: object) -> None:
 def read_frames_and_matrices(
     views: Sequence[dict[str, Any]], poses: int, file: Path
 ) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "v 3 3"], Float[np.ndarray, "v 4 4"]]:
-    """The frame of each view of a description, and K and cam_from_world as written.
+    """Returns the frame of each view of a description, and the matrices K and cam_from_world as
+    they are written.
 
-    poses: how many frames there are. A view may leave its frame out where there is one.
+    poses: the number of frames. A view may leave its frame out if there is one frame.
     """
     frames, matrices = [], []
     for i, view in enumerate(views):
@@ -321,8 +328,8 @@ def read_photos(
 
 
 def unknown_in_capture(folder: Path) -> Bool[np.ndarray, "v h w"] | None:
-    """Where each photo of a capture folder may hide the person, also where it has no masks yet;
-    None: nowhere.
+    """Read where something in front may hide the person in each photo of a capture folder, which
+    may have no masks yet; None: nowhere.
 
     Raises: CaptureError.
     """
@@ -334,8 +341,8 @@ def unknown_in_capture(folder: Path) -> Bool[np.ndarray, "v h w"] | None:
 def _read_unknown(
     folder: Path, views: Sequence[dict[str, Any]], size: tuple[int, int]
 ) -> Bool[np.ndarray, "v h w"] | None:
-    """Where each photo may hide the person; None where no view names such a file, or all of them
-    are black.
+    """Read where something in front may hide the person in each photo. Returns None if no view
+    names such an image, or all of these images are black.
     """
     unknown = np.zeros((len(views), *size), bool)
     for i, view in enumerate(views):
@@ -353,8 +360,8 @@ def _check_orientations(
     height: int,
     warns: bool,
 ) -> None:
-    """Photos are read as stored: those with an EXIF flag are warned of, and refused where K is of
-    the turned photo.
+    """Check photos with an EXIF orientation, since photos are read as they are stored. Such a photo
+    is an error if K is that of the turned photo; else there is a warning if `warns`.
     """
     flagged = []
     for view, camera in zip(views, K, strict=True):
@@ -381,12 +388,11 @@ def _check_orientations(
 
 
 def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) -> None:
-    """Whether views of a description cost no more than the limits allow, before their photos are
-    read.
+    """Raise CaptureError if the photos of a description need more than the limits allow, before
+    they are read.
 
-    Arguments: together: they are to be in memory at one time. Then the size of the first one is
-    looked at, which all must have.
-    Raises: CaptureError.
+    together: whether all photos are to be in memory at one time. Then only the size of the first
+    one is looked at, since all must have it.
     """
     file = folder / "capture.json"
     check_repeats(file, [folder / view["image"] for view in views])
@@ -399,9 +405,8 @@ def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) 
 
 
 def check_repeats(file: Path, photos: Sequence[Path]) -> None:
-    """Whether the views of a file name about as many photos; links to one photo are that photo.
-
-    Raises: CaptureError.
+    """Raise CaptureError if views of a file name the same photo too often. Links to a photo count
+    as that photo.
     """
     found = set()
     for photo in photos:
@@ -418,7 +423,7 @@ def check_repeats(file: Path, photos: Sequence[Path]) -> None:
 def _read_images(
     folder: Path, views: Sequence[dict[str, Any]], on_white: bool, fit_masks: bool
 ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
-    """Images and masks (or None), all of one size."""
+    """Read the images, and the masks or None, of all views, which must have one size."""
     images, masks, searched = None, None, []
     for i, view in enumerate(views):
         image, mask, on_background = read_view(folder, view, on_white)
@@ -470,8 +475,10 @@ def _read_images(
 def read_view(
     folder: Path, view: dict[str, Any], on_white: bool
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, bool]:
-    """Image, mask or None, and whether the image still has its background although a mask is known;
-    else it is on white.
+    """Read the image and the mask (or None) of a view.
+
+    The third result is whether the image still has its background although there is a mask; else
+    the image is on white, or there is no mask.
     """
     image, alpha = read_checked(read_image, folder / view["image"])
     if alpha is not None:
@@ -487,9 +494,10 @@ def read_view(
 
 
 def read_mask(file: Path, owner: str, width: int, height: int) -> Float[np.ndarray, "h w"]:
-    """A mask, see `io.images.read_grey`. owner: what has that width and height.
+    """Read a mask, see `io.images.read_grey`. owner: names in errors what has this width and
+    height.
 
-    Raises: CaptureError, also for another size, and for labels in place of 0 to 255.
+    Raises: CaptureError, also for another size, and for labels in place of coverage from 0 to 255.
     """
     mask = read_checked(read_grey, file)
     if mask.shape != (height, width):
@@ -520,22 +528,22 @@ def read_checked(reader: Callable[[Path], Any], file: Path) -> Any:
 def on_white_background(
     image: Float[np.ndarray, "*v h w 3"], mask: Float[np.ndarray, "*v h w"]
 ) -> Float[np.ndarray, "*v h w 3"]:
-    """The masked part over white."""
+    """Returns the image blended over white by the mask."""
     return image * mask[..., None] + (1 - mask[..., None])
 
 
 def cut_out(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """The person of a photo over white, without what the rim has of the background
-    (`clean_rims`).
+    """Returns the person of a photo over white, with the background's share of the colors removed
+    along the rim (`clean_rims`).
     """
     return on_white_background(clean_rims(image, mask), mask)
 
 
 def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:
-    """File names without folder and suffix, in letters, digits, '.', '_' and '-'; with their
-    folders where they are ambiguous.
+    """Returns file names without folder and suffix, made of letters, digits, '.', '_' and '-'.
+    Names that would be ambiguous contain their folders.
     """
 
     def plain(name, i):

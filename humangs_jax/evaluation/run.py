@@ -1,5 +1,5 @@
-"""One evaluator: people of any source, any method, any protocol -> scores of images, tables, and
-the page (report/).
+"""The evaluator: it scores any method, on people of any source, under any protocol, and writes the
+scores, tables and an HTML page (report/).
 """
 
 import base64
@@ -63,7 +63,7 @@ INPUT_SIDE = 128
 QUALITY = 88
 """The quality of the JPEGs."""
 LARGEST_ERROR = 0.25
-"""Mean absolute difference of the channels that gets the last color."""
+"""Mean absolute difference of the channels that is shown in the last color of the error scale."""
 _MARK = re.compile(r"\{\{(\w+)\}\}")
 
 
@@ -71,14 +71,14 @@ ORDER = "mean over the images of a frame, then over the frames of a person, then
 
 
 class Column(NamedTuple):
-    """How a score is shown."""
+    """The heading, the digits and the direction with which tables show one score."""
 
     heading: str
     """The heading of its column."""
     digits: int
-    """Digits after the point."""
+    """Digits after the decimal point."""
     better: str
-    """Where better scores are: "up", "down" or "", if nowhere."""
+    """Whether higher scores ("up") or lower ones ("down") are better; "" where neither is."""
 
 
 COLUMNS = {
@@ -102,8 +102,8 @@ COLUMNS["patches"] = Column("patches", 1, "")
 
 
 class _Gallery:
-    """The images of a page, made small as they come: truth, ours, error of those of the `limit`
-    lowest PSNR; inputs of every person.
+    """The small images of an HTML page: truth, prediction and error of the `limit` images with the
+    lowest PSNR, and the inputs of every person.
     """
 
     def __init__(self, limit: int) -> None:
@@ -112,7 +112,10 @@ class _Gallery:
         self._shots: list[tuple[float, int, dict[str, str]]] = []  # a heap, best first
 
     def add(self, row: int, psnr: float | None, images: Callable[[], dict[str, str]]) -> None:
-        """Adds an image, see `_shot`. row: its number among the rows."""
+        """Keep an image if it is among the `limit` worst so far. row: its number among the rows of
+        scores. psnr: dB; None counts as 0 dB. images: makes what `_shot` returns, and is called
+        only for an image that is kept.
+        """
         key = 0.0 if psnr is None else -psnr
         if len(self._shots) >= self.limit and (not self._shots or key <= self._shots[0][0]):
             return
@@ -124,12 +127,14 @@ class _Gallery:
 
     @property
     def shots(self) -> dict[int, dict[str, str]]:
-        """By row."""
+        """Returns the kept images by the number of their row, each as `_shot` returns it."""
         return {row: images for _, row, images in self._shots}
 
 
 def _shot(truth: Float[np.ndarray, "h w 3"], ours: Float[np.ndarray, "h w 3"]) -> dict[str, str]:
-    """Truth, ours and error, small."""
+    """Returns JPEG data URLs of the truth, the prediction and their error, by name. Their longest
+    side is at most `SIDE` pixels.
+    """
     ours = np.clip(ours, 0, 1)
     images = {
         "truth": truth,
@@ -152,7 +157,9 @@ def _data_url(image: np.ndarray, side: int) -> str:
 
 
 def page_html(evaluation: dict[str, Any], notes: list[str], gallery: _Gallery) -> str:
-    """The page as text. evaluation: what `Evaluation.to_json` gives."""
+    """Returns the HTML page as text. evaluation: what `Evaluation.to_json` returns. notes: what
+    `Evaluation.notes` returns. gallery: the images.
+    """
     shown = {evaluation["images"][row]["person"] for row in gallery.shots}
     data = evaluation | {
         "notes": notes,
@@ -182,19 +189,19 @@ logger = logging.getLogger(__name__)
 PAGE_IMAGES = 120
 """Images that a page shows, the worst first; the others are rows of its table."""
 LISTED = 5
-"""Missing files that a line names."""
+"""The most missing files that a note names."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What `evaluate` returns."""
+    """The scores that `evaluate` returns, with what was compared."""
 
     name: str
     """The name of the method."""
     protocol: EvaluationProtocol
     """The protocol that was used."""
     protocol_name: str
-    """Its name in `PROTOCOLS`, or "custom"."""
+    """The name of the protocol in `PROTOCOLS`, or "custom"."""
     rows: tuple[Scored, ...]
     """The scores of each image, in the order of the people."""
     reasons: dict[str, str]
@@ -213,11 +220,11 @@ class Evaluation:
 
     @functools.cached_property
     def means(self) -> dict[str, Mean | None]:
-        """Mean scores over all, each with its interval."""
+        """Mean scores over all images, by name, each with its confidence interval."""
         return overall_means(self.rows)
 
     def summary(self) -> str:
-        """Lines for the terminal."""
+        """Returns the scores as lines for the terminal."""
         lines = [f"{self.name}, protocol {self.protocol_name}: {self.about['counts']}"]
         for name, mean in self.means.items():
             if mean is not None:
@@ -225,7 +232,9 @@ class Evaluation:
         return "\n".join([*lines, *self.notes()])
 
     def notes(self) -> list[str]:
-        """What a reader must know besides."""
+        """Returns the lines that a reader needs beside the numbers: how they are averaged, which
+        scores or predictions are missing and why, and what makes them unlike published numbers.
+        """
         notes = [f"Each number is the {ORDER}."]
         # how sure the numbers are, and which are missing
         if any(mean is not None and mean.low is not None for mean in self.means.values()):
@@ -257,7 +266,7 @@ class Evaluation:
         return notes
 
     def to_json(self) -> dict[str, Any]:
-        """Everything but the images, as plain values."""
+        """Returns everything but the images as values that JSON holds."""
         means = {
             name: None if mean is None else mean._asdict() for name, mean in self.means.items()
         }
@@ -274,7 +283,9 @@ class Evaluation:
         }
 
     def tables(self) -> tuple[list[str], list[list[str]]]:
-        """Header and rows: a person each, then the mean."""
+        """Returns the header and the rows of the table: one row for each person, then one with the
+        means.
+        """
         names = [name for name, mean in self.means.items() if mean is not None]
         header = ["person", *(COLUMNS[name].heading for name in names)]
         rows = [
@@ -451,7 +462,9 @@ def evaluate(
 
 
 def _told(source: Any) -> str:
-    """A path as it was given; of another source its kind."""
+    """Returns the name of a source for reports: a path as it was given, or the name of the type of
+    any other source.
+    """
     if isinstance(source, str | Path):
         return str(source)
     return type(source).__name__
@@ -465,8 +478,9 @@ def _score_person(
     gallery: _Gallery,
     first: int,
 ) -> dict[str, Any]:
-    """What there is to say of a person, as JSON has it; its images go to the gallery. first: number
-    of its first row.
+    """Scores one person, and returns the rows and images as JSON holds them.
+
+    The worst images go to the gallery. first: the number of the person's first row among all rows.
     """
     predicted = _without_nobody(case, predict(case, rules.behind))
     name = printable(case.name)  # of a folder: now one line
@@ -508,8 +522,8 @@ def _score_person(
 
 
 def _without_nobody(case: Case, predicted: Predicted) -> Predicted:
-    """The predictions of views whose true mask shows somebody: white compared with white would
-    raise the mean.
+    """Returns the predictions of the views whose true mask shows somebody. The other views compare
+    white with white, which would raise the mean.
     """
     empty = set(empty_views(case.truth.masks)) & set(predicted.views)
     if not empty:
@@ -536,7 +550,9 @@ def _counted(count: int, one: str, many: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Settings as JSON; the kind of a crop by the name of its class."""
+    """Returns settings as values that JSON holds. A crop becomes the name of its class and its
+    fields.
+    """
     if not dataclasses.is_dataclass(value):
         if isinstance(value, tuple):
             return list(value)
@@ -552,14 +568,14 @@ def _plain(value: Any) -> Any:
 
 
 def shown(value: float | None, name: str) -> str:
-    """A score with its digits; a dash for a missing one."""
+    """Returns a score as text with the digits of its column; a dash for a missing score."""
     if value is None:
         return "-"
     return f"{value:.{COLUMNS[name].digits}f}"
 
 
 def shown_mean(mean: Mean | None, name: str) -> str:
-    """A mean with its interval in brackets."""
+    """Returns a mean as text with its interval in brackets."""
     if mean is None:
         return "-"
     interval = ""
@@ -573,7 +589,9 @@ _MARKDOWN = {"<": "&lt;", "&": "&amp;"} | {sign: f"\\{sign}" for sign in "\\|`*"
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """The first column to the left, the others to the right."""
+    """Returns a table in Markdown: the first column is aligned to the left, the others to the
+    right.
+    """
     rule = ["---", *["---:"] * (len(header) - 1)]
 
     def escape(cell):
@@ -588,7 +606,7 @@ _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 
 
 def latex_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A tabular with rules of the package booktabs."""
+    """Returns a LaTeX tabular with the rules of the package booktabs."""
     special = _LATEX | {sign: f"\\{sign}" for sign in "&%$#_{}"}
 
     def line(row):
@@ -604,12 +622,12 @@ def latex_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 _FORMULAS = tuple("=+-@\uff1d\uff0b\uff0d\uff20")
-"""Signs that a formula begins with, those of full width too."""
+"""The signs that a spreadsheet takes for the beginning of a formula, full-width forms included."""
 
 
 def csv_text(rows: Sequence[Scored]) -> str:
-    """One line an image, all digits; an empty cell for a missing score. Reads back with any
-    spreadsheet.
+    """Returns CSV text with one line for each image. Numbers have all digits, and a missing score
+    is an empty cell.
 
     Names that a spreadsheet would take for a formula begin with an apostrophe.
     """

@@ -68,18 +68,18 @@ from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 T = TypeVar("T")
 
 HELD_OUT_PHOTOS = 4
-"""With this number of photos or more, a whole photo is held out of a trial, not pixels of each:
-views that no step sees.
+"""With this number of photos or more, a trial holds out a whole photo, a view that no step sees.
+With fewer, blocks of pixels are held out of each photo.
 """
 TRIAL = 1 / 3
-"""Share of the steps that the trial makes."""
+"""Share of all steps that are made in trials."""
 ALLOWED_LOSS = 0.5
 """Decibels that steps may lose on a photo that is held out: it lacks what they learn from it when
 all photos are fitted. With six validation people they lose up to 0.4 there, and gain at least 0.1
 in other views of that pose by all photos."""
 ALLOWED_LOSS_OF_ITERATIONS = 1.0
-"""Decibels, too, that the learned update may lose there: one of eight test people loses 0.2
-and gains 2.1 by all.
+"""Decibels that the learned update may lose on a photo that is held out. One of eight test people
+loses 0.2 there, and gains 2.1 by all photos.
 """
 SUSPICIOUS = 1.5
 """Loss of the photo that fits least over the median, before refinement, from which on iterations
@@ -93,11 +93,13 @@ by 2 cm 0.0009 to 0.0037. Moved photos of one moment lose up to 2 dB (`experimen
 TIMED_STEPS = 3
 """Steps that are timed to plan how many a run has."""
 OVERRUN = 1.5
-"""A run ends early, and cannot be repeated, where it takes this many times its seconds."""
+"""A run ends early once it has taken this many times its seconds. Such a run cannot be repeated
+exactly.
+"""
 BUFFER_MARGIN = 1.5
-"""Room in the renderer's buffers beyond the need of the start: Gaussians grow.
+"""Factor on the buffers that the start needs, because Gaussians grow.
 
-Where it does not suffice, it is doubled.
+Buffers that are still too small are doubled.
 """
 BUFFERS = ("max_pairs", "max_rows")
 HOST_SETTINGS = {
@@ -115,9 +117,7 @@ HOST_SETTINGS = {
 
 
 class Clock:
-    """The time of a run without compilation, its number of steps and its bar: all that a run
-    keeps beside its states.
-    """
+    """The clock of a run: its time without compilation, its number of steps, and its bar."""
 
     def __init__(self, config: RefineConfig, progress: bool = False):
         self.limit, self.seconds = config.steps, config.seconds
@@ -137,7 +137,9 @@ class Clock:
 
     @contextlib.contextmanager
     def compiling(self) -> Generator[None]:
-        """Time spent within counts as compilation, not as refinement. May be nested."""
+        """Counts the time inside the context as compilation, not as refinement. Contexts may be
+        nested.
+        """
         before, began = self.compile_seconds, time.perf_counter()
         try:
             with compiling():
@@ -146,8 +148,10 @@ class Clock:
             self.compile_seconds = before + time.perf_counter() - began
 
     def with_room(self, function: Callable[[SplatConfig], tuple[T, Any]], splat: SplatConfig) -> T:
-        """The result of a function of buffers, which also returns what did not fit: they are
-        doubled until all does.
+        """Call `function` with buffers that have room for everything, and return its first result.
+
+        function: takes a configuration with buffers; returns a result and the number of pairs that
+        did not fit. The buffers are doubled until this number is 0.
         """
         result, overflow = function(splat)
         with self.compiling() if int(overflow) else contextlib.nullcontext():
@@ -159,11 +163,11 @@ class Clock:
         return result
 
     def plan(self, one_step: Callable[[], RefineState], ahead: float = 0.0) -> int:
-        """How many steps the run has: those of the configuration, or as many as fit into its
-        seconds, by the time of a few.
+        """Returns the number of steps of the run: that of the configuration, or as many as fit into
+        its seconds. `TIMED_STEPS` calls of `one_step` measure the time of a step.
 
-        A number that is fixed before the first step can be repeated. ahead: seconds that other work
-        will take.
+        The number is fixed before the first step, so the run can be repeated. ahead: seconds that
+        other work will take.
         """
         self.planned = self.limit or 0
         if self.seconds is not None and self.limit != 0:
@@ -181,7 +185,7 @@ class Clock:
         return self.planned
 
     def tick(self, shown: float) -> None:
-        """A step is done. shown: where the bar is, in [0, 1]."""
+        """Count one finished step, and move the bar to `shown`, in [0, 1]."""
         self.done += 1
         self.show(shown)
         self.late = self.late or (
@@ -189,24 +193,24 @@ class Clock:
         )
 
     def show(self, shown: float) -> None:
-        """Move the bar."""
+        """Move the bar to `shown`, in [0, 1]."""
         self.bar.update(int(100 * shown) - self.bar.n)
 
     def stopped(self) -> float:
-        """`elapsed`, at the end of the run: closes the bar."""
+        """Close the bar at the end of the run, and return `elapsed`."""
         self.bar.update(100 - self.bar.n)
         self.bar.close()
         return self.elapsed()
 
 
 class Task(NamedTuple):
-    """What a run works with."""
+    """The inputs of a run, which stay the same during its search."""
 
     avatar: Avatar
     """The avatar with the low-pass of the photos."""
     fresh: Avatar
-    """The same with the scales that the learned update was trained with: the low-pass that the
-    avatar came with is undone.
+    """The avatar with the scales that the learned update was trained with: the low-pass that the
+    avatar came with is taken out.
     """
     photos: list[Photo]
     """The photos, with all their pixels."""
@@ -221,13 +225,14 @@ class Task(NamedTuple):
     clock: Clock
     """The time and the number of steps of the run."""
     first: tuple["Candidate", float] | None = None
-    """What iterations on all photos find, and the loss on them; None where it is not known."""
+    """The result of iterations on all photos, and its loss on them; None where they are not known.
+    """
     moved: bool = False
     """Whether the photos were moved, see `align`."""
 
 
 class Candidate(NamedTuple):
-    """What a run has found."""
+    """A state of the Gaussians that a run has found."""
 
     state: RefineState
     """The state of the Gaussians."""
@@ -242,7 +247,7 @@ class Candidate(NamedTuple):
 def prepare(
     avatar: Avatar, views: SubjectViews, config: RefineConfig, clock: Clock
 ) -> tuple[Task, Candidate, Comparison]:
-    """The task, the start and its comparison with each photo."""
+    """Returns the task, the state at the start, and its comparison with each photo."""
     start = with_pixel_footprint_of(avatar, views)
     fresh = replace(avatar, gaussians=_fresh(avatar, start.gaussians.pixel_footprint))
     photos, held = list(photos_of(views)), np.zeros(views.masks.shape, bool)
@@ -266,7 +271,9 @@ def prepare(
 
 
 def calls_of_photos(avatar: Avatar, views: SubjectViews) -> Iterator[Call]:
-    """The long programs of iterations on these photos, which `prepare` begins with, too."""
+    """Yields the long programs of iterations on these photos. `prepare` starts to compile the same
+    programs.
+    """
     start = with_pixel_footprint_of(avatar, views)
     parameters, graph = unconstrained(start.gaussians), graph_like(len(start.gaussians.means))
     photos = list(photos_of(views))
@@ -275,14 +282,14 @@ def calls_of_photos(avatar: Avatar, views: SubjectViews) -> Iterator[Call]:
 
 @jax.jit
 def _fresh(avatar: Avatar, pixel_footprint: Float[Array, " g"] | None) -> Gaussians:
-    """See `Task.fresh`."""
+    """Returns the Gaussians of `Task.fresh`."""
     return with_pixel_footprint(
         without_pixel_footprint(avatar), cast(Array, pixel_footprint)
     ).gaussians
 
 
 def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:
-    """How photos are drawn, with buffers for all of them."""
+    """Returns how the photos are drawn, with buffers that have room for each of them."""
     poses = jax.vmap(BodyPose)(views.rotations, views.translations)
     configs = [
         plan_buffers(posed(avatar, pose), camera, SPLAT_PRESETS[avatar.rendering], BUFFER_MARGIN)
@@ -324,8 +331,8 @@ def align(task: Task, start: Candidate, each: Comparison) -> tuple[Task, Compari
 
 
 def compile_parts(task: Task, start: Candidate) -> Candidate:
-    """Makes a step and an iteration, so that their programs are compiled; the start, with buffers
-    in which the step fits.
+    """Make one iteration and one step, so that their programs are compiled. Returns the start, with
+    buffers that have room for the step.
     """
     if task.config.iterations:
         updated(task, start, start.used, 1)
@@ -336,8 +343,8 @@ def compile_parts(task: Task, start: Candidate) -> Candidate:
 
 
 def search(task: Task, start: Candidate, each: Comparison) -> Iterator[Candidate]:
-    """What a run finds, one after the other: the last that is kept is its result. each: comparison
-    of the start with photos.
+    """Yields the states that a run finds, in order. The last one that is `kept` is the result.
+    each: the comparison of the start with each photo.
     """
     held_photo = len(task.photos) >= HELD_OUT_PHOTOS and task.config.held_out > 0
     method = _search_by_photo if held_photo else _search_by_blocks
@@ -347,9 +354,10 @@ def search(task: Task, start: Candidate, each: Comparison) -> Iterator[Candidate
 def _search_by_blocks(
     task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
 ) -> Iterator[Candidate]:
-    """The held-out pixels choose the best state. Where there are none, the loss on all pixels
-    decides on the iterations, and the last state of the steps is kept. losses: of the photos, at
-    first.
+    """Yields the states of a search in which held-out pixels choose the best one.
+
+    Where no pixels are held out, the loss on all pixels decides whether the iterations are kept,
+    and the last state of the steps is kept. losses: the loss of the start on each photo.
     """
     hidden = [
         replace(all, counted=from_host(np.asarray(all.counted) & ~np.asarray(seen.counted)))
@@ -380,8 +388,8 @@ def _search_by_blocks(
 def _search_by_photo(
     task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
 ) -> Iterator[Candidate]:
-    """A trial without one photo, then a fit of all photos as the trial says. losses: of the
-    photos, at first.
+    """Yields the states of trials without one photo, then those of a fit of all photos that does
+    what helped in the trials. losses: the loss of the start on each photo.
     """
     config, clock, everybody = task.config, task.clock, np.arange(len(losses))
     # iterations alone need no trial, unless one photo contradicts the others
@@ -434,8 +442,8 @@ def _trial_gains(
     asked: Sequence[int],
     tried: dict[int, Candidate],
 ) -> Iterator[float]:
-    """Decibels that iterations without a photo gain on it, for one photo after the other; what they
-    have found goes to `tried`.
+    """Yields for each photo in `asked` the decibels that it gains by iterations on the other photos
+    of `used`. The state after these iterations is stored in `tried` under the photo's number.
     """
     for view in asked:
         photo = [task.photos[view]]
@@ -452,8 +460,9 @@ def steps(
     end: int,
     shown: tuple[float, float],
 ) -> Iterator[Candidate]:
-    """The first `end` of `total` steps on some photos: the state at each check and at the end.
-    shown: from where to where the bar goes.
+    """Make the first `end` of `total` steps on some photos; yields the state at each check and at
+    the end. shown: where the progress bar would be after none and after all of the `total` steps,
+    in [0, 1].
     """
     config, clock = task.config, task.clock
     share = 1.0
@@ -488,7 +497,7 @@ def stepped(task: Task, state: RefineState, view: int | np.integer) -> RefineSta
 
 
 def iterated(task: Task, start: Candidate, used: Int[np.ndarray, " n"]) -> tuple[Candidate, float]:
-    """The state after the learned update on some photos, and the loss on them."""
+    """Returns the state after the learned update on some photos, and its mean loss on them."""
     if task.first is not None and len(used) == len(task.photos):
         return task.first
     parameters = updated(task, start, used, task.config.iterations)
@@ -501,7 +510,7 @@ def iterated(task: Task, start: Candidate, used: Int[np.ndarray, " n"]) -> tuple
 def updated(
     task: Task, start: Candidate, used: Int[np.ndarray, " n"], iterations: int
 ) -> UnconstrainedGaussians:
-    """The parameters after iterations of the learned update on some photos."""
+    """Returns the parameters after `iterations` of the learned update on some photos."""
     fresh, photos = unconstrained(task.fresh.gaussians), [task.seen[i] for i in used]
 
     def updated(splat: SplatConfig) -> tuple[UnconstrainedGaussians, Array]:
@@ -514,7 +523,9 @@ def updated(
 def comparison(
     task: Task, parameters: UnconstrainedGaussians, photos: Sequence[Photo], splat: SplatConfig
 ) -> Comparison:
-    """Comparison with each of the photos (leading axis v)."""
+    """Returns the comparison of the Gaussians with each of the photos (leading axis v), as numpy
+    arrays.
+    """
 
     def compared(splat: SplatConfig) -> tuple[Comparison, int]:
         each = [compare(parameters, task.avatar, photo, task.settings, splat) for photo in photos]
@@ -527,13 +538,17 @@ def comparison(
 def avatar_comparison(
     task: Task, avatar: Avatar, photos: Sequence[Photo], splat: SplatConfig
 ) -> Comparison:
-    """`comparison` of an avatar with each of the photos, drawn with the low-pass that it has."""
+    """Returns the comparison of an avatar with each of the photos, drawn with the avatar's own
+    low-pass.
+    """
     parameters = unconstrained(avatar.gaussians)
     return comparison(task._replace(avatar=avatar), parameters, photos, splat)
 
 
 def psnr_of(task: Task, found: Candidate, photos: Sequence[Photo]) -> float:
-    """`aligned_psnr` of what no step sees, dB: mean over the photos some pixels of which count."""
+    """Returns the mean `aligned_psnr` of a state, dB, over the photos of which some pixels count;
+    `LARGEST_PSNR` if no pixel counts.
+    """
     scores = [
         aligned_psnr(
             image, _side_by_side(photo.image, photo.mask), counted=np.asarray(photo.counted)
@@ -549,7 +564,9 @@ def psnr_of(task: Task, found: Candidate, photos: Sequence[Photo]) -> float:
 def images_of(
     task: Task, found: Candidate, photos: Sequence[Photo]
 ) -> list[Float[np.ndarray, "h w 4"]]:
-    """Colors and alpha as some photos show what was found."""
+    """Draws a state from the cameras of some photos. Returns for each photo colors and alpha, (h,
+    w, 4).
+    """
     parameters = found.state.parameters
 
     def drawn(splat: SplatConfig) -> tuple[list[Image], int]:
@@ -568,4 +585,4 @@ def _side_by_side(
 
 
 unconstrained = jax.jit(parameters_of)
-"""What refinement moves, by a program."""
+"""`parameters_of` as a compiled program: the parameters that refinement moves."""

@@ -62,20 +62,22 @@ TYPES = {
 TYPES |= {f"{np.dtype(kind).name}": kind for kind in TYPES.values()}
 CHUNK = 256
 REST = 8 * np.concatenate([[0], np.arange(1.5, 255), [256]]) / 256 - 4
-"""The values of the bytes of compressed harmonics: the middle of each step, and the ends of the
-first and last.
+"""The numbers that the bytes of compressed harmonics stand for: the middle of each step, but the
+ends of the range for the first and the last byte.
 """
 DEGREE_4 = 72
-"""Properties of harmonics up to degree 4."""
+"""The number of `f_rest_*` properties of harmonics of degree 1 to 4, which are not read."""
 FILTER = "filter_3D"
-"""The property of Mip-Splatting and GOF that belongs to scales and opacities."""
+"""The property with the standard deviation of the 3D smoothing filter of Mip-Splatting and GOF. It
+widens the scales and lowers the opacities.
+"""
 KNOWN = re.compile(
     r"[xyz]|n[xyz]|red|green|blue|alpha|opacity|filter_3D"
     r"|(f_dc|f_rest|scale|rot|packed|min|max)_\w+"
 )
-"""Properties that are used, or say the same as those."""
+"""Matches the properties that are read, and those that repeat what these contain."""
 SHOWN = 6
-"""Names in a line."""
+"""The most names that a line about unused properties lists."""
 Columns = Mapping[str, np.ndarray]
 
 
@@ -85,8 +87,8 @@ def write_ply(
 ) -> None:
     """Write a 3DGS `.ply`; the file appears whole or not at all.
 
-    rest_fields: all 45 `f_rest_*` fields, on which some importers (Unity) insist, zeros where there
-    are no such harmonics.
+    rest_fields: write all 45 `f_rest_*` fields, which some importers (Unity) require. Fields of
+    harmonics that the Gaussians do not have are 0.
     """
     import plyfile
 
@@ -110,9 +112,10 @@ def write_ply(
 
 
 def read_ply(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a file. said: takes lines.
+    """Returns the Gaussians in the bytes of a `.ply`. Lines about unused properties are appended to
+    `said`.
 
-    Raises: InvalidFileError; what damaged numbers raise.
+    Raises: InvalidFileError; for damaged numbers also other errors.
     """
     elements = _elements(data)
     said += _unused(elements)
@@ -137,8 +140,8 @@ def _fused(
     opacities: Float[np.ndarray, " g"],
     smoothing: Float[np.ndarray, "g 1"],
 ) -> tuple[Float[np.ndarray, "g 3"], Float[np.ndarray, " g"]]:
-    """Scales and opacities with the 3D smoothing filter of Mip-Splatting, a Gaussian of that scale
-    in metres.
+    """Returns the scales and opacities after the 3D smoothing filter of Mip-Splatting. smoothing:
+    the filter's standard deviations f, metres.
 
     s' = sqrt(s^2 + f^2) and o' = o prod(s / s'), so that the integral over space stays (arXiv
     2311.16493, equation 9).
@@ -149,7 +152,9 @@ def _fused(
 
 
 def _unused(elements: Mapping[str, Columns]) -> list[str]:
-    """Lists in words the properties and elements that have no meaning here."""
+    """Returns a line that lists the properties and elements that are not read; no line if all are
+    read.
+    """
     found = [name for name in elements if name not in ("chunk", "vertex", "sh", "face")]
     found += [
         name
@@ -172,7 +177,10 @@ def _exponential(logs: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
 def _harmonics(
     columns: Columns, values: np.ndarray | None = None
 ) -> dict[str, Float[np.ndarray, "g k 3"]]:
-    """Under their name, nothing if there are none. values: what the bytes of a column stand for."""
+    """Returns the harmonics under the name "f_rest_*"; an empty dictionary if there are none.
+    values: the numbers that the bytes of a column stand for; None if columns hold the numbers
+    themselves.
+    """
     count = sum(name.startswith("f_rest_") for name in columns)
     if count % 3 or count // 3 not in COUNTS:
         degree = " of degree 4" if count == DEGREE_4 else ""
@@ -192,7 +200,9 @@ def _harmonics(
 
 
 def _unpacked(chunk: Columns, vertex: Columns, sh: Columns, said: list[str]) -> Gaussians:
-    """Gaussians of compressed columns."""
+    """Returns the Gaussians of a compressed `.ply` of PlayCanvas. Lines about what is left out are
+    appended to `said`.
+    """
     words = {name: _columns(vertex, f"packed_{name}", dtype=np.uint32)[:, 0] for name in WORDS}
     bits = {
         name: np.stack([_bits(words[name], *place) for place in places], axis=1)
@@ -239,14 +249,15 @@ WORDS = {
 
 
 def _bits(words: np.ndarray, lowest: int, width: int) -> Float[np.ndarray, " g"]:
-    """From 0 to 1."""
+    """Returns a field of bits of each word, scaled to [0, 1]."""
     return (words >> np.uint32(lowest) & np.uint32(2**width - 1)) / (2**width - 1)
 
 
 def _columns(columns: Columns, *names: str, dtype: type[np.generic] = np.float64) -> np.ndarray:
-    """Properties (g, names) as numbers of a type.
+    """Returns the named properties side by side, (g, names), as numbers of type `dtype`.
 
-    Raises: InvalidFileError for one that is missing, or not of the bytes it is made of.
+    Raises: InvalidFileError if a property is missing, or if `dtype` is an integer type and the file
+    has another one.
     """
     for name in names:
         if name not in columns:
@@ -263,9 +274,9 @@ def _columns(columns: Columns, *names: str, dtype: type[np.generic] = np.float64
 
 
 def _elements(data: bytes) -> dict[str, Columns]:
-    """Columns of the elements, up to one with lists.
+    """Returns the columns of each element of a `.ply`, up to the first element with lists.
 
-    Nothing is made before it is known that the file is long enough.
+    Memory is taken only after it is known that the file is long enough.
     """
     end = re.compile(rb"end_header[ \t]*\r?\n").search(data, 0, LONGEST_HEADER)
     if end is None:
@@ -332,8 +343,8 @@ ROW_BYTES = 32
 
 
 def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a `.splat`; the file appears whole or not at all. Colors and opacities lose to 8 bits,
-    quaternions to 7.
+    """Write a `.splat`; the file appears whole or not at all. Colors, opacities and quaternions are
+    rounded to bytes.
 
     Raises: ValueError for Gaussians with harmonics.
     """
@@ -356,7 +367,11 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 
 def read_splat(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a file. said: takes lines. Raises: InvalidFileError."""
+    """Returns the Gaussians in the bytes of a `.splat`. Lines about what is left out are appended
+    to `said`.
+
+    Raises: InvalidFileError.
+    """
     check_limit("gaussians", len(data) // ROW_BYTES, "Gaussians")
     if not data or len(data) % ROW_BYTES:
         raise InvalidFileError(
@@ -383,9 +398,10 @@ SPLATS = "splats"
 
 
 def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a file. said: takes lines.
+    """Returns the Gaussians in the bytes of a gsplat checkpoint. Lines about what is left out are
+    appended to `said`.
 
-    Raises: InvalidFileError; what damaged files raise.
+    Raises: InvalidFileError; for damaged files also other errors.
     """
     try:
         tensors = tensors_in(data, (SPLATS,))
@@ -441,21 +457,21 @@ def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
 
 
 EXTENSION = "KHR_gaussian_splatting"
-"""Extension of glTF that holds Gaussians."""
+"""The glTF extension that holds Gaussians."""
 SRGB = "srgb_rec709_display"
-"""Its name of colors as sRGB images have them."""
+"""The extension's name for colors that are encoded as in sRGB images."""
 COEFFICIENTS = [
     f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"
     for degree in (1, 2, 3)
     for i in range(2 * degree + 1)
 ]
 KERNEL = "ellipse"
-"""The usual shape of a Gaussian, and the only one that is drawn."""
+"""The extension's name for the usual shape of a Gaussian, the only shape that is drawn."""
 NEEDED = tuple(
     f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY", "SH_DEGREE_0_COEF_0")
 )
 ATTRIBUTES = (*NEEDED, *COEFFICIENTS)
-"""Those of the extension."""
+"""The names of the extension's attributes."""
 
 
 def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
@@ -509,9 +525,10 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 
 def read_glb(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a file, those of all nodes in their places. said: takes lines.
+    """Returns the Gaussians in the bytes of a `.glb`, those of each node moved by its transform.
+    Lines about what is left out are appended to `said`.
 
-    Raises: InvalidFileError; what damaged numbers raise.
+    Raises: InvalidFileError; for damaged numbers also other errors.
     """
     content, binary = parse_glb(data)
     # files that cannot be read right without another extension are refused
@@ -552,7 +569,7 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
 
 
 def _other_parts(placed: Sequence[tuple[dict[str, Any], Any]]) -> list[str]:
-    """Lists in words the kernels and attributes of the extension that have no meaning here."""
+    """Returns lines that list the extension's kernels and attributes that are not used here."""
     kernels = {shown(part["extensions"][EXTENSION].get("kernel", KERNEL)) for part, _ in placed} - {
         shown(KERNEL)
     }

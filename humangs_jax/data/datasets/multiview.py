@@ -87,9 +87,10 @@ PARAMETERS = "smpl_params.npz"
 MISSING = "missing_img_files.txt"
 """File that lists images that are missing."""
 ON_PERSON = 128.5 / 255
-"""Least value of a mask on the person: above 128."""
+"""The least mask value, in [0, 1], of a pixel on the person: bytes above 128."""
 PHOTO = re.compile(r"(?:[\w-]+_(?:rgb|mask))?(\d+)\.\w+")
-"""Names of photos, those of ActorsHQ included."""
+"""Matches the file names of photos and masks, those of ActorsHQ included; the group is the frame.
+"""
 T = TypeVar("T")
 Photo = tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]
 """Image on white and mask, both in [0, 1]."""
@@ -103,10 +104,10 @@ _ANGLES = {
 
 
 def read_parameters(file: Path, body: FileBody) -> BodyParameters:
-    """Shape and all poses of smpl_params.npz. Raises: CaptureError naming file and key.
+    """Read the shape and all poses of smpl_params.npz.
 
-    Where shape or expression differ between frames, those of the first are taken: one person has
-    one shape.
+    If shape or expression differ between frames, those of the first frame are taken, since a person
+    has one shape. Raises: CaptureError naming file and key.
     """
     values = open_arrays(file)
     count = len(values.numbers("global_orient", (None, 3), LARGEST_ANGLE))
@@ -132,7 +133,8 @@ def read_parameters(file: Path, body: FileBody) -> BodyParameters:
 
 
 def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
-    """The cameras of a file, pixel centres at +0.5; the world's axes stay.
+    """Read the cameras of a calibration file, with pixel centres at +0.5. The world's axes are
+    kept.
 
     Raises: CaptureError naming file and camera.
     """
@@ -145,8 +147,8 @@ def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
 
 
 def _checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
-    """Cameras of known sizes, rigid, no farther than `FARTHEST` from the origin, with names that
-    can be those of folders.
+    """Returns the cameras after checking them: sizes are known, poses are rigid, the camera is no
+    farther than `FARTHEST` from the origin, and its name can be the name of a folder.
 
     Raises: CaptureError naming the camera.
     """
@@ -178,8 +180,8 @@ def _checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
 
 
 def numbered(folder: Path) -> dict[int, Path]:
-    """Frame -> its file, of the photos in a folder that are called by a number; empty if it does
-    not exist.
+    """Returns the photos of a folder by frame. The name of a photo is the number of its frame,
+    perhaps behind NAME_rgb or NAME_mask. Empty if the folder does not exist.
     """
     listed = ()
     if folder.is_dir():
@@ -190,9 +192,10 @@ def numbered(folder: Path) -> dict[int, Path]:
 
 
 def _read_missing(file: Path) -> set[tuple[str, int]]:
-    """(camera, frame) of the photos that the authors list as missing; both kinds of slashes.
+    """Read the (camera, frame) pairs of the photos that the authors list as missing. Paths may have
+    slashes or backslashes.
 
-    Empty without the file.
+    Returns an empty set if there is no such file.
     """
     if not file.is_file():
         return set()
@@ -218,13 +221,13 @@ def _video_subject(
     listed: Set[tuple[str, int]] = frozenset(),
     digits: int = 8,
 ) -> Subject:
-    """The photos of some cameras that have a mask and a pose, frame after frame and camera after
+    """Returns a subject with the photos that have both a mask and a pose, ordered by frame, then by
     camera.
 
-    photos, masks: of each camera by frame. read: a photo and its mask -> image on white and mask as
-    0 and 1. listed: (camera, frame) that are known to be missing. digits: of a frame in the name of
-    a view.
-    Raises: CaptureError if there is no photo.
+    photos, masks: for each camera a mapping from frame to whatever `read` takes. read: called with
+    a photo and its mask; returns the image on white and the mask as 0 and 1. listed: the (camera,
+    frame) pairs known to be missing. digits: the digits of the frame in the name of a view. Raises:
+    CaptureError if there is no photo.
     """
     count = len(parameters.translations)
     missing = {"listed as missing": 0, "no photo": 0, "no mask": 0, "no pose": 0}
@@ -276,7 +279,9 @@ def _folder_subject(
     parameters: BodyParameters,
     listed: Set[tuple[str, int]] = frozenset(),
 ) -> Subject:
-    """`_video_subject` of files in folders of each camera's photos and masks."""
+    """Returns `_video_subject` of image files. folders: for each camera the folder of its photos
+    and the folder of its masks.
+    """
     photos, masks = ([numbered(folder) for folder in part] for part in zip(*folders, strict=True))
     return _video_subject(name, cameras, photos, masks, on_white, parameters, listed)
 
@@ -284,7 +289,7 @@ def _folder_subject(
 def on_white(
     photo: Path, mask: Path
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """A photo on white where its mask is at most 128, and the mask as 0 and 1.
+    """Returns a photo, white where its mask is at most 128, and the mask as 0 and 1.
 
     Raises: CaptureError naming the file.
     """
@@ -311,9 +316,9 @@ class _FolderLayout(NamedTuple):
     calibration: str
     """The path of the calibration."""
     photos: str
-    """The folder of the photos of a camera, with NAME for its name."""
+    """The folder of one camera's photos, with NAME in place of the camera's name."""
     masks: str
-    """The folder of its masks, with NAME for its name."""
+    """The folder of one camera's masks, with NAME in place of the camera's name."""
 
 
 THUMAN4 = _FolderLayout("calibration.json", "images/NAME", "masks/NAME")
@@ -321,7 +326,7 @@ AVATARREX = _FolderLayout("calibration_full.json", "NAME", "NAME/mask/pha")
 
 
 def _find_subjects(layout: _FolderLayout, folder: str | Path) -> tuple[Path, ...]:
-    """The subjects in a folder, sorted, or the folder itself; empty if there are none."""
+    """Returns the folder itself if it is a subject, else the subjects directly in it, sorted."""
     above = layout.photos.removesuffix("NAME")
     return _subfolders(
         folder, lambda path: (path / layout.calibration).is_file() and (path / above).is_dir()
@@ -331,7 +336,9 @@ def _find_subjects(layout: _FolderLayout, folder: str | Path) -> tuple[Path, ...
 def _subfolders(
     folder: str | Path, is_one: Callable[[Path], bool], depth: int = 1
 ) -> tuple[Path, ...]:
-    """The folder itself, or those up to `depth` folders below that are a subject, sorted."""
+    """Returns the folder itself if `is_one` accepts it, else the accepted folders up to `depth`
+    levels below, sorted.
+    """
     folder = Path(folder)
     below = (path for level in range(depth) for path in visible(folder.glob("*/" * (level + 1))))
     if is_one(folder):
@@ -340,7 +347,7 @@ def _subfolders(
 
 
 def _open_subject(layout: _FolderLayout, folder: str | Path, body: FileBody) -> Subject:
-    """One subject; nothing but calibration, poses and names of files is read.
+    """Open one subject. Only calibration, poses and file names are read.
 
     Raises: CaptureError naming file and key.
     """
@@ -374,13 +381,13 @@ find_avatarrex, open_avatarrex = (
 CALIBRATION = "calibration.csv"
 """File with the cameras of one size of images."""
 SCALES = ("4x", "2x", "1x")
-"""Folders of images, smallest first."""
+"""Folders of images, those of the smallest images first."""
 COLUMNS = ["w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"]
 
 
 def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
-    """The sequences in a folder (of one actor or of several), sorted, or the folder itself; empty
-    if there are none.
+    """Returns the sequences in a folder of one actor or of several, sorted; the folder itself if it
+    is a sequence; empty if there are none.
     """
     return _subfolders(
         folder,
@@ -390,7 +397,7 @@ def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
 
 
 def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
-    """One sequence, in the smallest images that are there.
+    """Open one sequence with the smallest images that its folder has.
 
     Raises: CaptureError naming file and key.
     """
@@ -405,7 +412,10 @@ def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
 
 
 def _read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
-    """The cameras of a csv. Raises: CaptureError naming file, camera and column."""
+    """Read the cameras of a calibration.csv.
+
+    Raises: CaptureError naming file, camera and column.
+    """
     with reading(file, "csv file", CaptureError):
         rows = list(csv.DictReader(io.StringIO(checked_text(file))))
     cameras = []
@@ -456,7 +466,9 @@ GROUPS = ("Camera_5mp", "Camera_12mp")
 
 
 def find_dna_rendering(folder: str | Path) -> tuple[Path, ...]:
-    """The main files of a folder with main/ and annotations/, sorted; empty if there are none."""
+    """Returns the main files of a folder that has main/ and annotations/, sorted; empty if there
+    are none.
+    """
     return tuple(sorted(visible(Path(folder).glob("main/*.smc"))))
 
 
@@ -479,7 +491,9 @@ class _Smc:
             self.file = h5py.File(path, "r")
 
     def _at(self, key: str) -> Any:
-        """What is under a key, or None. Links, which can lead into other files, are refused."""
+        """Returns the group or data set under a key, or None if there is none. Links are refused,
+        since they can lead into other files.
+        """
         found = self.file
         for part in key.split("/"):
             if not hasattr(found, "keys") or part not in found:
@@ -490,13 +504,13 @@ class _Smc:
         return found
 
     def names(self, group: str) -> list[str]:
-        """Names in a group; none if there is no such group."""
+        """Returns the names in a group; an empty list if there is no such group."""
         with reading(f"{self.path}: {group}", "group", CaptureError):
             found = self._at(group)
             return [] if found is None else list(found.keys())
 
     def array(self, key: str, limit: str = "array_bytes") -> np.ndarray:
-        """The numbers of a data set."""
+        """Returns the numbers of a data set. limit: the name of the limit on its bytes."""
         with reading(f"{self.path}: {key}", "data set", CaptureError):
             data = self._at(key)
             if data is None:
@@ -513,11 +527,11 @@ class _Smc:
     def numbers(
         self, key: str, shape: tuple[int | None, ...], largest: float = np.inf
     ) -> Float[np.ndarray, "..."]:
-        """Finite float64 numbers of a shape."""
+        """Returns finite float64 numbers of this shape. largest: see `checked_numbers`."""
         return checked_numbers(self.array(key), self.path, key, shape, largest=largest)
 
     def image(self, key: str, made_of: Callable[[Any], T]) -> T:
-        """What a function makes of an encoded photo, one of PIL."""
+        """Decodes a photo, and returns what `made_of` makes of the PIL image."""
         data = self.array(key, "image_bytes")
         with reading(f"{self.path}: {key}", "image", CaptureError):
             if data.dtype != np.uint8 or data.ndim != 1:
@@ -529,7 +543,10 @@ class _Smc:
 
 
 def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
-    """One sequence of its main file. Raises: CaptureError naming file and key."""
+    """Open one sequence by its main file.
+
+    Raises: CaptureError naming file and key.
+    """
     main = Path(main)
     photos, notes = _Smc(main), _Smc(main.parent.parent / "annotations" / f"{main.stem}_annots.smc")
     # cameras are spread over groups of two kinds
