@@ -46,21 +46,25 @@ from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 TERMS = 8
 LIMIT = 0.7
-"""The largest change of the log: no pose makes a Gaussian more than twice as bright, or less than
-half, as it is in the photos.
+"""The largest change of the log of a Gaussian's brightness from the photos to another pose: a
+factor of about 2 or 1/2.
 """
 STEPS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233)
-"""Along a curve through all vertices: how far apart those are that are compared."""
+"""Distances between the vertices that are compared, as numbers of vertices along a curve through
+all of them.
+"""
 CURVE_REACH = 1.5
-"""Metres, of the curve's cube around the middle of the body."""
+"""Metres: half the side of the cube that holds the curve, around the middle of the body."""
 REACH = 0.25
-"""Metres: vertices farther apart are not compared."""
+"""Metres. Vertices that are farther apart are not compared."""
 DARKEST = 0.02
 """Brightness below which differences of the log are noise."""
 ROBUST = 0.03
-"""Difference of the logs from which on a deviation counts by its size and not by its square."""
+"""Differences of the logs above this count by their size, smaller ones by their square."""
 RIDGE = 0.003
-"""Weight of the squares of the coefficients: a body without contrast has no light."""
+"""Weight of the squared coefficients in the fit. It keeps the light of a body without contrast at
+zero.
+"""
 ITERATIONS = 10
 TINY = 1e-24
 """The least sum of squares: it keeps the gradient of a vanishing normal finite."""
@@ -89,14 +93,16 @@ def light_terms(normals: Float[Array, "g 3"]) -> Float[Array, "g 8"]:
 def log_brightness(
     terms: Float[Array, "*n 8"], coefficients: Float[Array, "8"]
 ) -> Float[Array, "*n"]:
-    """Log of the brightness that a light gives."""
+    """Returns the log of the brightness that surfaces have in a light. terms: what `light_terms`
+    returns.
+    """
     return jnp.sum(terms * coefficients, axis=-1)
 
 
 def turned_normals(
     normals: Float[Array, "g 3"], linear: Float[Array, "g 3 3"]
 ) -> Float[Array, "g 3"]:
-    """Unit normals of surfaces that linear maps deform; 0 where a map has rank 1."""
+    """Returns the unit normals of surfaces after linear maps; 0 where a map has rank 1."""
     # the inverse transpose, up to a positive factor: rows of cofactors
     rows = [jnp.cross(linear[:, (i + 1) % 3], linear[:, (i + 2) % 3]) for i in range(3)]
     turned = jnp.einsum("gij,gj->gi", jnp.stack(rows, axis=1), normals, precision=EXACT)
@@ -106,9 +112,9 @@ def turned_normals(
 def relit(
     colors: Float[Array, "g 3"], light: Light, linear: Float[Array, "g 3 3"]
 ) -> Float[Array, "g 3"]:
-    """Colors where `linear` has turned the surface.
+    """Returns the colors of Gaussians after their surfaces were turned by `linear`.
 
-    They do not exceed 1, except where they do in the photos.
+    Colors do not exceed 1, except those that do so in the photos.
     """
     terms = light_terms(turned_normals(light.normals, linear))
     change = jnp.clip(log_brightness(terms, light.coefficients) - light.shading, -LIMIT, LIMIT)
@@ -154,7 +160,7 @@ def light_coefficients(
 def surface_normals(
     vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], points: Float[Array, "g 3"]
 ) -> Float[Array, "g 3"]:
-    """Unit normals of a mesh at the vertex nearest to each point. On the host."""
+    """Returns the unit normal of a mesh at the vertex nearest to each point. Runs on the host."""
     from scipy.spatial import KDTree
 
     return vertex_normals(vertices, faces)[
@@ -179,10 +185,10 @@ _ARRAYS = (
     "faces",
 )
 ALIKE = 1e-3
-"""Skinning weights that differ by less are those of one vertex."""
+"""Skinning weights that differ by less count as those of one vertex."""
 _LIGHT = ("coefficients", "normals", "shading")
 _OPTIONAL = {"low_pass": "pixel_footprint", "harmonics": "harmonics"}
-"""Key of the file -> field of `Gaussians`, of arrays that only some have."""
+"""The optional arrays of a file: key -> field of `Gaussians`."""
 
 
 @pytree_dataclass
@@ -230,12 +236,12 @@ class Avatar(Batchable):
     face: Face | None = None
     """What poses with an expression need (`with_face`); None: the face is rigid."""
     one_at_a_time: ClassVar[bool] = True
-    """Functions of one avatar refuse a batch (`core.checks`)."""
+    """Functions of one avatar refuse a batch of avatars (`core.checks`)."""
 
     @property
     def gaussians_per_vertex(self) -> int | None:
-        """k, or None where refinement has added Gaussians, which do not stand with those of a
-        vertex.
+        """The number of Gaussians of each vertex. None where refinement has added some, which do
+        not stand with those of their vertex.
         """
         weights, vertices = np.asarray(self.skinning_weights), len(self.rest_vertices)
         if len(weights) % vertices:
@@ -276,7 +282,7 @@ class Avatar(Batchable):
         return with_face(self, body)
 
     def select(self, index: Array | np.ndarray) -> "Avatar":
-        """The avatar with these of its Gaussians."""
+        """The avatar with the Gaussians at `index` alone."""
         light = self.light
         if light is not None:
             light = replace(
@@ -372,8 +378,8 @@ def recorded_source(path: str | os.PathLike[str]) -> str | None:
 def _read(
     path: Any, wanted: Callable[[str], bool] | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays of an avatar file, not checked yet, and its header. wanted: which arrays to
-    read; None: all.
+    """Read the arrays of an avatar file, without checks, and its header. wanted: tells by its key
+    whether an array is read; None: all are.
     """
     try:
         arrays, _ = read_npz(path, wanted)
@@ -443,13 +449,13 @@ _FACE = (
     *("row", "eyes", "beside", "stretching"),
     *("hidden_normals", "hidden_directions", "hidden_shown", "in_mouth", "lips", "lip_directions"),
 )
-"""Arrays of a face, in files behind `face_`; and the Gaussians that are hidden, behind
-`face_hidden_`.
+"""The arrays of a face. Their keys in files begin with `face_`, and those of the hidden Gaussians
+with `face_hidden_`.
 """
 
 
 def _face_arrays(face: Face) -> dict[str, np.ndarray]:
-    """What a file holds of a face, by key."""
+    """Returns the arrays of a face by their keys in a file."""
     arrays = {f"face_{name}": np.asarray(getattr(face, name)) for name in _FACE}
     hidden = {f"face_hidden_{name}": np.asarray(getattr(face.hidden, name)) for name in _ARRAYS[:5]}
     return arrays | hidden | expression_arrays(face.expressions)
@@ -502,7 +508,7 @@ def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray])
 
 
 _RANGES = {"skinning_weights": UNIT, "light_normals": SIGNED_UNIT}
-"""What arrays of files may hold, where records allow more."""
+"""Ranges of the arrays in files, where the records themselves allow more."""
 
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:

@@ -1,4 +1,5 @@
-"""Photos with body poses -> one forward pass -> an avatar; one person, or many in one batch.
+"""Reconstructs an avatar from photos with body poses in one forward pass, for one person or for
+many in one batch.
 
 Programs are compiled once per bucket: numbers of views and of foreground tokens are rounded up to
 few sizes (`buffers.round_up`), and padding is masked.
@@ -69,12 +70,14 @@ LEGS = tuple(
     for side in ("left", "right")
 )
 SMALLEST_VOLUME = 0.2
-"""Blended transforms of limbs that are turned against each other collapse; below this determinant
-they are not inverted.
+"""The least determinant of a blended transform that is inverted. Transforms of limbs that are
+turned against each other collapse, and Gaussians there keep their weights.
 """
 POSED = "the posed vertices, which all arrays of the body move"
 BATCH = 8
-"""Captures of `reconstruct_batch` at a time: beyond it memory grows, and little else."""
+"""Captures that `reconstruct_batch` takes at a time by default. Larger batches take more memory,
+and gain little.
+"""
 
 
 @checked_arguments
@@ -135,8 +138,8 @@ def reconstruct(
 def calls_of_reconstruct(
     variables: Variables, config: HumanGSConfig, capture: Capture
 ) -> Iterator[Call]:
-    """The programs of `reconstruct` for a capture with masks, whatever its body; none where the
-    body decides on their sizes. A skirt makes others.
+    """Yields the programs of `reconstruct` for a capture with masks, whatever its body. Yields none
+    where the sizes depend on the body. Bodies with a skirt need other programs.
     """
     body, moved = gaussian_body(capture.body, config), None
     if allows_vertex_offsets(config):
@@ -151,8 +154,8 @@ def calls_of_reconstruct(
 def _for_network(
     photos: Capture, displacement: Float[np.ndarray, "n 3"] | None, config: HumanGSConfig
 ) -> tuple[SubjectViews, HumanGSConfig | None]:
-    """The photos as the network wants them, and the configuration with room for their tokens; None
-    where masks alone do not say how many these are.
+    """Returns the photos in the form that the network takes, and the configuration with room for
+    their tokens. The configuration is None if the masks alone do not tell the number of tokens.
     """
     # few numbers of views are compiled: the others are padded
     size, crop = config.image_size, config.runtime.crop
@@ -168,14 +171,14 @@ def _for_network(
 
 
 class Reconstructed(NamedTuple):
-    """A capture of a batch with its avatar, or with what is wrong with it."""
+    """A capture of a batch, with its avatar or with the error that it caused."""
 
     capture: PreparedCapture | None = None
     """The capture as it was used; None if there is an error."""
     avatar: Avatar | None = None
     """The avatar; None if there is an error."""
     error: Exception | None = None
-    """What is wrong; None if nothing is."""
+    """The error that the capture caused; None if it caused none."""
 
 
 @checked_arguments
@@ -322,8 +325,9 @@ def stack_captures(
 def fit_buffers(
     foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, config: HumanGSConfig
 ) -> HumanGSConfig:
-    """The configuration with room for the foreground of some inputs, those of one subject or of a
-    batch.
+    """Returns the configuration with room for the foreground tokens of one subject or of a batch.
+
+    foreground: which pixels are foreground. view_count: the number of real views; None: all are.
     """
     patch, capacity = config.architecture.encoder.patch_size, 0
     if config.tokens != "all":
@@ -392,9 +396,10 @@ def _reconstruct(
 def make_avatar(
     outputs: HumanGSOutputs, body: BodyModel, rest: RestBody, config: HumanGSConfig
 ) -> Avatar:
-    """Canonical Gaussians on the body of a person, shaped to `rest`: what can be posed.
+    """Returns an avatar: the canonical Gaussians of the outputs on the body of a person. rest: that
+    body in the T-pose.
 
-    Raises: ValueError if there are none.
+    Raises: ValueError if there are no Gaussians.
     """
     if outputs.is_empty:
         name = type(config.architecture.decoder).__name__
@@ -423,8 +428,8 @@ def make_avatar(
 def completed_avatar(
     outputs: HumanGSOutputs, body: BodyModel, views: SubjectViews, config: HumanGSConfig
 ) -> Avatar:
-    """`make_avatar`, and what the conventions take from the photos: the skinning between the legs,
-    the light, the low-pass.
+    """Returns `make_avatar` with what the configuration's conventions take from the photos: the
+    skinning weights between the legs, the light, and the low-pass.
     """
     conventions = config.conventions
     avatar = make_avatar(outputs, body, subject_rest(body, views.betas, views.displacement), config)
@@ -482,8 +487,8 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
 
 
 def with_blended_leg_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
-    """The avatar with the weights of `blend_leg_weights`. In `pose`, that of the first photo, the
-    means stay where they were.
+    """Returns the avatar with the skinning weights of `blend_leg_weights`. The means are changed
+    such that they stay in their places in `pose`, the pose of the first photo.
 
     The shapes of Gaussians are not corrected. Gradients do not pass through the weights.
     """
@@ -514,7 +519,10 @@ def with_blended_leg_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Av
 
 
 def _check(given: Capture | PreparedCapture, name: str) -> None:
-    """Raises: TypeError, ValueError unless this is a capture that can be reconstructed."""
+    """Check that `given` is a capture that can be reconstructed.
+
+    Raises: TypeError for other types; ValueError.
+    """
     capture = given.capture if isinstance(given, PreparedCapture) else given
     if not isinstance(capture, Capture):
         raise TypeError(f"{name}: expected Capture, got {type(capture).__name__}")
@@ -527,7 +535,9 @@ def _check(given: Capture | PreparedCapture, name: str) -> None:
 
 
 def _same_body(one: PreparedCapture, other: PreparedCapture) -> bool:
-    """Whether the people have one body model, which may have been read twice."""
+    """Returns whether two people have equal body models, even if these were read from file
+    twice.
+    """
     mine, theirs = one.capture.body, other.capture.body
     return mine is theirs or (
         jax.tree.structure(mine) == jax.tree.structure(theirs)
@@ -540,6 +550,6 @@ _prepare = jax.jit(prepare_inputs)
 
 @jax.jit
 def _prepare_batch(body: BodyModel, batch: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
-    """`prepare_inputs` of each person of a batch."""
+    """Returns the network's inputs for each person of a batch, see `prepare_inputs`."""
     pixels = math.prod(batch.images.shape[1:4])
     return over(lambda views: prepare_inputs(body, views, config), batch, pixels)

@@ -1,5 +1,5 @@
-"""A calibration in memory, of whatever format: cameras, conversion to the convention of captures,
-lens distortion, checks.
+"""A calibration of any format in memory: its cameras, their conversion to the convention of
+captures, lens distortion, and checks.
 
 Readers return a `Calibration`: OpenCV axes (x right, y down, z forward), but lengths, the world's
 up axis and the place of pixel centres still those of the source. `in_capture_convention` makes
@@ -27,11 +27,11 @@ from humangs_jax.data.unknown import binary_kind, described
 from humangs_jax.io.reading import limits, reading
 
 ROUNDED_ROTATION = 5e-3
-"""R R^T of matrices written with three decimals (EasyMocap) is this far from 1; they are replaced
-by the nearest rotation.
+"""The largest deviation of R R^T from 1 for matrices that are written with three decimals
+(EasyMocap). Such matrices are replaced by the nearest rotation.
 """
 LARGEST_COEFFICIENT = 1e100
-"""The largest coefficient of a lens: products of larger ones are not finite."""
+"""The largest coefficient of a lens. Products of larger ones are not finite."""
 ROTATION_TO_Y_UP = {
     "+x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
@@ -40,9 +40,9 @@ ROTATION_TO_Y_UP = {
     "+z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
 }
-"""For each axis that can be up in the source, the proper rotation that takes it to +y."""
+"""The proper rotation that takes each axis of the source that can point up to +y."""
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""y down and z forward -> y up and z backwards; its own inverse."""
+"""The matrix that turns axes y down, z forward into y up, z backward; it is its own inverse."""
 CAM_FROM_WORLD = "cam_from_world, OpenCV axes"
 """Matrices take points of the world to the camera, x right, y down, z forward."""
 WORLD_FROM_CAM = "world_from_cam, OpenCV axes"
@@ -57,8 +57,9 @@ CONVENTIONS = {
     CAM_FROM_WORLD_OPENGL: lambda matrix: OPENGL_FROM_OPENCV @ matrix,
     WORLD_FROM_CAM_OPENGL: lambda matrix: OPENGL_FROM_OPENCV @ np.linalg.inv(matrix),
 }
-"""What a matrix in a file may mean, and the cam_from_world with OpenCV's axes that follows. OpenCV:
-x right, y down, z forward; OpenGL: x right, y up, z backwards."""
+"""The meanings that a matrix in a file may have, each with a function from the matrix to
+cam_from_world with OpenCV's axes.
+"""
 PixelCenters = Literal["integer", "half"]
 """Where the centre of the first pixel is: at (0, 0), as OpenCV has it, or at (0.5, 0.5)."""
 
@@ -78,8 +79,8 @@ class CalibratedCamera:
     height: int | None = None
     """The height of the image, pixels; None where the format does not say."""
     distortion: Float[np.ndarray, " coefficients"] | None = None
-    """OpenCV's k1 k2 p1 p2 k3; 8, 12 or, of fisheyes, 4 numbers where there is a `refusal`. None:
-    the lens does not distort.
+    """OpenCV's k1 k2 p1 p2 k3. Where there is a `refusal`: 8 or 12 numbers, or 4 of a fisheye.
+    None: the lens does not distort.
     """
     frame: int = 0
     """The frame of the image, counted from 0, where there is one camera for each image."""
@@ -88,8 +89,8 @@ class CalibratedCamera:
     lens: str = "pinhole"
     """The kind of the lens, as `geometry.lens` names it."""
     refusal: CaptureError | None = None
-    """The error to raise where photos have to be undistorted, for lenses that this is not done for
-    (fisheyes, more coefficients).
+    """The error to raise where photos have to be undistorted, for lenses whose photos are not
+    undistorted here (fisheyes, more coefficients).
     """
 
 
@@ -126,7 +127,7 @@ class Calibration:
     per_image: bool
     """Whether there is one camera for each image, not one for each camera."""
     pixel_centers: PixelCenters
-    """Where the format has the centre of the first pixel, unless the user says otherwise."""
+    """Where the centre of the first pixel is in this format, unless the user says otherwise."""
     up: str
     """The world's up axis in this format, unless the user says otherwise."""
     observations: Observations | None = None
@@ -134,18 +135,22 @@ class Calibration:
     convention: str = CAM_FROM_WORLD
     """What the matrices in the file mean, a key of `CONVENTIONS`."""
     stations: int | None = None
-    """How many cameras took the images, where the format says; None: one for each of `cameras`."""
+    """The number of cameras that took the images, where the format says it. None: one for each of
+    `cameras`.
+    """
     mask_key: str | None = None
     """The key under which the file names masks; None if it does not."""
     upright: bool = False
-    """Whether cameras are of photos that obey their EXIF orientation; if not, sizes decide."""
+    """Whether cameras belong to photos turned by their EXIF orientation; if not, sizes decide."""
     estimated: bool = False
     """Whether the cameras were found from the person."""
     unit: float | None = None
-    """Metres in the unit of the format, None where it may be any."""
+    """Metres per unit of the format; None where files may have any unit."""
 
     def with_cameras(self, kept: Sequence[int]) -> "Calibration":
-        """The calibration of these cameras alone, and of what they saw; frames are counted anew."""
+        """Returns the calibration of the cameras with these numbers, and of the points that they
+        saw. Frames are counted anew.
+        """
         cameras = [self.cameras[i] for i in kept]
         frames = {frame: i for i, frame in enumerate(sorted({camera.frame for camera in cameras}))}
         cameras = [dataclasses.replace(camera, frame=frames[camera.frame]) for camera in cameras]
@@ -170,12 +175,14 @@ class Calibration:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CalibrationFile:
-    """What a reader of a format gets."""
+    """The file that a reader of a calibration format gets."""
 
     path: Path
-    """A file, or the folder of a format of several files."""
+    """The path of a file, or of the folder where a format has several files."""
     photo_size: Callable[[str], tuple[int, int]]
-    """Width and height of the photo of a name, for formats that do not say them."""
+    """Returns the width and the height of the photo with a name, for formats that do not have
+    them.
+    """
 
     @functools.cached_property
     def text(self) -> str:
@@ -184,7 +191,10 @@ class CalibrationFile:
 
     @functools.cached_property
     def json(self) -> Any:
-        """The value of a file that begins like a JSON object, else None. Raises: CaptureError."""
+        """The value of a file that begins like a JSON object, else None.
+
+        Raises: CaptureError.
+        """
         if self.text.lstrip().startswith("{"):
             return checked_json(self.path, self.text)
         return None
@@ -196,7 +206,9 @@ class CalibrationFile:
         file: Path | None = None,
         **more: Any,
     ) -> Calibration:
-        """These cameras, with what the format means. file: that errors name, `path` if None."""
+        """Returns a calibration of these cameras with the conventions of the format. file: the file
+        that errors name; None: `path`.
+        """
         what = (
             format.about,
             file or self.path,
@@ -211,10 +223,11 @@ class CalibrationFile:
 def read_calibration(
     path: Path, photo_size: Callable[[str], tuple[int, int]], any_lens: bool = False
 ) -> Calibration:
-    """The calibration in a file or folder of one of the `CAMERAS`; its content decides which one.
+    """Read the calibration in a file or folder. Its content decides which of the `CAMERAS` formats
+    it has.
 
-    photo_size: as in `CalibrationFile`. any_lens: also one whose photos are not undistorted here,
-    else refused.
+    photo_size: as in `CalibrationFile`. any_lens: whether lenses are allowed whose photos are not
+    undistorted here; such lenses are refused otherwise.
 
     Raises: CaptureError, one line that names the file and what was expected.
     """
@@ -253,11 +266,12 @@ def _read(path: Path, photo_size: Callable[[str], tuple[int, int]]) -> Calibrati
 def in_capture_convention(
     calibration: Calibration, scale: float, up: str, pixel_centers: str
 ) -> Calibration:
-    """The same cameras and points in metres, y up, pixel centres at +0.5, rotations orthonormal.
+    """Returns the cameras and points in metres, with y up, pixel centres at +0.5 and orthonormal
+    rotations.
 
     Arguments:
-        scale: metres per unit of the source. up: the source's axis that points up, a key of
-            `ROTATION_TO_Y_UP`.
+        scale: metres per unit of the source.
+        up: the axis of the source that points up, a key of `ROTATION_TO_Y_UP`.
         pixel_centers: "integer" adds 0.5 to the principal point, "half" leaves it.
     """
     turn = np.asarray(ROTATION_TO_Y_UP[up], float)
@@ -280,8 +294,8 @@ def in_capture_convention(
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation nearest to a rounded one; a matrix that is further from one than rounding
-    explains is left as it is.
+    """Returns the rotation nearest to a rounded rotation matrix. A matrix that deviates by more
+    than rounding explains is returned as it is.
     """
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROUNDED_ROTATION or np.linalg.det(matrix) < 0:
         return matrix
@@ -294,7 +308,10 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 
 
 def image_size(value: Any, file: object, field: str) -> tuple[int, int]:
-    """Width and height in whole pixels."""
+    """Returns width and height in whole pixels, read from `value`.
+
+    Raises: CaptureError for other values.
+    """
     width, height = floats(value, file, field, (2,)).tolist()
     if not (
         width.is_integer()
@@ -309,22 +326,22 @@ def image_size(value: Any, file: object, field: str) -> tuple[int, int]:
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
-    """K of focal lengths and principal point, pixels."""
+    """Returns the camera matrix K of focal lengths and a principal point, pixels."""
     return np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
 def pose_matrix(
     rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """[[R, t], [0, 0, 0, 1]]."""
+    """Returns the matrix [[R, t], [0, 0, 0, 1]]."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, translation
     return pose
 
 
 def rotation(value: Any, file: object, field: str) -> Float[np.ndarray, "3 3"]:
-    """A rotation given as 9 numbers of its matrix, or as the 3 of a rotation vector
-    (cv2.Rodrigues).
+    """Returns the 3 x 3 matrix of a rotation in a file, which may be the 9 numbers of the matrix or
+    the 3 numbers of a rotation vector (cv2.Rodrigues).
     """
     from scipy.spatial.transform import Rotation
 
@@ -346,15 +363,15 @@ UNDISTORT_BEFORE = (
     "undistort the photos before (cv2.undistort, cv2.fisheye or colmap image_undistorter)"
 )
 COUNTS = (4, 5, 8, 12, 14)
-"""Numbers of coefficients that OpenCV's calibration writes: from the sixth on they are k4 k5 k6,
-s1..s4, tx ty.
+"""The numbers of coefficients that OpenCV's calibration writes. From the sixth on, these are k4 k5
+k6, s1..s4, tx ty.
 """
 
 
 def brown_conrady(values: Any, file: object, field: str) -> Float[np.ndarray, "5"] | None:
-    """k1 k2 p1 p2 k3 of OpenCV's list of coefficients; None if all are 0.
+    """Returns k1 k2 p1 p2 k3 of OpenCV's list of coefficients; None if all are 0.
 
-    Raises: as `pinhole_lens`, and CaptureError if others than the first five are not 0.
+    Raises: CaptureError as `pinhole_lens`, and if a coefficient beyond the first five is not 0.
     """
     fields = pinhole_lens(values, file, field)
     if "refusal" in fields:
@@ -363,10 +380,10 @@ def brown_conrady(values: Any, file: object, field: str) -> Float[np.ndarray, "5
 
 
 def pinhole_lens(values: Any, file: object, field: str) -> dict[str, Any]:
-    """Fields of a `CalibratedCamera` for OpenCV's list of coefficients.
+    """Returns the fields of a `CalibratedCamera` for OpenCV's list of coefficients.
 
-    Raises: CaptureError if there are not 4, 5, 8, 12 or 14, or the last two of 14, a tilted sensor,
-    are not 0.
+    Raises: CaptureError if there are not 4, 5, 8, 12 or 14 coefficients, or if one of the last two
+    of 14 (a tilted sensor) is not 0.
     """
     values = file_numbers(values, file, field).ravel()
     if len(values) not in COUNTS:
@@ -382,8 +399,8 @@ def pinhole_lens(values: Any, file: object, field: str) -> dict[str, Any]:
 
 
 def fisheye_lens(values: Any, file: object, field: str, refusal: CaptureError) -> dict[str, Any]:
-    """Fields of a `CalibratedCamera` for k1 k2 k3 k4 of a fisheye, or fewer. refusal: where
-    photos have to be undistorted.
+    """Returns the fields of a `CalibratedCamera` for the coefficients k1 k2 k3 k4 of a fisheye;
+    missing ones are 0. refusal: the error where photos have to be undistorted.
     """
     values = file_numbers(values, file, field).ravel()
     if values[4:].any():
@@ -396,7 +413,7 @@ def fisheye_lens(values: Any, file: object, field: str, refusal: CaptureError) -
 def distort(
     points: Float[np.ndarray, "*n 2"], coefficients: Float[np.ndarray, "5"]
 ) -> Float[np.ndarray, "*n 2"]:
-    """Where the lens puts points of the plane z = 1."""
+    """Returns where the lens puts points (x, y) of the plane z = 1."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = points[..., 0], points[..., 1]
     r2 = x * x + y * y
@@ -415,8 +432,8 @@ def undistort(
     fill: float,
     box: tuple[slice, slice] = (slice(None), slice(None)),
 ) -> Float[np.ndarray, "h w *c"]:
-    """The photo that a pinhole of the same K (pixel centres at +0.5) would have taken, bilinear,
-    float32.
+    """Returns the photo that a pinhole camera with the same K (pixel centres at +0.5) would have
+    taken, interpolated bilinearly, float32.
 
     Pixels that the photo does not show, and those outside of `box` (rows, columns), get the value
     `fill`.
@@ -443,8 +460,8 @@ def undistort_person(
     K: Float[np.ndarray, "3 3"],
     coefficients: Float[np.ndarray, "5"],
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """A photo on white and its mask without distortion: `undistort`, in the box around the person
-    alone, which is faster.
+    """Returns a photo on white and its mask without distortion. `undistort` runs in the box around
+    the person alone, which is faster.
     """
     step = 16
     rows, columns = (np.arange(0.0, size + step, step) for size in mask.shape)
@@ -469,8 +486,8 @@ def _in_photo(
     K: Float[np.ndarray, "3 3"],
     coefficients: Float[np.ndarray, "5"],
 ) -> Float[np.ndarray, "*n 2"]:
-    """Where the lens puts pixels (edges of the photo at whole numbers); far outside if it does not
-    show them.
+    """Returns where the lens puts pixels, in pixels of the photo, whose edges are whole numbers.
+    Pixels that the photo does not show are put far outside.
     """
     plane = (pixels - K[:2, 2]) / np.diag(K)[:2]
     source = distort(plane, coefficients) * np.diag(K)[:2] + K[:2, 2]
@@ -479,7 +496,7 @@ def _in_photo(
 
 
 def _squared_reach(coefficients: Sequence[float | int] | np.ndarray) -> float:
-    """r^2 up to which r (1 + k1 r^2 + ..) grows.
+    """Returns the r^2 up to which r (1 + k1 r^2 + ..) grows.
 
     Beyond it the formula folds the image back over itself.
     """

@@ -1,5 +1,5 @@
-"""What is read: cameras, keypoints, motions and data sets. A row each; a new format is a reader and
-a line here.
+"""The tables of file formats that are read: cameras, keypoints, motions and data sets. Each format
+is a row; a new format needs a reader and a row here.
 
 `--help`, `humangs start`, errors and the tables in the docs are made of these rows.
 """
@@ -15,7 +15,7 @@ from humangs_jax.core.registry import FOLDER, Format, Formats, imported
 from humangs_jax.io.reading import visible
 
 START_MARK = "start.json"
-"""What `humangs start` leaves in a capture folder that it made."""
+"""The file that `humangs start` leaves in a capture folder that it made."""
 
 # Cameras and keypoints
 # --------------------------------------------------------------------------------------------------
@@ -39,27 +39,27 @@ class SourceFormat(Format):
     files: tuple[str, ...] = ()
     """Usual names in a folder, patterns of `Path.glob`."""
     content: str = ""
-    """What is in them, for the docs: a line of Markdown."""
+    """The contents of its files, for the docs: a line of Markdown."""
     folder: bool = False
     """Whether the files of one folder are read together."""
 
     def __str__(self) -> str:
-        """As lists name it."""
+        """Returns the format as lists show it."""
         return self.about
 
     def fits(self, source: Any) -> bool:
-        """Whether a source, a file, is of this format."""
+        """Returns whether a source, a file, is of this format."""
         return not self.folder and imported(str(self.code).replace(":read", ":recognizes"))(source)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Lists the usual names of files, without those of folders."""
+        """Returns the usual names of files, without those of folders."""
         return tuple(dict.fromkeys(Path(file).name for file in self.files))
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraFormat(SourceFormat):
-    """A format of calibrations."""
+    """A format of camera calibrations."""
 
     up: str = "-y"
     """The axis that points up."""
@@ -68,7 +68,7 @@ class CameraFormat(SourceFormat):
     per_image: bool = False
     """Whether there is one camera for each image, not one for each camera."""
     unit: float | None = None
-    """Metres in the unit of length of the format; None where it may be any."""
+    """Metres per unit of length of the format; None where files may have any unit."""
 
     def __str__(self) -> str:
         if self.files:
@@ -80,7 +80,9 @@ class SourceFormats(Formats[F]):
     """Formats that are known by the content of their files."""
 
     def found(self, folder: Path) -> tuple[F, Path] | None:
-        """The first format of which a folder has files, and the first of these; None: none."""
+        """Returns the first format of which the folder has a file with a usual name, and the first
+        such file; None if it has none.
+        """
         for each in self.values():
             for pattern in each.files:
                 file = next(iter(sorted(visible(folder.glob(pattern)))), None)
@@ -89,7 +91,7 @@ class SourceFormats(Formats[F]):
         return None
 
     def of_name(self, file: Path) -> F | None:
-        """The first format of several files that one is of by its name."""
+        """Returns the first format of several files to which the name of this one belongs."""
         named = (
             each
             for each in self.values()
@@ -98,8 +100,8 @@ class SourceFormats(Formats[F]):
         return next(named, None)
 
     def of_content(self, source: Any) -> F | None:
-        """The first format that recognizes a source, a file; those of its suffix are asked before
-        the others.
+        """Returns the first format whose reader recognizes a source, a file. Formats of its suffix
+        are tried before the others.
         """
         asked = sorted(
             self.values(), key=lambda each: source.path.suffix.lower() not in each.suffixes
@@ -107,14 +109,14 @@ class SourceFormats(Formats[F]):
         return next((each for each in asked if each.fits(source)), None)
 
     def listed(self) -> str:
-        """All in one line."""
+        """Returns all formats in one line of text."""
         return "; ".join(map(str, self.values()))
 
 
 _CAMERAS = "humangs_jax.capture.calibration."
-"""How the names of functions that read cameras begin."""
+"""The package whose modules read cameras."""
 _KEYPOINTS = "humangs_jax.capture.keypoints.formats:read_"
-"""How the names of functions that read keypoints begin."""
+"""The module and the beginning of the names of the functions that read keypoints."""
 _MODELS = ("", "sparse/0/", "sparse/")
 CAMERAS = SourceFormats(
     colmap=CameraFormat(
@@ -191,7 +193,7 @@ CAMERAS = SourceFormats(
         ),
     ),
 )
-"""Calibrations."""
+"""The formats of camera calibrations, by name."""
 KEYPOINTS = SourceFormats(
     humangs=SourceFormat(
         "humangs detect",
@@ -228,7 +230,7 @@ KEYPOINTS = SourceFormats(
         content="inferencer or demo scripts, a file an image or a video: 17, 26, 133 or 136 points",
     ),
 )
-"""Keypoints of detectors; files may be folders."""
+"""The formats of detected keypoints, by name. A file may be a folder."""
 
 
 # Motions
@@ -250,53 +252,57 @@ PLACES = {
     "right_hand": (40, 15),
     "hands": (25, 30),
 }
-"""Where parts are among SMPL-X's joints: the first, and how many.
+"""The joints of each part among those of SMPL-X: the first joint, and the number of joints.
 
-SMPL's body and limbs end with two more, whole hands.
+In SMPL the body and the limbs have two further joints at the end, the whole hands.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class ArrayKeys:
-    """What the arrays of one person's motion are called, and what they mean."""
+    """The keys of the arrays of one person's motion, and the conventions of these arrays."""
 
     keys: tuple[str, ...]
-    """A file that has all of them is of this format."""
+    """A file that has all of these keys is of this format."""
     poses: dict[str, str]
-    """The key of each of `PLACES`: axis-angles or rotation matrices."""
+    """The key of the rotations of each part in `PLACES`; axis-angles or rotation matrices."""
     moves: tuple[str, ...] = ("trans", "transl")
-    """The keys of positions: the first that is there. Without any, people stay in place where
+    """The keys of positions; the first one that a file has is used. For files without any see
     `stays`.
     """
     rates: tuple[str, ...] = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate")
-    """The keys of frames per second: the first that is there."""
+    """The keys of frames per second; the first one that a file has is used."""
     fps: float | None = None
-    """Frames per second of files that say none; None: they must."""
+    """Frames per second of files that do not say them; None: files must say them."""
     up: str = "y"
     """The axis that is up in files of this format."""
     fixed: bool = False
-    """Whether that axis is up whatever the poses look like."""
+    """Whether `up` holds whatever the poses look like."""
     also: tuple[str, ...] = ()
-    """Other axes that are up in some of them, see `rules.up_axis`."""
+    """Other axes that point up in some files, see `rules.up_axis`."""
     scaling: str | None = None
-    """The key of what translations are divided by, 1000 without it."""
+    """The key of the divisor of translations; 1000 where a file does not have it."""
     pivot: str = "pelvis"
-    """What a person turns about, and positions are of: the pelvis at rest, the "origin" (in which
-    positions are applied last), the "head", or the root "joint" in space."""
+    """The point that a person turns about, and whose positions the file has: the pelvis at rest
+    ("pelvis"), the origin ("origin", positions applied last), the head ("head"), or the root joint
+    in space ("joint").
+    """
     six: bool = False
-    """Whether rotations are six numbers each, with the frames as last axis."""
+    """Whether rotations are six numbers each, with the frames as the last axis."""
     stays: bool = False
-    """Whether people stay in place in files without positions; if not, such files are refused."""
+    """Whether people of files without positions stay in place; if not, such files are refused."""
     kind: str = "poses"
-    """The kind of reader: "ours" are whole rotations, "points" joints in space."""
+    """The kind of reader: "poses" for rotations of parts, "ours" for whole rotations, "points" for
+    joints in space.
+    """
     page: bool = True
-    """Whether the page reads the format, too."""
+    """Whether the page reads this format, too."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MotionFormat(Format):
-    """Files of motions. code: called as code(path, `motion.Reading`), returns `motion.Poses` or a
-    `skeleton.Clip`.
+    """A format of motion files. code: called as code(path, `motion.Reading`); returns
+    `motion.Poses` or a `skeleton.Clip`.
     """
 
     arrays: ArrayKeys | None = None
@@ -307,7 +313,9 @@ class MotionFormat(Format):
 def _arrays(
     about: str, keys: str, poses: str, use: dict[str, Any] | None = None, **more: Any
 ) -> MotionFormat:
-    """keys: separated by spaces; poses: as "root=global_orient limbs=body_pose"."""
+    """Returns a format of arrays. keys: separated by spaces. poses: PART=KEY, separated by spaces,
+    as in "root=global_orient limbs=body_pose". use, more: further fields of `ArrayKeys`.
+    """
     places = dict(each.split("=") for each in poses.split())
     return MotionFormat(
         about,
@@ -326,8 +334,8 @@ _OF_CAMERA = (
     *("camera", "cam_trans", "translation", "orig_cam"),
 )
 _FOUND: dict[str, Any] = {"fps": DEFAULT_FPS, "also": ("-y",), "moves": _OF_CAMERA}
-"""Estimators write what they find in a world, or in the coordinates of a camera, whose y points
-down.
+"""Fields of the formats of pose estimators. These write motions in a world, or in the coordinates
+of a camera, whose y axis points down.
 """
 _ALONE: dict[str, Any] = _FOUND | {"page": False}
 MOTIONS = Formats(
@@ -446,7 +454,7 @@ MOTIONS = Formats(
         "humangs_jax.motion.face_files:has_scores",
     ),
 )
-"""By name, in the order in which keys and files are asked."""
+"""The formats of motions by name, in the order in which keys and files are compared with them."""
 
 # Data sets
 # --------------------------------------------------------------------------------------------------
@@ -454,24 +462,28 @@ MOTIONS = Formats(
 
 @dataclasses.dataclass(frozen=True)
 class DataSetFormat(Format):
-    """A data set of captured people. code: opens one subject, code(its path, body) ->
+    """A data set of captured people. code: opens one subject; called as code(path, body), returns a
     `subject.Subject`.
     """
 
     find: str | Callable[[Path], tuple[Path, ...]] = ""
-    """Paths of the subjects in a folder, sorted, or the folder itself; empty if it has another
-    layout.
+    """Finds the subjects in a folder: their sorted paths, or the folder itself; empty if the folder
+    has another layout.
     """
     lists: bool = False
-    """Whether a file lists many people: code(path, body, size) -> tuple of `subject.Person`."""
+    """Whether one file lists many people. Then code is called as code(path, body, size), and
+    returns a tuple of `subject.Person`.
+    """
     scans: bool = False
-    """Whether people are textured scans: there are no photos before `humangs preprocess` has
-    rendered some. code: see `preprocess.run`.
+    """Whether people are textured scans, of which `humangs preprocess` has to render photos first.
+    For code see `preprocess.run`.
     """
 
 
 def _data_set(about: str, place: str, **options: bool) -> DataSetFormat:
-    """place: module and ending of its functions."""
+    """Returns a data set whose functions are open_NAME and find_NAME of a module. place:
+    "MODULE:NAME".
+    """
     code, find = (
         f"humangs_jax.data.datasets.{place.replace(':', f':{do}_')}" for do in ("open", "find")
     )
@@ -490,4 +502,4 @@ DATASETS: Formats[DataSetFormat] = Formats(
         "dna-rendering": _data_set("DNA-Rendering", "multiview:dna_rendering"),
     }
 )
-"""By name, in the order in which a folder is compared with them."""
+"""The data sets by name, in the order in which a folder is compared with them."""

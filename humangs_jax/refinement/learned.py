@@ -41,51 +41,55 @@ from humangs_jax.rendering.splatting import Rendering
 SHIPPED = "assets/refiner.safetensors"
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "color_logits")
 COLUMNS = 14
-"""The number of these parameters side by side."""
+"""The number of parameters of a Gaussian, all `FIELDS` side by side."""
 LARGEST_MOVES = np.asarray([0.01] * 3 + [0.1] * 4 + [0.2] * 3 + [0.5] * 4, np.float32)
-"""What an output of 1 moves: metres, quaternions, log scales, logits of opacity and colors."""
+"""How far an output of 1 moves each parameter: metres, quaternion components, log scales, logits of
+opacity and colors.
+"""
 NEIGHBORS = 8
 CLUSTER_LEVELS = 9
-"""How often the Gaussians are halved: 2^levels clusters."""
+"""How often the set of Gaussians is halved; there are 2^CLUSTER_LEVELS clusters."""
 NEAREST_CLUSTERS = 4
-"""Clusters that each Gaussian looks at."""
+"""The number of clusters that each Gaussian reads."""
 CLUSTER_BLUR = 0.01
-"""Metres: what lies this close to the centre of a cluster reads mostly that cluster."""
+"""Metres. A Gaussian that is this close to the centre of a cluster reads mostly that cluster."""
 PERSON = 8000.0
-"""Pixels of a person in the photos of training: sums over pixels are brought to it, whatever the
-size of the photos.
+"""The number of pixels that a person covers in the photos of training. Sums over pixels are scaled
+to it, so that the size of the photos does not matter.
 """
 SEEN = 0.02
-"""A Gaussian of this largest weight on a pixel of a photo counts as seen there."""
+"""A Gaussian counts as seen in a photo if its largest weight on a pixel is at least this."""
 TYPICAL_LOG_SCALE = -4.5
 MOST_PHOTOS = 6
-"""Photos that an iteration looks at, as in training: sums over more are nothing that the network
-knows, and take longer.
+"""The most photos that an iteration reads, as in training. The network does not know sums over more
+photos, and these take longer.
 """
 
 
 @pytree_dataclass
 class Signals:
-    """What photos say about g Gaussians. Without the axis v it is one photo."""
+    """What photos show about g Gaussians. Without the axis v, the signals are those of one
+    photo.
+    """
 
     gradients: Float[Array, "*v g 14"]
-    """Gradients of the sum of squared errors of colors and coverage, (v, g, 14); those of the
-    Gaussians' colors by the foreground alone.
+    """Gradients of the sum of squared errors of colors and coverage, (v, g, 14). For the colors of
+    Gaussians only errors in the foreground count.
     """
     visibility: Float[Array, "*v g"]
     """The largest weight of each Gaussian on a pixel, (v, g)."""
     pixels: Float[Array, "*v g"]
-    """The sum of its weights over the pixels, (v, g)."""
+    """The sum of each Gaussian's weights over the pixels, (v, g)."""
 
 
 @pytree_dataclass
 class Neighbors:
-    """A symmetric graph."""
+    """A symmetric graph of points."""
 
     index: Int[Array, "g k"]
-    """The neighbours of each point, (g, k); itself where it has fewer."""
+    """The neighbours of each point, (g, k). Unused places hold the point itself."""
     share: Float[Array, "g k"]
-    """1 / their number where there is a neighbour, else 0, (g, k)."""
+    """1 / the number of a point's neighbours where `index` holds a neighbour, else 0, (g, k)."""
 
 
 @pytree_dataclass
@@ -105,7 +109,7 @@ class Graph:
 
 
 def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
-    """The graph of Gaussians at these places, on the host."""
+    """Returns the graph of Gaussians with these means, metres. Runs on the host."""
     members = clusters_of(means)
     centers = means[members].mean(axis=1)
     distances, nearest = KDTree(centers).query(means, NEAREST_CLUSTERS)
@@ -118,7 +122,7 @@ def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
 
 
 def graph_like(g: int) -> Graph:
-    """A graph of the shape that `graph_of` g Gaussians has, with nothing in it."""
+    """Returns an empty graph, whose arrays have the shapes of the graph of g Gaussians."""
 
     def neighbors(count: int) -> Neighbors:
         index = np.zeros((count, NEIGHBORS))
@@ -131,11 +135,10 @@ def graph_like(g: int) -> Graph:
 
 
 def clusters_of(means: Float[np.ndarray, "g 3"]) -> Int[np.ndarray, "c m"]:
-    """The Gaussians of 2**CLUSTER_LEVELS clusters of equal size: halved along their longest side,
-    again and again.
+    """Returns the indices of the Gaussians in each of 2**CLUSTER_LEVELS clusters of equal size.
+    Clusters are halved along their longest side, again and again.
 
-    Some are in more than once, where the number of Gaussians is not a multiple of the number of
-    clusters.
+    Some Gaussians occur more than once if their number is not a multiple of the number of clusters.
     """
     count = 2**CLUSTER_LEVELS
     members = np.resize(np.arange(len(means)), (1, count * -(-len(means) // count)))
@@ -148,7 +151,9 @@ def clusters_of(means: Float[np.ndarray, "g 3"]) -> Int[np.ndarray, "c m"]:
 
 
 def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Neighbors:
-    """Pairs of points each of which is among the `count` nearest of the other. On the host."""
+    """Returns the graph that joins two points if each is among the `count` nearest of the other.
+    Runs on the host.
+    """
     total = len(means)
     own = np.arange(total)[:, None]
     nearest = KDTree(means).query(means, min(count + 1, total))[1].reshape(total, -1)[:, 1:]
@@ -166,9 +171,9 @@ def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Nei
 
 @jax.custom_vjp
 def neighbor_mean(values: Float[Array, "g c"], neighbors: Neighbors) -> Float[Array, "g c"]:
-    """Mean over the neighbours.
+    """Returns the mean of the values of each point's neighbours.
 
-    Its gradient gathers, too, because the graph is symmetric: scattering is slow on a CPU.
+    Since the graph is symmetric, the gradient gathers as well; scattering is slow on a CPU.
     """
     return jnp.sum(values[neighbors.index] * neighbors.share[..., None], axis=1)
 
@@ -187,16 +192,16 @@ neighbor_mean.defvjp(_mean_forward, _mean_backward)
 
 
 class Refiner(nn.Module):
-    """The network of an iteration."""
+    """The recurrent network of one iteration."""
 
     width: int = 48
-    """The width of its features."""
+    """The number of features of a Gaussian."""
     layers: int = 2
     """How often Gaussians exchange messages with their neighbours."""
     cluster_layers: int = 3
-    """How often clusters do."""
+    """How often clusters exchange messages with their neighbours."""
     per_photo: int = 32
-    """The width of the features of one photo."""
+    """The number of features of a Gaussian in one photo."""
 
     @nn.compact
     def __call__(
@@ -208,8 +213,11 @@ class Refiner(nn.Module):
         graph: Graph,
         center: Float[Array, "3"],
     ) -> tuple[Float[Array, "g 14"], Float[Array, "g w"]]:
-        """(values, hidden) after an iteration; values: the parameters side by side, start: those
-        before the first one.
+        """Returns the values and the hidden features after an iteration.
+
+        values: the parameters side by side. start: the parameters before the first iteration.
+        hidden: the features of the iteration before. center: the mean of the joints at rest,
+        metres.
         """
 
         def dense(name, width):
@@ -257,8 +265,8 @@ class Refiner(nn.Module):
         return values + moves * LARGEST_MOVES, features
 
     def from_clusters(self, features: Float[Array, "g w"], graph: Graph) -> Float[Array, "g w"]:
-        """Features of the clusters around each Gaussian, after messages between clusters and a mean
-        over all of them.
+        """Returns for each Gaussian the features of the clusters around it, after these have
+        exchanged messages with their neighbours and with the mean of all clusters.
         """
 
         def dense(name):
@@ -283,8 +291,9 @@ class Refiner(nn.Module):
 
 
 def _relative_errors(values: Float[Array, "g 14"], signals: Signals) -> Float[Array, "v g 14"]:
-    """Gradients for a pixel of a Gaussian's weight, lengths relative to its longest axis, those of
-    colors before the sigmoid.
+    """Returns gradients that are relative to a Gaussian's weight on the pixels, squashed into (-3,
+    3). Lengths are relative to the Gaussian's longest axis. Gradients of color logits become
+    gradients of colors.
     """
     colors = nn.sigmoid(values[:, 11:])
     longest = jnp.exp(jnp.max(values[:, 7:10], axis=-1, keepdims=True))
@@ -300,14 +309,14 @@ def _relative_errors(values: Float[Array, "g 14"], signals: Signals) -> Float[Ar
 
 
 def stacked(parameters: UnconstrainedGaussians) -> Float[Array, "g 14"]:
-    """The parameters of the Gaussians side by side."""
+    """Returns the parameters of the Gaussians side by side."""
     return jnp.concatenate(
         [getattr(parameters, name).reshape(len(parameters.means), -1) for name in FIELDS], axis=-1
     )
 
 
 def unstacked(values: Float[Array, "g 14"], like: UnconstrainedGaussians) -> UnconstrainedGaussians:
-    """Inverse of `stacked`, in the shapes of `like`."""
+    """Returns the parameters that `stacked` has put side by side, in the shapes of `like`."""
     shapes = {name: getattr(like, name) for name in FIELDS}
     ends = np.cumsum([x[0].size for x in shapes.values()])
     parts = jnp.split(values, ends[:-1], axis=-1)
@@ -328,8 +337,9 @@ def learned_update(
     iterations: int,
     splat: SplatConfig,
 ) -> tuple[UnconstrainedGaussians, Int[Array, ""]]:
-    """The parameters after some iterations on at most `MOST_PHOTOS` of the photos, evenly spaced;
-    and the overflow.
+    """Returns the parameters after some iterations of the learned update, and the (splat, tile)
+    pairs that the buffers had no room for. At most `MOST_PHOTOS` of the photos are used, evenly
+    spaced.
     """
     start = values = side_by_side(parameters)
     hidden = from_host(np.zeros((len(values), Refiner.width), values.dtype))
@@ -351,7 +361,7 @@ def calls_of_update(
     graph: Graph,
     splat: SplatConfig,
 ) -> Iterator[Call]:
-    """The long programs of `learned_update`, in the order of their use."""
+    """Yields the long programs of `learned_update`, in the order of their use."""
     photo, used = photos[0], min(len(photos), MOST_PHOTOS)
     drawing = parameters, avatar, photo, splat
     yield drawn_photo, drawing
@@ -368,7 +378,7 @@ def calls_of_update(
 
 @compiled
 def side_by_side(parameters: UnconstrainedGaussians) -> Float[Array, "g 14"]:
-    """`stacked`, as a program."""
+    """Returns `stacked` parameters, as a compiled program."""
     return stacked(parameters)
 
 
@@ -384,8 +394,8 @@ def _iteration_by(
     graph: Graph,
     avatar: Avatar,
 ) -> tuple[UnconstrainedGaussians, Float[Array, "g 14"], Float[Array, "g w"], Int[Array, ""]]:
-    """`refiner_iteration` by the `photo_signals` of each photo: the parameters, values and hidden
-    features after it, and the overflow so far.
+    """Makes an iteration with the `photo_signals` of each photo. Returns the parameters, the
+    values, the hidden features, and the overflow so far.
     """
     signals, missing = jax.tree.map(lambda *x: jnp.stack(x), *each)
     values, hidden = refiner_iteration(variables, values, start, hidden, signals, graph, avatar)
@@ -395,8 +405,8 @@ def _iteration_by(
 def photo_signals(
     parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo, splat: SplatConfig
 ) -> tuple[Signals, Int[Array, ""]]:
-    """Signals of one photo (without the axis v), from the pixels that count; and the overflow.
-    splat: with `visibility`.
+    """Returns the signals of one photo (without the axis v) from the pixels that count, and the
+    overflow of its rendering. splat: a configuration with `visibility`.
     """
     image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat)
     gradient, _ = pulled(pull_back, _squared_errors(image, photo))
@@ -407,15 +417,15 @@ def photo_signals(
 
 @compiled
 def _squared_errors(image: Image, photo: Photo) -> Image:
-    """Gradient of the sum of squared errors with respect to the image."""
+    """Returns the gradient of the sum of squared errors with respect to the image."""
     rgb = jnp.where(photo.counted[..., None], image[0] - photo.image, 0)
     return 2 * rgb, 2 * jnp.where(photo.counted, image[1] - photo.mask, 0)
 
 
 @compiled
 def _foreground_errors(image: Image, photo: Photo) -> Image:
-    """Gradient of the squared errors of colors in the foreground alone: what stands before the
-    background should fade, not take its color.
+    """Returns the gradient of the squared color errors in the foreground with respect to the image.
+    A Gaussian in front of the background should fade and not take the background's color.
     """
     rgb, alpha = _squared_errors(image, photo)
     return rgb * photo.mask[..., None], jnp.zeros_like(alpha)
@@ -423,7 +433,7 @@ def _foreground_errors(image: Image, photo: Photo) -> Image:
 
 @compiled
 def _colors_alone(image: Image) -> Image:
-    """Gradient of the sum of all colors with respect to the image."""
+    """Returns the gradient of the sum of all colors with respect to the image."""
     return jnp.ones_like(image[0]), jnp.zeros_like(image[1])
 
 
@@ -435,8 +445,8 @@ def _signals_from(
     rendering: Rendering,
     photo: Photo,
 ) -> Signals:
-    """Signals from `_squared_errors`, `_foreground_errors` and `_colors_alone`, each pulled back to
-    the Gaussians.
+    """Returns the signals of a photo. gradient, foreground, pixels: the results of
+    `_squared_errors`, `_foreground_errors` and `_colors_alone`, each pulled back to the Gaussians.
     """
     assert rendering.visibility is not None
     scale = PERSON / jnp.maximum(jnp.sum(photo.mask), 1.0)
@@ -456,7 +466,7 @@ def refiner_iteration(
     graph: Graph,
     avatar: Avatar,
 ) -> tuple[Float[Array, "g 14"], Float[Array, "g w"]]:
-    """`Refiner` on an avatar: (values, hidden) after an iteration."""
+    """Returns the values and hidden features after one iteration of the `Refiner` on an avatar."""
     center = jnp.mean(avatar.rest_joints, axis=0)
     return cast(Any, Refiner().apply(variables, values, start, hidden, signals, graph, center))
 
@@ -474,7 +484,7 @@ def save_refiner(path: str | os.PathLike[str], variables: PyTree) -> None:
 
 
 def read_refiner(path: str | os.PathLike[str]) -> PyTree:
-    """What `save_refiner` wrote.
+    """Read the variables that `save_refiner` wrote.
 
     Raises: FileNotFoundError; FileError if it is no safetensors file.
     """
@@ -487,6 +497,6 @@ def read_refiner(path: str | os.PathLike[str]) -> PyTree:
 
 @functools.cache
 def load_refiner() -> PyTree:
-    """Variables of the `Refiner` that comes with the package."""
+    """Returns the variables of the `Refiner` that comes with the package."""
     with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as path:
         return read_refiner(path)

@@ -1,5 +1,5 @@
-"""A whole set: which subjects are due, what is written of each, and the lists and the manifest over
-all of it.
+"""Preprocesses a whole data set: decides which subjects are due, writes each of them, and writes
+the lists and the manifest of all.
 
     OUT/manifest.json            settings, finished scenes with what is known of them, skipped ones
                                  with the reason, the split
@@ -102,7 +102,7 @@ class PreprocessConfig:
     supersample: int = 3
     """Samples along each side of a pixel, for scans."""
     every: int = EVERY
-    """The step between the frames of a video that are taken."""
+    """Every how many frames one is taken from a video."""
     train: int = TRAIN
     """Scans of the training list."""
     test: int = TEST
@@ -110,13 +110,13 @@ class PreprocessConfig:
 
     @property
     def mark(self) -> str:
-        """The file that a finished folder holds."""
+        """Returns the name of the file that shows that a folder is finished."""
         return SCENE if self.layout == "scenes" else CAPTURE
 
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What is in a set after a run."""
+    """The numbers of what was made and skipped, and of what a set holds after a run."""
 
     out: Path
     """The folder of the set."""
@@ -125,7 +125,7 @@ class Report:
     scenes: int
     """The number of scenes in all."""
     views: int
-    """The number of views in all."""
+    """Why people were left out, by their names."""
     skipped: dict[str, str]
     """Why people were left out, by name."""
 
@@ -222,9 +222,10 @@ def _subjects(source: Path, settings: PreprocessConfig) -> tuple[dict[str, Path]
 
 
 def _made_with(source: Path, body: FileBody, settings: PreprocessConfig) -> dict[str, Any]:
-    """What the scenes depend on.
+    """Returns the settings that all scenes depend on, as they stand in the manifest.
 
-    The data set by the name of its folder: it may lie elsewhere on another machine.
+    The data set is known by the name of its folder alone, since it may lie elsewhere on another
+    machine.
     """
     shipped = body.file == DEFAULT_BODY
     known = {
@@ -235,7 +236,7 @@ def _made_with(source: Path, body: FileBody, settings: PreprocessConfig) -> dict
 
 
 def _source_key(name: str, source: Path, settings: PreprocessConfig) -> str:
-    """A checksum of the files that a scene is made from, see `sets.files_key`."""
+    """Returns a checksum of the files that a scene is made from, see `sets.files_key`."""
     if DATASETS[settings.kind].scans:
         scan, fit = scan_files(source, name)
         return files_key(source, (*scan.parent.iterdir(), *fit.parent.iterdir()))
@@ -244,9 +245,10 @@ def _source_key(name: str, source: Path, settings: PreprocessConfig) -> str:
 
 
 def _check_source(file: Path, name: str, source: Path, settings: PreprocessConfig) -> None:
-    """A finished scene was made from what the data set holds now, if its scene.json says from what.
+    """Check that a finished scene was made from the files that the data set holds now. A scene.json
+    without a checksum passes.
 
-    Raises: CaptureError.
+    Raises: CaptureError if the files differ.
     """
     if not file.is_file():
         return
@@ -265,7 +267,10 @@ def _skip(out: Path, name: str, reason: str) -> None:
 
 
 def _read_scene(file: Path, settings: PreprocessConfig) -> dict[str, Any]:
-    """What a finished folder says of itself. Raises: CaptureError naming file and key."""
+    """Read and check the scene.json of a finished folder.
+
+    Raises: CaptureError naming file and key.
+    """
     content = checked_json(file)
     (known,) = members(content, file, known=dict)
     members(known, file, "known", views=int)
@@ -282,7 +287,7 @@ def _read_scene(file: Path, settings: PreprocessConfig) -> dict[str, Any]:
 def _write_lists(
     out: Path, names: Sequence[str], settings: PreprocessConfig, made_with: dict[str, Any]
 ) -> dict[str, Any]:
-    """Lists and manifest of what is there."""
+    """Write the lists and the manifest of all finished scenes, and return the manifest."""
     # all that lies in the folder counts, whichever run has made it
     scenes = {
         name: _read_scene(out / name / SCENE, settings) for name in finished(out, settings.mark)
@@ -356,7 +361,7 @@ class View(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Content:
-    """What is written of a scene."""
+    """The data of one scene from which its files are written."""
 
     transform: Float[np.ndarray, "4 4"]
     """From the source's world to the scene's, (4, 4), written as `mesh_transform`."""
@@ -369,7 +374,7 @@ class Content:
     scale: float
     """Units of the scene per metre."""
     views: Iterator[View]
-    """The views in the world after the transform, in units."""
+    """The views in the scene's world (after the transform), lengths in units of the scene."""
     known: dict[str, Any]
     """Entries of the manifest; complete when the views have run out."""
 
@@ -387,7 +392,7 @@ def _make_scan(
 
 
 def scan_content(source: Path, name: str, body: FileBody, settings: PreprocessConfig) -> Content:
-    """What is written of a scan; its views are rendered when they are asked for.
+    """Returns the content of a scan's scene. Each view is rendered when it is asked for.
 
     Raises: ValueError naming file and key.
     """
@@ -431,7 +436,7 @@ def _make_video(
     settings: PreprocessConfig,
     progress: bool,
 ) -> None:
-    """Frames of a video from all cameras, `every` apart."""
+    """Make the scene of a video, from every `every`-th frame and all cameras."""
     # the frames to take
     subject = DATASETS[settings.kind](source, body)
     chosen = np.flatnonzero(subject.frames % settings.every == 0)
@@ -475,7 +480,9 @@ def _make_video(
 def _write(
     folder: Path, content: Content, body: FileBody, settings: PreprocessConfig, made_from: str
 ) -> None:
-    """Photos and masks, then what the layout says of them. made_from: `_source_key`."""
+    """Write the photos and masks of a scene, then the files of the layout. The folder appears whole
+    or not at all. made_from: what `_source_key` returns.
+    """
 
     def write(temporary: Path) -> None:
         for kind in ("images", "masks"):
@@ -504,7 +511,7 @@ def _write(
 def _write_scene(
     folder: Path, name: str, content: Content, views: Sequence[View]
 ) -> dict[str, Any]:
-    """Writes the arrays of each frame; returns the entry for the list."""
+    """Write the arrays of each frame, and return the scene's entry for the list."""
     (folder / "smpl").mkdir()
     for i, posed in enumerate(content.posed):
         transforms = content.transform @ posed.joint_transforms
@@ -525,7 +532,10 @@ def _write_scene(
 def _write_capture(
     folder: Path, target: Path, content: Content, views: Sequence[View], body: FileBody
 ) -> None:
-    """In metres; the poses are those of the aligned world."""
+    """Write body.npz and capture.json of a scene as a capture: lengths in metres, poses and cameras
+    in the aligned world. folder: where the files are written. target: the folder that they will be
+    in.
+    """
     matrix = content.transform.copy()
     matrix[:3, 3] /= content.scale
     pelvis = body.rest_joints(content.parameters.betas)[0]
