@@ -1,10 +1,10 @@
-"""Loading a body: the CC0 body of the package, or a file; the package's own body file, one small
-npz without pickles; SMPL-X.
+"""Loads and saves bodies: the CC0 body of the package, a body file of the package's format, or an
+SMPL-X model.
 
-Small numbers make it small: positions of shape directions are multiples of 10 micrometres in int16,
-weights are the largest few of each vertex in uint16, indices are uint16 where they fit. `read_body`
-returns float32 weights whose rows sum to 1. SMPL-X's licence forbids redistribution: users bring
-the file.
+The package's body file is one small npz without pickles. Positions of shape directions are
+multiples of 10 micrometres in int16. Skinning weights are the entries of each vertex that are not
+0, in uint16. Indices are uint16 where they fit. `read_body` returns float32 weights whose rows sum
+to 1. SMPL-X's licence forbids redistribution, so users bring that file.
 """
 
 from importlib import resources
@@ -34,8 +34,8 @@ from humangs_jax.io.reading import FileError, InvalidFileError, check_limit, ope
 
 FORMAT = "humangs-body-1"
 DIRECTION_STEP = 1e-5
-"""Metres. int16 then spans +-0.33 m per unit of a shape coefficient; larger directions are stored
-as float32.
+"""Step of the stored shape directions, metres. int16 then spans +-0.33 m per unit of a shape
+coefficient. Larger directions are stored as float32.
 """
 UV_STEPS = 65535
 KEYS = {
@@ -51,12 +51,14 @@ KEYS = {
     ),
     *("regressor_vertices", "regressor_values", "weight_joints", "weight_values"),
 }
-"""What every file has; some have texture coordinates and an order of collapses, too."""
+"""Keys that every body file has. Some files also have texture coordinates, an order of collapses
+and expressions.
+"""
 
 
 @checked_arguments
 def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel:
-    """Loads a body model: the CC0 body that comes with the package, or one of a file.
+    """Loads a body model: the CC0 body that comes with the package, or the body in a file.
 
     Args:
         path: None for the shipped body (13,380 vertices, 55 joints in SMPL-X order, facing +z,
@@ -99,13 +101,13 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
 
 
 def _indices(array: np.ndarray) -> np.ndarray:
-    """Stores non-negative integers in 2 bytes where they fit."""
+    """Returns non-negative integers as uint16 if they fit, else as int32."""
     return array.astype(np.uint16 if array.max(initial=0) < 2**16 else np.int32)
 
 
 def _sparse_rows(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns columns and values (rows, k) of the entries that are not 0, k the most in any row,
-    padded with zeros.
+    """Returns columns and values, (rows, k) each, of the entries that are not 0. k is the largest
+    number of such entries in a row; shorter rows are padded with values of 0.
     """
     count = max(1, int((matrix != 0).sum(1).max()))
     columns = np.argsort(-np.abs(matrix), axis=1, kind="stable")[:, :count]
@@ -115,7 +117,11 @@ def _sparse_rows(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _dense_rows(
     arrays: dict[str, np.ndarray], rows: str, columns: str, count: int, width: int
 ) -> np.ndarray:
-    """Makes the matrix (count, width) of `_sparse_rows`, with rows of sum 1."""
+    """Returns the matrix (count, width) that `_sparse_rows` stored, scaled so that each row sums to
+    1.
+
+    Raises: InvalidFileError if the arrays do not describe such a matrix.
+    """
     check_limit("plain_bytes", 8 * count * width, "bytes of a matrix")
     check_indices(columns, arrays[columns], (count, None), width)
     check_array(
@@ -134,9 +140,9 @@ def _dense_rows(
 
 
 def save_body(path: str | Path, body: BodyModel) -> None:
-    """Write a body model.
+    """Writes a body model to a file, without pickles.
 
-    Raises: ValueError for one with pose correctives, which this format does not hold.
+    Raises: ValueError for a body with pose directions, which this format does not hold.
     """
     if body.pose_directions is not None:
         raise ValueError(
@@ -181,9 +187,9 @@ def save_body(path: str | Path, body: BodyModel) -> None:
 
 
 def read_body(path: str | Path) -> BodyModel:
-    """Read what `save_body` wrote.
+    """Returns the body model that `save_body` wrote.
 
-    Raises: ValueError, naming the file and the key, if it is something else.
+    Raises: ValueError, which names the file and the key, if the file is something else.
     """
     with reading(path, "body file"):
         arrays, pickled = read_npz(path)
@@ -248,12 +254,12 @@ def read_body(path: str | Path) -> BodyModel:
 
 
 EXPRESSION = "expression_"
-"""How the keys of expressions begin, in files of bodies and of avatars."""
+"""Beginning of the keys of expressions in files of bodies and avatars."""
 EXPRESSION_FIELDS = ("vertices", "directions", "joint_directions", "joint_turns", "names")
 
 
 def expression_arrays(expressions: Expressions) -> dict[str, np.ndarray]:
-    """Returns what files hold of expressions, by key; the arrays are as they are."""
+    """Returns the arrays of expressions by their key in files."""
     found = {name: getattr(expressions, name) for name in EXPRESSION_FIELDS}
     return {
         f"{EXPRESSION}{name}": np.asarray(value)
@@ -265,10 +271,10 @@ def expression_arrays(expressions: Expressions) -> dict[str, np.ndarray]:
 def read_expressions(
     arrays: dict[str, np.ndarray], vertices: int, joints: int
 ) -> Expressions | None:
-    """Reads the expressions of a body or an avatar with so many vertices and joints; None if its
-    file has none.
+    """Returns the expressions in a file's arrays, for a body or avatar with this number of vertices
+    and joints. None if the file has no expressions.
 
-    Raises: InvalidFileError, naming the key.
+    Raises: InvalidFileError, which names the key.
     """
     found = {
         name: arrays[f"{EXPRESSION}{name}"]
@@ -310,11 +316,13 @@ def read_expressions(
 
 
 SHAPE_COLUMNS = 300
-"""Columns of `shapedirs` that are directions of shape, in current files."""
+"""Number of shape directions in `shapedirs` of current files. They come first."""
 EXPRESSION_COLUMNS = 100
-"""Columns of `shapedirs` behind them that are directions of expression."""
+"""Number of expression directions in `shapedirs` of current files. They follow the shape
+directions.
+"""
 OLD_COLUMNS = 10
-"""Columns of each kind in older files."""
+"""Number of directions of each kind in older files."""
 JOINTS = len(JOINT_NAMES)
 
 
@@ -329,14 +337,14 @@ class HandBasis:
 
 
 def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int = 10) -> BodyModel:
-    """Read an SMPL-X model file, `.npz` (no pickled object in it is touched) or `.pkl` (see
+    """Reads an SMPL-X model file, `.npz` (pickled objects in it are never read) or `.pkl` (see
     `restricted_pickle`).
 
-    Arguments: shape_count, expression_count: how many of the file's directions to keep;
-    `shape_directions` holds the shape ones, then the expression ones. Numbers are float32, or
-    float64 under `jax.enable_x64`.
-    Raises: FileNotFoundError; ValueError, naming file and key, for whatever does not fit the
-    format.
+    Arguments: shape_count, expression_count: how many of the file's directions to keep.
+    `shape_directions` holds the shape directions, then the expression directions. Numbers are
+    float32, or float64 under `jax.enable_x64`.
+    Raises: FileNotFoundError; ValueError, which names file and key, for anything that does not fit
+    the format.
     """
     with reading(path, "body model file"):
         file = ArrayFile.open(path, wanted=lambda key: not key.startswith("hands_"))
@@ -420,9 +428,9 @@ def _parents(file: ArrayFile) -> tuple[int, ...]:
 
 
 def load_hands(path: str | Path) -> HandBasis:
-    """Reads the mean and the principal components of the hand poses of an SMPL-X model file.
+    """Returns the mean and the principal components of the hand poses in an SMPL-X model file.
 
-    Raises as `load_smplx`.
+    Raises: as `load_smplx`.
     """
     with reading(path, "body model file"):
         file = ArrayFile.open(path, wanted=lambda key: key.startswith("hands_"))

@@ -1,16 +1,17 @@
-"""Configurations (frozen dataclasses, nested) as JSON and back, checked against their annotations.
+"""Writes configurations (frozen dataclasses, nested) as JSON, reads them back, and checks them
+against their annotations.
 
-Numbers are annotated with their range, which every way to make a configuration checks:
+Numbers are annotated with their range. Every way to make a configuration checks it:
 
     @configuration
     class Fit:
         steps: Annotated[int, Range(1, 1000)] = 100
 
-A class variable `renamed_fields` maps names that fields had in earlier files to those of today.
+A class variable `renamed_fields` maps the names of fields in earlier files to the names of today.
 
-A field annotated with a class of `Part` may hold any `part` that derives from it. Its JSON names
-the class under "kind", as "PatchTransformer". Reading imports nothing: a part of another package is
-known once its module is imported.
+A field annotated with a subclass of `Part` may hold any class derived from it that is decorated
+with `part`. The JSON names the class under "kind", as "PatchTransformer". Reading imports nothing:
+a part of another package is known once its module is imported.
 """
 
 import dataclasses
@@ -27,15 +28,15 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 T = TypeVar("T")
 KIND = "kind"
-"""Key of the class of a part."""
+"""Key under which the JSON of a part names its class."""
 LARGEST = sys.float_info.max
-"""No configuration has larger numbers."""
+"""Largest magnitude of a number in a configuration."""
 LARGEST_INTEGER = 1 << 63
-"""No configuration has integers of a larger magnitude."""
+"""Largest magnitude of an integer in a configuration."""
 
 
 MOST_ITEMS = 256
-"""Most items of a list in a configuration."""
+"""Largest number of items of a list in a configuration."""
 
 
 class Range(NamedTuple):
@@ -55,34 +56,34 @@ class Range(NamedTuple):
 
 
 def at_least(low: float | int) -> Range:
-    """Makes the range of finite numbers from `low` on."""
+    """Returns the range of finite numbers from `low` on."""
     return Range(low, LARGEST)
 
 
 InputSide = Annotated[int, Range(1, 2048)]
 """Side of a photo as a network sees it, pixels."""
 Side = Annotated[int, Range(1, 4096)]
-"""Side of an image or map that is drawn or made, pixels."""
+"""Side of an image or map that is drawn or computed, pixels."""
 PhotoSide = Annotated[int, Range(1, 32_768)]
-"""Side of a photo as it comes, pixels."""
+"""Side of a photo before it is resized, pixels."""
 Width = Annotated[int, Range(1, 16_384)]
-"""Features of a layer."""
+"""Number of features of a layer."""
 Ratio = Annotated[int, Range(1, 64)]
 """Ratio of one width to another."""
 Patch = Annotated[int, Range(1, 256)]
 """Side of a patch of a photo, pixels."""
 Layers = Annotated[int, Range(1, 256)]
 Count = Annotated[int, Range(1, 1024)]
-"""Views, joints, heads, subjects: things of which there are some."""
+"""Number of views, joints, heads or subjects."""
 Capacity = Annotated[int, Range(1, 1 << 31)]
-"""Slots of a buffer."""
+"""Number of slots of a buffer."""
 CapacityOrAuto = Annotated[int, Range(0, 1 << 31)]
-"""Slots, or 0 for as many as may be needed."""
+"""Number of slots of a buffer, or 0 for as many as may be needed."""
 Chunk = Annotated[int, Range(1, 65_536)]
-"""What is worked on at once."""
+"""Number of items that are processed at once."""
 Iterations = Annotated[int, Range(0, 1000)]
 RefineSteps = Annotated[int, Range(0, 100_000)]
-"""Steps of refinement, which take some hours at most."""
+"""Number of steps of a refinement, which takes some hours at most."""
 Steps = Annotated[int, Range(1, 100_000_000)]
 Seed = Annotated[int, Range(0, (1 << 32) - 1)]
 Share = Annotated[float, Range(0, 1)]
@@ -95,13 +96,16 @@ Length = Annotated[float, Range(1e-6, 100)]
 Bias = Annotated[float, Range(-100, 100)]
 Vertices = Annotated[int, Range(1, 10_000_000)]
 Edge = Annotated[float, Range(0.005, 10)]
-"""Metres to which edges of a body are split: below, there would be millions of Gaussians."""
+"""Length to which the edges of a body are split, metres. Shorter edges would make millions of
+Gaussians.
+"""
 
 
 def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
-    """Makes a field that trades accuracy or memory for speed: a row of docs/knobs.md.
+    """Returns a field that trades accuracy or memory for speed. Each is a row of docs/knobs.md.
 
-    cost, gain: in a few words. measured: the page of docs/ with the measurement.
+    cost, gain: what a change costs and gains, in a few words. measured: the page of docs/ with the
+    measurement.
     """
     return dataclasses.field(
         default=default, metadata={"cost": cost, "gain": gain, "measured": measured}
@@ -109,8 +113,8 @@ def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
 
 
 class ArgumentError(ValueError):
-    """Says what is wrong with an argument of a function; the command line shows its name as that of
-    an option.
+    """An error that names the argument of a function and the problem with it. The command line
+    shows the name of the option instead.
     """
 
     def __init__(self, argument: str, problem: str) -> None:
@@ -118,23 +122,23 @@ class ArgumentError(ValueError):
         super().__init__(self.line(argument))
 
     def line(self, name: str) -> str:
-        """Returns the message, with this name of the argument."""
+        """Returns the message with `name` as the name of the argument."""
         if self.problem.startswith(":"):
             return f"{name}{self.problem}"
         return f"{name} {self.problem}"
 
 
 class _UnknownPresetError(KeyError):
-    """Is a `KeyError` whose text is a line, not its repr."""
+    """A `KeyError` whose text is its message, not the repr of the message."""
 
     def __str__(self) -> str:
         return str(self.args[0])
 
 
 class Presets(dict[str, T]):
-    """Presets by name; another name is refused in a line that has all of them.
+    """A dict of presets by name. An unknown name raises a KeyError whose line lists all names.
 
-    hint: ends that line.
+    hint: text at the end of that line.
     """
 
     def __init__(self, presets: dict[str, T], hint: str = "") -> None:
@@ -148,11 +152,13 @@ class Presets(dict[str, T]):
 
 
 def check_fields(cls: type, values: Mapping[str, Any], owner: str) -> None:
-    """Checks that values of fields are what the annotations of a configuration say, and in their
-    ranges.
+    """Checks that the values of fields have the types and ranges of the annotations of a
+    configuration.
 
-    Any integer and any real number will do. owner: what the message begins with. Raises: ValueError
-    naming owner and field.
+    An `int` field takes any integer, and a `float` field any real number. owner: begins the
+    message.
+
+    Raises: ValueError, which names owner and field.
     """
     annotations = _annotations(cls)
     for name, value in values.items():
@@ -169,7 +175,7 @@ def _annotations(cls: Any) -> dict[str, Any]:
 
 
 def _fits(value: Any, annotation: Any) -> bool:
-    """Says whether a value has the annotated type; parts and arrays are not checked here."""
+    """Says whether a value has the annotated type. Parts and arrays are not checked here."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, option) for option in arguments)
@@ -197,7 +203,7 @@ def _fits(value: Any, annotation: Any) -> bool:
 
 
 def in_words(annotation: Any) -> str:
-    """Returns what an annotation allows, for a message."""
+    """Returns the types or values that an annotation allows, as text for a message."""
     union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     words = []
     options = typing.get_args(annotation) if union else [annotation]
@@ -214,8 +220,10 @@ def in_words(annotation: Any) -> str:
 
 @typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, knob))
 def configuration(cls: type[T]) -> type[T]:
-    """Makes a frozen dataclass, whose fields are checked when it is made: ValueError naming class,
-    field, value and what it may be.
+    """Makes a class a frozen dataclass whose fields are checked when an instance is made.
+
+    A wrong value raises a ValueError that names the class, the field, the value and what is
+    expected.
     """
     own = getattr(cls, "__post_init__", None)
 
@@ -234,8 +242,8 @@ def configuration(cls: type[T]) -> type[T]:
 
 
 class Part:
-    """Base of what a field may hold by its registered name: modules of Linen, whose fields cannot
-    be assigned.
+    """Base class of modules of Linen that are fields of configurations. Files name them by their
+    registered name. Their fields cannot be assigned once they are made.
     """
 
     def __setattr__(self, name: str, val: Any) -> None:  # the names of Linen's
@@ -259,10 +267,10 @@ _PARTS: dict[str, type] = {}
 
 
 def part(cls: type[T]) -> type[T]:
-    """Registers a `Part` that files may name by its class; its fields are checked as those of a
-    `configuration`.
+    """Registers a subclass of `Part`, so that files may name it. Its fields are checked as those of
+    a `configuration`.
 
-    Raises: ValueError if there is another part of this name.
+    Raises: ValueError if another module has a part of this name.
     """
     other = _PARTS.get(cls.__name__, cls)
     if other.__module__ != cls.__module__:  # the cell of a notebook may run again
@@ -275,7 +283,8 @@ def part(cls: type[T]) -> type[T]:
 
 
 def vary(config: T, changes: Mapping[str, Any]) -> T:
-    """Returns a configuration with fields exchanged, each named by its path.
+    """Returns a copy of a configuration with other values of some fields. Each field is named by
+    its path.
 
     Args:
         config: a frozen dataclass.
@@ -311,8 +320,8 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
 
 
 def field_paths(config: Any, before: str = "") -> dict[str, Any]:
-    """Returns all fields of a configuration by path, those of nested ones too, with their
-    values.
+    """Returns the values of all fields of a configuration by path, with those of nested
+    configurations.
     """
     found: dict[str, Any] = {}
     for name in field_names(type(config)):
@@ -331,8 +340,10 @@ def _varied(config: Any, names: list[str], value: Any) -> Any:
 
 
 def check_range(cls: type, name: str, value: Any, path: str) -> None:
-    """Raises: ValueError if a number of a field, or one in its tuple, is out of the range of its
+    """Checks that a number of a field, or each number in its tuple, is in the range of the
     annotation.
+
+    Raises: ValueError if one is not, or if the tuple is too long.
     """
     ranges = _ranges(cls).get(name, ())
     values = value
@@ -349,15 +360,15 @@ def check_range(cls: type, name: str, value: Any, path: str) -> None:
 
 @functools.cache
 def _ranges(cls: Any) -> dict[str, tuple[Range, ...]]:
-    """Returns the ranges of the fields that have some."""
+    """Returns the ranges of each field that has a range in its annotation."""
     hints = typing.get_type_hints(cls, include_extras=True)
     found = {name: tuple(marks_in(hints[name], Range)) for name in field_names(cls)}
     return {name: ranges for name, ranges in found.items() if ranges}
 
 
 def marks_in(annotation: Any, kind: type[T]) -> Iterator[T]:
-    """Gives the marks of one kind in an annotation or a part of it, as in
-    `Annotated[int, Range(1, 9)] | None`.
+    """Yields the marks of class `kind` in an annotation or a part of it, as in `Annotated[int,
+    Range(1, 9)] | None`.
     """
     if typing.get_origin(annotation) is Annotated:
         yield from (each for each in annotation.__metadata__ if isinstance(each, kind))
@@ -366,12 +377,16 @@ def marks_in(annotation: Any, kind: type[T]) -> Iterator[T]:
 
 
 def config_to_json(config: Any, indent: int | None = None) -> str:
-    """Writes a configuration as JSON, sub-configurations nested."""
+    """Returns a configuration as JSON, with nested configurations as nested objects."""
     return json.dumps(_plain(config), indent=indent)
 
 
 def _plain(value: Any, kind: bool = False) -> Any:
-    """Turns a configuration into what JSON has. kind: whether the class must be named."""
+    """Returns a configuration as dicts, lists and values that JSON has. kind: whether the class
+    must be named.
+
+    Raises: ValueError if the class must be named but is no registered part.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         annotations = typing.get_type_hints(type(value))
         if kind and _PARTS.get(type(value).__name__) is not type(value):
@@ -395,11 +410,11 @@ def _is_part(annotation: Any) -> bool:
 
 
 def config_from_json(cls: type[T], text: str) -> T:
-    """Reads what `config_to_json` wrote of a configuration of class `cls`; missing fields take
+    """Returns the configuration of class `cls` that `config_to_json` wrote. Missing fields take
     their defaults.
 
-    Raises: ValueError for a field that the configuration does not have or a value of another type,
-    naming it.
+    Raises: ValueError, which names the field, for a field that the configuration does not have, a
+    missing field without a default, or a value of a wrong type.
     """
     try:
         values = json.loads(text)
@@ -409,7 +424,9 @@ def config_from_json(cls: type[T], text: str) -> T:
 
 
 def _build(annotation: Any, value: Any, path: str) -> Any:
-    """Turns a JSON value into what its annotation says, if it fits."""
+    """Returns a JSON value as the type that its annotation asks for. A value that does not fit is
+    returned unchanged, and checked by the caller.
+    """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     # a part names its class, a dataclass is known by the annotation
     if _is_part(annotation) and isinstance(value, dict):
@@ -446,7 +463,10 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
 
 
 def _find_part(kind: Any, base: Any, path: str) -> type:
-    """Finds the class that a "kind" names."""
+    """Returns the registered part with the name `kind`, which must be a subclass of `base`.
+
+    Raises: ValueError if there is none.
+    """
     known = {name: cls for name, cls in _PARTS.items() if issubclass(cls, base)}
     name = ""
     if isinstance(kind, str):
@@ -460,7 +480,10 @@ def _find_part(kind: Any, base: Any, path: str) -> type:
 
 
 def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
-    """Makes a configuration of an object of JSON."""
+    """Returns the configuration of class `cls` that an object of JSON describes.
+
+    Raises: ValueError.
+    """
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected an object, got {values!r}")
     # fields have today's names, and none is unknown

@@ -1,12 +1,16 @@
-"""Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel), JPEG, WebP and AVIF,
-in sRGB.
+"""Reads photos as float32 arrays in [0, 1], in sRGB, and writes PNG files.
 
-Photos say how their colors are encoded (an ICC profile, or numbers in their header), and colors are
-converted to sRGB; those of files that say nothing, or sRGB, are values as stored. Masks are values
-as stored, too. With the extra `heic`, HEIC photos of phones too (libheif, by pi-heif). The content
-decides, not the name: no other format is looked at. Pixels come as stored, whatever the orientation
-flag says that phones write into JPEG files (EXIF): `orientation` reads it, `oriented` obeys it, and
-who imports photos decides. HEIC photos come upright: their format turns them, not the flag.
+PNG (8 and 16 bits a channel), JPEG, WebP and AVIF can be read. With the extra `heic`, HEIC photos
+of phones can be read, too (libheif, by pi-heif). The content of a file decides its format, not its
+name, and no other format is tried.
+
+Photos say how their colors are encoded, by an ICC profile or numbers in their header. Such colors
+are converted to sRGB. Colors of files that say nothing, or say sRGB, are values as stored, and so
+are masks.
+
+Pixels come as stored, whatever the orientation flag says that phones write into JPEG files (EXIF).
+`orientation` reads the flag, and `oriented` turns pixels by it. The caller decides. HEIC photos
+come upright, because their format turns them without the flag.
 """
 
 import contextlib
@@ -36,21 +40,25 @@ from humangs_jax.io.image_headers import (
 from humangs_jax.io.reading import InvalidFileError, check_limit, open_file, read_bytes, reading
 
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif", ".heic", ".heif")
-"""Suffixes of the photos, masks and images that are read, the likelier original first."""
+"""Suffixes of the photos, masks and images that can be read. The likelier original comes first."""
 FORMATS = ("PNG", "JPEG")
-"""Formats of textures. Pillow knows some forty more, one of which starts Ghostscript."""
+"""Formats of Pillow that `image_in` accepts by default. Pillow knows some forty more, one of which
+starts Ghostscript.
+"""
 NAMES = {"HEIF": "HEIC", "AVIF": "AVIF", "WEBP": "WebP"}
 """Names of Pillow's formats, as people write them."""
 HEAD = 256
-"""Bytes of a file that tell its format."""
+"""Number of bytes at the start of a file that show its format."""
 GREY_SLACK = 16 / 255
-"""Channels of a grey image that was compressed differ by less."""
+"""Largest difference between the channels of an image that still counts as grey, after
+compression.
+"""
 GREY_MASK = "grey from 0 (background) to 255 (person)"
 EXIF_TAGS = 0x8769
-"""Number of the table of EXIF tags in the first table."""
+"""Number of the tag that points to the table of EXIF tags."""
 DIAGONAL_35MM = 43.27
-"""Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle
-along the diagonal.
+"""Diagonal of a frame of 36 x 24 mm, millimetres. The 35-mm equivalent of a focal length sees the
+same angle along the diagonal.
 """
 EXIF_MARKS = (
     b"Exif",
@@ -61,29 +69,28 @@ EXIF_MARKS = (
     b"adobe.com/xap",
     b"com.adobe.xmp",
 )
-"""A file without any of these has no EXIF; looking further would decode a PNG.
-
-An AVIF may be turned without it.
+"""Byte strings, at least one of which is in every file with EXIF. Without them no tags are read,
+because that would decode a PNG. An AVIF file may be turned without EXIF.
 """
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOR_TYPES = {2: "RGB", 4: "LA", 6: "RGBA"}
-"""Color types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it
-reads in full).
+"""Color types of PNG files that Pillow silently cuts from 16 to 8 bits. It reads grey alone (type
+0) in full.
 """
 MARK_KEY = "Software"
 DRAWN = "humangs_jax"
-"""Value of the text `Software` in PNG files that show results, which are never photos."""
+"""Value of the text `Software` in PNG files that show results. These are never photos."""
 MASK = "humangs_jax mask"
-"""Value of the same text in masks."""
+"""Value of the text `Software` in PNG files that are masks."""
 
 
 def read_image(
     path: str | Path,
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
-    """Reads colors in sRGB and, where the file has an alpha channel, alpha. Grey images become
-    three equal channels.
+    """Returns the colors of a photo in sRGB, (h, w, 3), and its alpha channel, (h, w), or None
+    without one. Grey images become three equal channels.
 
-    A color profile that cannot be used is warned of, and the values are taken as stored.
+    If a color profile cannot be used, a warning says so, and the values are taken as stored.
 
     Raises: FileNotFoundError; FileError if the file cannot be read as a photo or has more pixels
     than the limit.
@@ -101,15 +108,17 @@ def _colors_and_alpha(
 
 
 def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
-    """Reads a mask, coverage in [0, 1]: a grey image, or what else segmentation tools write.
+    """Returns a mask, coverage in [0, 1], (h, w), from a grey image or what else segmentation tools
+    write.
 
-    A palette or colors: 1 where the image has the one label (of a palette) or the one color that is
-    not the background. The background is black, and label 0 if there is one. Several greys of a
-    palette are those of a grey image. An alpha channel is the mask if the colors are those of a
-    photo, all alike, or the same mask.
+    In an image with a palette or colors, the mask is 1 where the image has the one label (of a
+    palette) or the one color that is not the background. The background is black, and label 0 if
+    that label is used. A palette of several greys is read like a grey image. An alpha channel is
+    the mask if the colors are those of a photo, all alike, or the same mask.
 
-    Raises: as `read_image`; FileError for several labels or colors, for a label 0 that is not
-    black, for no black, and for alpha and greys that differ: which is the person?
+    Raises: as `read_image`; FileError if it is not clear which part is the person: for several
+    labels or colors, a label 0 that is not black, no black, or an alpha channel and greys that
+    differ.
     """
     # labels of a palette without transparency
     with open_image(path) as (image, data):
@@ -146,8 +155,9 @@ def _is_grey(colors: np.ndarray) -> bool:
 
 
 def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """Makes the mask of a palette image: labels (h, w), colors of the palette (256, 3) from 0 to
-    255.
+    """Returns the mask of a palette image.
+
+    Arguments: labels (h, w); palette (256, 3): the colors of the labels, from 0 to 255.
     """
     used = np.unique(labels)
     black = [label for label in used.tolist() if not palette[label].any()]
@@ -189,8 +199,8 @@ def _mask_of_alpha(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def orientation(path: str | Path) -> int:
-    """Returns the EXIF flag of a photo, 1 (none) to 8: how programs that obey it show it, see
-    `oriented`.
+    """Returns the EXIF orientation of a photo, from 1 (shown as stored; also without a flag) to 8.
+    See `oriented`.
 
     Raises: as `open_image`.
     """
@@ -200,11 +210,12 @@ def orientation(path: str | Path) -> int:
 
 
 def focal_length(path: str | Path) -> float | None:
-    """Returns the focal length in pixels, from EXIF's 35-mm equivalent and the diagonal of the
-    photo; None where that is missing or 0.
+    """Returns the focal length of a photo in pixels, from EXIF's 35-mm equivalent and the photo's
+    diagonal.
 
-    equivalent / 43.27 mm = focal length / diagonal, as EXIF defines it. Of a photo that was cut out
-    of what EXIF describes, see `cropped_from`, it is not known. Raises: as `open_image`.
+    Returns None if EXIF has no equivalent, or 0, or if the photo was cut out of the frame that EXIF
+    describes, see `cropped_from`. EXIF defines: equivalent / 43.27 mm = focal length / diagonal.
+    Raises: as `open_image`.
     """
     with open_image(path) as (image, data):
         tags = _exif(image, data, EXIF_TAGS)
@@ -219,18 +230,19 @@ def focal_length(path: str | Path) -> float | None:
 
 
 def cropped_from(path: str | Path) -> tuple[int, int] | None:
-    """Returns the width and height that EXIF says if the photo has another shape, because it was
-    cut out of that; else None.
+    """Returns the width and height in EXIF if their ratio differs from the photo's, because the
+    photo was cut out of that frame. Otherwise returns None.
 
-    Photos that were made smaller or turned have the shape that EXIF says. Raises: as `open_image`.
+    A photo that was made smaller or turned keeps the shape that EXIF describes. Raises: as
+    `open_image`.
     """
     with open_image(path) as (image, data):
         return other_frame(_exif(image, data, EXIF_TAGS), image.size)
 
 
 def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
-    """Returns the EXIF tags of the photo, or of a folder in them; none where they are damaged:
-    nobody obeys these.
+    """Returns the EXIF tags of a photo, or of the table `folder` in them. Damaged tags count as
+    none.
     """
     if any(mark in data for mark in EXIF_MARKS):
         with warnings.catch_warnings(), contextlib.suppress(Exception):
@@ -243,7 +255,7 @@ def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
 
 
 def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
-    """Turns pixels (h, w, ...) as an EXIF orientation from 1 to 8 wants them shown; from 5 on
+    """Returns pixels (h, w, ...) turned and mirrored by an EXIF orientation from 1 to 8. From 5 on
     height and width are exchanged.
     """
     if flag >= 5:
@@ -261,15 +273,15 @@ def write_png(
     compress_level: int = 6,
     mark: str | None = None,
 ) -> None:
-    """Write colors or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside
+    """Writes colors or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level. Values outside
     are clipped.
 
     A fourth channel is alpha. The file appears whole or not at all.
 
-    Arguments: compress_level: of zlib; 1 takes a third of the time and a sixth more room. mark:
-    DRAWN for a picture that shows results and is not to be taken for a photo, MASK for a mask; see
-    `mark_of`. None: a photo.
-    Raises: OSError if it cannot be written.
+    Arguments: compress_level: of zlib; level 1 takes a third of the time and a sixth more room.
+    mark: DRAWN for a picture that shows results and must not be taken for a photo, MASK for a mask,
+    None for a photo; see `mark_of`.
+    Raises: OSError if the file cannot be written.
     """
     write_bytes(path, png_bytes(image, compress_level, mark))
 
@@ -279,7 +291,7 @@ def png_bytes(
     compress_level: int = 6,
     mark: str | None = None,
 ) -> bytes:
-    """Returns the content of the file that `write_png` writes."""
+    """Returns the bytes of the PNG file that `write_png` writes."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
@@ -294,8 +306,8 @@ def png_bytes(
 
 
 def mark_of(path: str | Path) -> str | None:
-    """Returns the mark with which `write_png` wrote a file; None for other files, and for those
-    that cannot be read.
+    """Returns the mark that `write_png` wrote into a file. None for other files and for files that
+    cannot be read.
     """
     with contextlib.suppress(OSError, ValueError), open_file(path, "image_bytes") as file:
         head = file.read(1024)  # the text stands before the pixels
@@ -308,16 +320,16 @@ def mark_of(path: str | Path) -> str | None:
 
 
 def is_own_picture(path: str | Path) -> bool:
-    """Says whether a file is a picture that shows results: a sheet, a rendering, a texture.
+    """Says whether a file is a picture that shows results: a sheet, a rendering or a texture.
 
-    Photos and masks are none.
+    False for photos and masks.
     """
     return mark_of(path) == DRAWN
 
 
 def is_own_output(path: str | Path) -> bool:
-    """Says whether a new output may replace a file of the same name: an own picture, or what is no
-    picture of anybody.
+    """Says whether a new output may replace a file. True for an own picture, and for a file that is
+    no PNG or cannot be read as an image.
     """
     if Path(path).suffix.lower() != ".png" or is_own_picture(path):
         return True
@@ -331,7 +343,7 @@ def is_own_output(path: str | Path) -> bool:
 def image_row(
     images: Iterable[Float[np.ndarray, "h w c"]], height: int = 240
 ) -> Float[np.ndarray, "height w c"]:
-    """Puts images side by side, reduced to one height, pixels."""
+    """Returns one image of all images side by side, each resized to `height` pixels."""
     return np.concatenate(
         [resized(i, max(1, round(i.shape[1] * height / i.shape[0])), height) for i in images],
         axis=1,
@@ -341,7 +353,9 @@ def image_row(
 def to_uint8(
     image: Float[np.ndarray, "*shape"] | UInt8[np.ndarray, "*shape"],
 ) -> UInt8[np.ndarray, "*shape"]:
-    """Rounds numbers in [0, 1] to 0..255, clipped; NaN becomes 0. Bytes stay as they are."""
+    """Returns numbers in [0, 1] as integers in 0..255, rounded and clipped. NaN becomes 0. Bytes
+    are returned unchanged.
+    """
     if np.asarray(image).dtype == np.uint8:
         return np.asarray(image)
     return np.rint(255 * np.clip(np.nan_to_num(np.asarray(image)), 0, 1)).astype(np.uint8)
@@ -350,7 +364,7 @@ def to_uint8(
 def named_color(name: str) -> tuple[float, float, float]:
     """Returns red, green and blue in [0, 1] of a CSS name or "#rrggbb".
 
-    Raises: ValueError for what is no opaque color.
+    Raises: ValueError if the name is no opaque color.
     """
     from PIL import ImageColor
 
@@ -366,11 +380,11 @@ def named_color(name: str) -> tuple[float, float, float]:
 def resized(
     image: Float[np.ndarray, "h w *c"] | UInt[np.ndarray, "h w *c"], width: int, height: int
 ) -> Float[np.ndarray, "height width *c"]:
-    """Resizes an image, in float32: an axis that becomes shorter is averaged by area, one that
-    becomes longer is bicubic.
+    """Returns the image resized to (height, width), in float32. An axis that becomes shorter is
+    averaged by area; an axis that becomes longer is interpolated by cubics.
 
-    The average is exact for every ratio; it is how the photos that the shipped weights have seen
-    were made. No value leaves the range of the image's own.
+    The average is exact for every ratio. The photos that the shipped weights were trained on were
+    made the same way. No value leaves the range of the image's values.
     """
     h, w, *rest = image.shape
     found = image.astype(np.float32, copy=False)
@@ -383,7 +397,7 @@ def resized(
 
 
 def _axis_weights(old: int, new: int) -> Any:
-    """Returns what each pixel of an axis takes from those it had, a sparse matrix (new, old)."""
+    """Returns a sparse matrix (new, old) that maps `old` pixels along an axis to `new` pixels."""
     from scipy.sparse import csr_array
 
     edges = np.arange(new + 1) * (old / new)
@@ -403,10 +417,10 @@ def _axis_weights(old: int, new: int) -> Any:
 
 @contextlib.contextmanager
 def open_image(path: str | Path) -> Generator[tuple[Any, bytes]]:
-    """Opens a photo as a PIL.Image that is not decoded yet but within the limits; also gives the
-    bytes of its file.
+    """Opens a photo as a PIL.Image that is within the limits but not decoded yet. Yields the image
+    and the bytes of its file.
 
-    Raises: FileNotFoundError; FileError, also for whatever goes wrong inside.
+    Raises: FileNotFoundError; FileError, also for any error inside the block.
     """
     with reading(path, "image"):
         data = read_bytes(path, "image_bytes")
@@ -415,16 +429,18 @@ def open_image(path: str | Path) -> Generator[tuple[Any, bytes]]:
 
 
 def is_heic(path: str | Path) -> bool:
-    """Says whether a file begins as a HEIC photo. Raises: FileNotFoundError; FileError."""
+    """Says whether the first bytes of a file are those of a HEIC photo. Raises: FileNotFoundError;
+    FileError.
+    """
     with reading(path, "image"), open_file(path, "image_bytes") as file:
         return iso_kind(file.read(HEAD)) == "HEIF"
 
 
 def _formats(data: bytes) -> tuple[str, ...]:
-    """Returns the formats of Pillow, which knows them from now on, that a file with these bytes may
-    have.
+    """Returns the names of Pillow's formats that a file with these bytes may have. A decoder that
+    Pillow lacks is registered first.
 
-    Raises: InvalidFileError.
+    Raises: InvalidFileError if the decoder is not installed.
     """
     kind = iso_kind(data)
     if kind == "HEIF":
@@ -449,9 +465,11 @@ def _formats(data: bytes) -> tuple[str, ...]:
 
 @contextlib.contextmanager
 def image_in(data: bytes, formats: tuple[str, ...] = FORMATS) -> Generator[Any]:
-    """Opens an image as `open_image` does, of bytes in one of these formats of Pillow.
+    """Opens an image from bytes, in one of these formats of Pillow, within the limits. It is not
+    decoded yet.
 
-    Raises: InvalidFileError; what Pillow raises for damaged images, which is of many types.
+    Raises: InvalidFileError; anything that Pillow raises for damaged images, which is of many
+    types.
     """
     from PIL import Image
 
@@ -477,7 +495,7 @@ def _check_size(width: int, height: int) -> None:
 
 
 def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
-    """Checks an image, PNG files by their checksums and others by decoding. Returns ((width,
+    """Checks an image, a PNG file by its checksums and others by decoding. Returns ((width,
     height), whether there is an alpha channel).
 
     Raises: as `open_image`.
@@ -492,14 +510,14 @@ def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Returns the width and height in pixels. Raises: as `open_image`."""
+    """Returns the width and height of an image in pixels. Raises: as `open_image`."""
     with open_image(path) as (image, _):
         return image.size
 
 
 def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray, "h w c"]:
-    """Reads pixels (h, w, channels) in float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels;
-    colors in sRGB, or as stored.
+    """Returns float32 pixels (h, w, channels) with 1 (grey), 2 (grey, alpha), 3 or 4 channels.
+    Colors are in sRGB, or as stored.
     """
     kept = kept_photos()
     with open_image(path) as (image, data):
@@ -526,7 +544,9 @@ def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray,
 
 
 def _levels(image: Any, data: bytes) -> tuple[UInt[np.ndarray, "h w c"], int]:
-    """Returns whole levels as stored, and the largest that there may be."""
+    """Returns the integer levels of an image as stored, (h, w, channels), and the largest level
+    that its type can hold.
+    """
     if data[:8] == PNG_SIGNATURE:
         check_png_chunks(data)
         if data[24] == 16 and data[25] in PNG_COLOR_TYPES:
@@ -539,8 +559,8 @@ def _levels(image: Any, data: bytes) -> tuple[UInt[np.ndarray, "h w c"], int]:
 
 
 def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
-    """Reads the pixels of a PNG file of 16 bits a channel, of which Pillow keeps the upper 8: it
-    decodes the lower ones, too.
+    """Returns all 16 bits of the pixels of a PNG file. Pillow keeps only the upper 8 bits, so the
+    lower 8 bits are decoded separately.
     """
     if data[26:28] != b"\0\0" or data[28] > 1:
         raise InvalidFileError("not a readable image: a PNG header with unknown methods")
@@ -552,8 +572,8 @@ def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
 
 
 def _decoded(data: bytes, raw: str) -> UInt[np.ndarray, "h w c"]:
-    """Decodes bytes of the pixels of a PNG file, chosen by the name that Pillow has for their
-    layout.
+    """Returns bytes of the pixels of a PNG file, (h, w, channels), selected by Pillow's name `raw`
+    of a pixel layout.
     """
     with image_in(data) as image:
         image.tile = [(*tile[:3], raw) for tile in image.tile]

@@ -1,14 +1,14 @@
-"""Reading files that nobody trusts: one set of limits, one error line for every kind of damage. See
-docs/security.md.
+"""Reads files that nobody trusts, with one set of limits and one error line for every kind of
+damage. See docs/security.md.
 
 Readers open files through `open_file` or `read_bytes` and work inside `reading`:
 
     with reading(path, "npz archive"):
         ...
 
-Whatever is raised in there becomes one `FileError` line that names the file: `me.npz: not a
-readable npz archive: ...`. A helper that does not know the file raises `InvalidFileError`, whose
-text follows the name of the file as it is.
+Any error inside becomes a `FileError` of one line that names the file: `me.npz: not a readable npz
+archive: ...`. A helper that does not know the file raises `InvalidFileError`; its text follows the
+name of the file unchanged.
 """
 
 import contextlib
@@ -31,17 +31,18 @@ from humangs_jax.io.atomic import write_text
 logger = logging.getLogger(__name__)
 
 ENVIRONMENT = "HUMANGS_LIMITS"
-"""Variable with other limits, such as "pixels=2e8,photos_outside=1"."""
+"""Environment variable that changes limits, such as "pixels=2e8,photos_outside=1"."""
 OUTSIDE = f"{ENVIRONMENT}=photos_outside=1 allows it"
 LONGEST_LINE = 1000
-"""Most characters of an error, in which values of files are quoted."""
+"""Largest number of characters of an error, because errors quote values of files."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """What a file or a command may cost. Each error line that a limit causes names it.
+    """Limits on what a file or a command may cost. Each error line that a limit causes names that
+    limit.
 
-    From `capture_pixels` on they are of a command, and are checked before it begins.
+    The limits from `capture_pixels` on apply to a command, and are checked before it begins.
     """
 
     file_bytes: int = 16 << 30
@@ -49,23 +50,27 @@ class Limits:
     text_bytes: int = 64 << 20
     """Bytes of JSON and other text, and of the pickle inside of a `.pt`."""
     slow_text_bytes: int = 1 << 19
-    """Bytes of YAML, of the JSON of a GLB scan and of the header of safetensors: slow readers."""
+    """Bytes of YAML, of the JSON of a GLB scan and of the header of safetensors, which are slow to
+    read.
+    """
     mesh_bytes: int = 512 << 20
     """Bytes of a scan."""
     image_bytes: int = 256 << 20
     """Bytes of a photo before it is decoded."""
     array_bytes: int = 4 << 30
-    """Bytes of all arrays of an archive, unpacked, or of an EXR file that is written."""
+    """Unpacked bytes of all arrays of an archive, or bytes of an EXR file that is written."""
     plain_bytes: int = 256 << 20
-    """Bytes to which a file of any size may unpack, and of a sparse matrix made dense."""
+    """Bytes to which a file of any size may unpack, and bytes of a sparse matrix made dense."""
     ratio: int = 100
-    """Largest unpacked size over the size of the file, for unpacked sizes beyond `plain_bytes`."""
+    """Largest unpacked size relative to the size of the file. It applies to unpacked sizes beyond
+    `plain_bytes`.
+    """
     members: int = 65_536
     """Entries of an archive."""
     opcodes: int = 4_000_000
     """Instructions of a pickle."""
     nesting: int = 64
-    """Lists in lists of JSON and YAML."""
+    """Depth of lists within lists in JSON and YAML."""
     pixels: int = 64_000_000
     """Pixels of a photo."""
     side: int = 32_768
@@ -95,9 +100,9 @@ class Limits:
     frames: int = 250_000
     """Frames of a motion or a capture, read or written."""
     rate: int = 1000
-    """Frames per second of a motion; the least is 0.01."""
+    """Frames per second of a motion. The smallest rate is 0.01."""
     frames_per_photo: int = 100
-    """Frames of a capture without poses, over its photos."""
+    """Frames of a capture without poses, divided by its photos."""
     people: int = 100_000
     """People in keypoint files, and their images."""
     parts: int = 2000
@@ -110,10 +115,10 @@ _current: Limits | None = None
 
 
 def limits() -> Limits:
-    """Returns the limits in force: those of `set_limits`, else the default ones changed by the
-    environment variable HUMANGS_LIMITS.
+    """Returns the limits in force: those of `set_limits`, or else the default limits as changed by
+    the environment variable HUMANGS_LIMITS.
 
-    Raises: ValueError for a variable that is not understood.
+    Raises: ValueError if the variable cannot be parsed.
     """
     global _current
     if _current is None:
@@ -122,13 +127,16 @@ def limits() -> Limits:
 
 
 def set_limits(new: Limits | None) -> None:
-    """Use other limits from now on; None: those of the environment again."""
+    """Sets the limits from now on. None restores the limits of the environment."""
     global _current
     _current = new
 
 
 def _limits_of_text(text: str) -> Limits:
-    """Reads "pixels=2e8,photos_outside=1"."""
+    """Returns the limits that a text such as "pixels=2e8,photos_outside=1" describes.
+
+    Raises: ValueError.
+    """
     changes: dict[str, Any] = {}
     kinds: dict[str, Any] = {
         field.name: type(field.default) for field in dataclasses.fields(Limits)
@@ -149,7 +157,9 @@ def _limits_of_text(text: str) -> Limits:
 
 
 class _Shown(reprlib.Repr):
-    """Shows values as `repr` does, but short, also those that hold many others or themselves."""
+    """Shows values as `repr` does, but shortened, so that values that hold many others or
+    themselves can be shown, too.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -159,15 +169,15 @@ class _Shown(reprlib.Repr):
         ) = 4
 
     def repr_int(self, x: int, level: int) -> str:
-        """Shows large integers by their size: Python refuses to write integers of thousands of
-        digits.
+        """Shows integers of 40 digits or more by their size, because Python refuses to write
+        integers of thousands of digits.
         """
         if abs(x) < 10**40:
             return repr(x)
         return f"an integer of {x.bit_length():,} bits"
 
     def repr_instance(self, x: object, level: int) -> str:
-        """Shows numpy scalars like Python's; any other object by the name of its type."""
+        """Shows numpy scalars like Python's, and any other object by the name of its type."""
         if isinstance(x, str):
             return self.repr_str(str(x), level)
         if x is None or isinstance(x, bool | float):
@@ -176,19 +186,19 @@ class _Shown(reprlib.Repr):
 
 
 def shown(value: object) -> str:
-    """Shows the beginning of a value of a file, for an error line.
+    """Returns the beginning of a value of a file as text for an error line.
 
-    The parts of a list may be the list itself, or a million others.
+    This is safe for a list that contains itself or a million lists.
     """
     return _Shown().repr(value)
 
 
 LARGEST_AMOUNT = 10**15
-"""Larger amounts are not written out in errors."""
+"""Largest amount that is written out in errors."""
 
 
 def _one_line(text: object, longest: int = LONGEST_LINE) -> str:
-    """Makes one printable line of a text."""
+    """Returns a text as one printable line, cut after `longest` characters."""
     line = printable(" ".join(str(text).split()))
     if len(line) <= longest:
         return line
@@ -196,9 +206,7 @@ def _one_line(text: object, longest: int = LONGEST_LINE) -> str:
 
 
 class FileError(ValueError):
-    """Says what is wrong with a file in one line: file, field, and what was expected. Empty parts
-    are left out.
-    """
+    """An error of one line about a file: file, field, and the problem. Empty parts are left out."""
 
     def __init__(self, file: object, field: str, problem: object):
         parts = [str(part) for part in (file, field, problem) if part]
@@ -206,25 +214,24 @@ class FileError(ValueError):
 
 
 def is_unread(error: BaseException) -> bool:
-    """Says whether a file could not be read for want of permission, so that nothing is known of
-    what is in it.
+    """Says whether a file could not be read because of its permissions, so that nothing is known
+    about its content.
     """
     return isinstance(error.__cause__, PermissionError)
 
 
 class InvalidFileError(ValueError):
-    """Says what is wrong with the file that is being read; raised by functions that do not know its
-    name.
-    """
+    """An error about the file that is being read, raised by functions that do not know its name."""
 
 
 @contextlib.contextmanager
 def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Generator[None]:
-    """Turns whatever goes wrong inside into one line that names the file.
+    """Turns any error inside the block into an error of one line that names the file.
 
-    Arguments: path: the file, for the message. kind: what it should be, as in "npz archive".
+    Arguments: path: the file, for the message. kind: what the file should be, as in "npz archive".
     raises: the class of the error.
-    Raises: `raises`; FileNotFoundError for a missing file where that is FileError.
+    Raises: `raises`; FileNotFoundError for a missing file if `raises` is FileError; ArgumentError,
+    which stays as it is.
     """
     try:
         yield
@@ -248,7 +255,7 @@ def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Gen
 
 
 def _why(kind: str, error: Exception) -> str:
-    """Says why a reader failed, in a line."""
+    """Returns one line that says why a reader failed."""
     if isinstance(error, MemoryError):
         reason = "out of memory"
     elif isinstance(error, RecursionError):
@@ -267,8 +274,9 @@ def _why(kind: str, error: Exception) -> str:
 
 
 def check_limit(name: str, amount: float | int, unit: str) -> None:
-    """Raises: InvalidFileError, naming the limit and how it is raised, if that much is more than it
-    allows.
+    """Checks an amount against a limit.
+
+    Raises: InvalidFileError if the amount is larger. It names the limit and says how to raise it.
     """
     most = getattr(limits(), name)
     if amount > most:
@@ -286,7 +294,8 @@ def check_limit(name: str, amount: float | int, unit: str) -> None:
 
 
 def open_file(path: str | os.PathLike[str], limit: str = "file_bytes") -> BinaryIO:
-    """Open a file whose size is within a limit. No devices and no pipes: these have no end.
+    """Opens a regular file whose size is within a limit. Devices and pipes are refused, because
+    they have no end.
 
     Raises: OSError; InvalidFileError.
     """
@@ -300,7 +309,7 @@ def open_file(path: str | os.PathLike[str], limit: str = "file_bytes") -> Binary
 
 
 def read_bytes(path: str | os.PathLike[str], limit: str = "file_bytes") -> bytes:
-    """Reads the bytes of a file. Raises: as `open_file`."""
+    """Returns the bytes of a file. Raises: as `open_file`."""
     with open_file(path, limit) as file:
         return file.read()
 
@@ -308,12 +317,13 @@ def read_bytes(path: str | os.PathLike[str], limit: str = "file_bytes") -> bytes
 def walk(
     folder: str | os.PathLike[str], skip: Callable[[Path], bool] = lambda folder: False
 ) -> Generator[Path]:
-    """Yields the files in a folder and in the folders in it, but for names that begin with a dot
-    and folders to `skip`.
+    """Yields the files of a folder and of its subfolders, except names that begin with a dot and
+    folders that `skip` accepts.
 
-    Each folder is looked at once, however many links lead to it. Links that lead out are not
-    followed, unless the limit `photos_outside` allows it; the first of them is logged. Raises:
-    InvalidFileError beyond the limit `entries`; OSError.
+    Each folder is searched once, however many links lead to it. Links that lead out of the folder
+    are not followed, unless the limit `photos_outside` allows it; the first such link is logged.
+
+    Raises: InvalidFileError beyond the limit `entries`; OSError.
     """
     # what links lead to comes last: a folder is found at its proper place
     seen: set[tuple[int, int]] = set()
@@ -349,14 +359,17 @@ def walk(
 
 
 def visible(paths: Iterable[Path]) -> list[Path]:
-    """Returns the paths whose names do not begin with a dot, as `._NAME` of macOS and what is not
-    whole yet.
+    """Returns the paths whose names do not begin with a dot. Such names have `._NAME` files of
+    macOS, and files that are still being written.
     """
     return [path for path in paths if not path.name.startswith(".")]
 
 
 def check_unpacked(size: int, unpacked: int) -> None:
-    """Raises: InvalidFileError if a file of `size` bytes must not become that much in memory."""
+    """Checks that a file of `size` bytes may become `unpacked` bytes in memory.
+
+    Raises: InvalidFileError, which names the limit.
+    """
     most = limits()
     check_limit("array_bytes", unpacked, "bytes unpacked")
     if unpacked > max(most.plain_bytes, most.ratio * size):
@@ -367,11 +380,11 @@ def check_unpacked(size: int, unpacked: int) -> None:
 
 
 def inside(folder: str | os.PathLike[str], name: str, photo: bool = False) -> Path:
-    """Returns the path `folder / name` that a file in the folder names, if it lies in there after
-    symbolic links are followed.
+    """Returns the path `folder / name`, after checking that it lies in the folder when symbolic
+    links are followed. A file in the folder names the path.
 
-    Arguments: photo: it is one of a photo or mask, which the limit `photos_outside` lets lie
-    elsewhere.
+    Arguments: photo: whether the path is that of a photo or mask. The limit `photos_outside` lets
+    these lie elsewhere.
     Raises: InvalidFileError.
     """
     path = Path(folder) / name
@@ -400,18 +413,18 @@ T = TypeVar("T")
 
 
 def read_text(path: str | os.PathLike[str], limit: str = "text_bytes") -> str:
-    """Reads the text of a file in UTF-8, with or without a byte order mark.
+    """Returns the text of a file in UTF-8, with or without a byte order mark.
 
-    Raises: FileNotFoundError; FileError if it cannot be read, is too large or is not text.
+    Raises: FileNotFoundError; FileError if the file cannot be read, is too large or is not text.
     """
     with reading(path, "text file in UTF-8"):
         return read_bytes(path, limit).decode("utf-8-sig")
 
 
 def parse_json(text: str) -> Any:
-    """Parses a JSON text; NaN and Infinity, which Python's tools write, are accepted.
+    """Returns the value of a JSON text. NaN and Infinity, which Python's tools write, are accepted.
 
-    Raises: InvalidFileError (a ValueError) naming the line.
+    Raises: InvalidFileError (a ValueError), which names the line.
     """
     try:
         value = json.loads(text)
@@ -426,7 +439,10 @@ def parse_json(text: str) -> Any:
 
 
 def check_nesting(value: Any) -> None:
-    """Raises: InvalidFileError if lists and dicts contain each other more than `nesting` times."""
+    """Checks that lists and dicts contain each other at most `nesting` times.
+
+    Raises: InvalidFileError.
+    """
     level = [[value]]
     for _ in range(limits().nesting + 1):
         contents = (each.values() if isinstance(each, dict) else each for each in level)
@@ -439,7 +455,7 @@ def check_nesting(value: Any) -> None:
 
 
 def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
-    """Reads a configuration of class `cls` from its JSON, see `core.configuration`.
+    """Returns the configuration of class `cls` in a JSON file, see `core.configuration`.
 
     Raises: FileNotFoundError; FileError.
     """
@@ -451,22 +467,24 @@ def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
 
 
 def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = 1) -> None:
-    """Write a JSON file, whole or not at all.
+    """Writes a value to a JSON file, whole or not at all.
 
-    Raises: TypeError for what JSON cannot hold; OSError.
+    Raises: TypeError if JSON cannot hold the value; OSError.
     """
     write_text(path, json_text(value, indent))
 
 
 def json_text(value: Any, indent: int | None = 1) -> str:
-    """Returns what `write_json` writes. Raises: TypeError for what JSON cannot hold."""
+    """Returns the text that `write_json` writes. Raises: TypeError if JSON cannot hold the
+    value.
+    """
     return json.dumps(value, indent=indent) + "\n"
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
-    """Reads the value in a JSON file.
+    """Returns the value in a JSON file.
 
-    Raises: FileNotFoundError; FileError, naming file and line.
+    Raises: FileNotFoundError; FileError, which names file and line.
     """
     with reading(path, "JSON file"):
         return parse_json(read_text(path))

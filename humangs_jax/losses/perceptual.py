@@ -1,12 +1,13 @@
 """Losses that compare the features of frozen convolutional networks: LPIPS and the published
 perceptual loss.
 
-A network is a tuple of slices, a slice a tuple of layers; the map after the last layer of each
-slice is a feature that is compared. Layers carry torchvision's numbers in its `features` list as
-names ("0", "3.squeeze"). Every convolution has a bias and is followed by a ReLU; a fire module is a
-1x1 convolution whose output a 1x1 and a 3x3 convolution share.
+A network is a tuple of slices, and a slice is a tuple of layers. The map after the last layer of
+each slice is a feature that is compared. The names of layers are torchvision's numbers in its
+`features` list ("0", "3.squeeze"). Every convolution has a bias and is followed by a ReLU. A fire
+module is a 1x1 convolution whose output enters a 1x1 and a 3x3 convolution.
 
-All is for ONE image in [0, 1]; batch with `jax.vmap`. `losses.loss_networks` reads the weights.
+All functions take ONE image in [0, 1]; use `jax.vmap` for batches. `losses.loss_networks` reads the
+weights.
 """
 
 import functools
@@ -38,7 +39,7 @@ Weights = dict[str, Convolution]
 
 
 class Conv(NamedTuple):
-    """A convolution with `padding` zeros on each side, and its ReLU."""
+    """A convolution with `padding` zeros on each side, followed by a ReLU."""
 
     name: str
     """Name of the layer in weights files."""
@@ -55,8 +56,8 @@ class Conv(NamedTuple):
 
 
 class Pool(NamedTuple):
-    """Largest or mean value of a window; without `ceil`, rows and columns that fill no window are
-    ignored.
+    """A pooling layer: the largest or the mean value of each window. Without `ceil`, rows and
+    columns that fill no window are ignored.
     """
 
     size: int = 3
@@ -64,13 +65,15 @@ class Pool(NamedTuple):
     stride: int = 2
     """Step between windows, pixels."""
     average: bool = False
-    """Whether it takes the mean instead of the largest value."""
+    """Whether to take the mean instead of the largest value."""
     ceil: bool = False
     """Whether windows that reach over the border count too."""
 
 
 class Fire(NamedTuple):
-    """SqueezeNet's module: a narrow convolution, then two expanding ones side by side."""
+    """SqueezeNet's fire module: a narrow convolution, then two expanding convolutions side
+    by side.
+    """
 
     name: str
     """Name of the module in weights files."""
@@ -83,7 +86,7 @@ class Fire(NamedTuple):
 
     @property
     def convolutions(self) -> tuple[Conv, Conv, Conv]:
-        """The one that comes first, and the two that look at its output."""
+        """The narrow convolution, then the two that take its output."""
         half = self.outputs // 2
         return (
             Conv(f"{self.name}.squeeze", self.inputs, self.squeezed, 1, 1, 0),
@@ -97,8 +100,8 @@ Slices = tuple[tuple[Layer, ...], ...]
 
 
 def vgg(depths: tuple[int, ...], feature: tuple[int, ...], average: bool = False) -> Slices:
-    """Makes a VGG whose block b has `depths[b]` convolutions, of which the one numbered
-    `feature[b]` (from 1) is compared.
+    """Returns a VGG whose block b has `depths[b]` convolutions. The map behind convolution
+    `feature[b]` of the block (counted from 1) is compared.
     """
     slices: list[tuple[Layer, ...]] = []
     layers: list[Layer] = []
@@ -156,7 +159,7 @@ def channels(slices: Slices) -> tuple[int, ...]:
 
 @functools.cache
 def smallest_side(slices: Slices) -> int:
-    """Returns the pixels that an image must have per side for every layer to find a whole
+    """Returns the smallest side of an image, pixels, with which every layer finds a whole
     window.
     """
 
@@ -173,7 +176,7 @@ def smallest_side(slices: Slices) -> int:
 
 
 def _size_after(layer: Conv | Pool, size: Any) -> Any:
-    """Returns the size of the maps behind a convolution or a pool: an int, or an array of
+    """Returns the size of the maps behind a convolution or a pool. Sizes are an int, or an array of
     several.
     """
     if isinstance(layer, Conv):
@@ -189,13 +192,16 @@ def feature_maps(
     image: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> list[tuple[Float[Array, "y x c"], Int[Array, "2"] | None]]:
-    """Returns the compared maps of an image whose colors are scaled as the network expects them,
-    each with its size.
+    """Returns the compared maps of an image, each with its size. The image's colors must be scaled
+    as the network expects.
 
-    size: the image's own height and width, where it was padded below and right so that images of
-    several sizes share a program. The maps are then those of the image without padding, padded with
-    zeros, and their sizes say where they end. Without it the sizes are None. Computed in the dtype
-    of the weights. Raises: ValueError for an image that is too small for the network.
+    Everything is computed in the dtype of the weights.
+
+    size: height and width of the image without padding, if it was padded below and right so that
+    images of several sizes share a program. The maps are then those of the image without padding,
+    padded with zeros, and the returned sizes say where they end. None: the image is not padded, and
+    the returned sizes are None.
+    Raises: ValueError for an image that is too small for the network.
     """
     height, width, _ = image.shape
     least = smallest_side(slices)
@@ -213,7 +219,7 @@ def feature_maps(
 
 
 def _cleared(x: Float[Array, "y x c"], size: Int[Array, "2"] | None) -> Float[Array, "y x c"]:
-    """Sets a map to zeros beyond its size: what a convolution finds outside of an image."""
+    """Returns a map with zeros beyond its size, as a convolution finds them outside of an image."""
     if size is None:
         return x
     inside = [jnp.arange(side) < n for side, n in zip(x.shape[:2], size, strict=True)]
@@ -253,8 +259,8 @@ def _convolve(weights: Convolution, layer: Conv, x: Float[Array, "y x c"]) -> Fl
 
 
 def _pool(layer: Pool, x: Float[Array, "y x c"]) -> Float[Array, "i j c"]:
-    """Pools columns, then rows, by strided slices: seven times as fast on a CPU as a windowed
-    reduction and its gradient.
+    """Returns the pooled map. Strided slices of columns, then of rows, are seven times as fast on a
+    CPU as a windowed reduction and its gradient.
     """
     if layer.ceil:
         missing = [-(side - layer.size) % layer.stride for side in x.shape[:2]]
@@ -275,7 +281,7 @@ def _larger(x: Float[Array, "*b"], y: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 
 EPSILON = 1e-10
-"""Added to the length of a feature vector."""
+"""Number added to divisors, such as the length of a feature vector, against a division by 0."""
 
 
 @pytree_dataclass
@@ -285,20 +291,20 @@ class Lpips:
     backbone: Weights
     """The backbone's convolutions."""
     heads: tuple[Float[Array, " _"], ...]
-    """Weight of each channel of the compared maps, one array a map."""
+    """Weights of the channels of each compared map, one array (channels,) for each map."""
     net: str = static_field()
-    """Which of `BACKBONES` it is."""
+    """Name of the backbone, a key of `BACKBONES`."""
 
 
 def _scaled(image: Array) -> Array:
-    """Scales colors in [0, 1] as the backbones of LPIPS expect them."""
+    """Returns colors in [0, 1] scaled as the backbones of LPIPS expect them."""
     shift = jnp.asarray((-0.030, -0.088, -0.188), image.dtype)
     scale = jnp.asarray((0.458, 0.448, 0.450), image.dtype)
     return (2 * image - 1 - shift) / scale
 
 
 def _unit(x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:
-    """Divides the features of each pixel by their length."""
+    """Returns the features of each pixel divided by their length."""
     return x / (safe_sqrt(jnp.sum(jnp.square(x), axis=-1, keepdims=True)) + EPSILON)
 
 
@@ -308,35 +314,35 @@ def lpips_distances(
     target: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> Float[Array, " _"]:
-    """Returns the distance at each depth of the backbone: five for vgg and alex, seven for squeeze.
-
-    See `lpips`.
+    """Returns the distance of two images at each depth of the backbone: five for vgg and alex,
+    seven for squeeze. Their sum is `lpips`.
     """
     maps = [lpips_features(weights, image, size) for image in (predicted, target)]
     return _distances(weights, *maps)
 
 
 LpipsMaps = list[tuple[Float[Array, "_y _x _c"], Int[Array, "2"] | None]]
-"""Unit-length features of an image at each depth, and how large their maps are, see
-`feature_maps`."""
+"""Unit-length features of an image at each depth, with the sizes of their maps, see
+`feature_maps`.
+"""
 
 
 def lpips_features(
     weights: Lpips, image: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
 ) -> LpipsMaps:
-    """Returns what `lpips` compares of an image."""
+    """Returns the features of an image that `lpips` compares."""
     image = at_least_float32(image)
     maps = feature_maps(weights.backbone, BACKBONES[weights.net], _scaled(image), size)
     return [(_unit(at_least_float32(x)), own) for x, own in maps]
 
 
 def lpips_to(weights: Lpips, predicted: Float[Array, "h w 3"], target: LpipsMaps) -> Scalar:
-    """Returns the `lpips` to an image whose features are known."""
+    """Returns the `lpips` distance of an image to one whose features are given."""
     return jnp.sum(_distances(weights, lpips_features(weights, predicted), target))
 
 
 def _distances(weights: Lpips, predicted: LpipsMaps, target: LpipsMaps) -> Float[Array, " _"]:
-    """Returns the distance at each depth."""
+    """Returns the distance of two images' features at each depth."""
     distances = []
     for head, (x, own), (y, _) in zip(weights.heads, predicted, target, strict=True):
         different = jnp.sum(head * jnp.square(x - y), axis=-1)
@@ -353,14 +359,15 @@ def lpips(
     target: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> Scalar:
-    """Returns LPIPS (Zhang et al., 2018, version 0.1): distances of unit-length features, weighed
-    per channel by learned heads.
+    """Returns the LPIPS distance of two images (Zhang et al., 2018, version 0.1): the distance of
+    their unit-length features, weighted per channel by learned heads.
 
         d = sum over slices of the mean over pixels of sum_c w_c (x_c / |x| - y_c / |y|)^2
 
-    size: height and width of the images where both were padded below and right, see `feature_maps`:
-    the distance is that of the images without padding. Raises: ValueError for images that are too
-    small (16 pixels a side for vgg, 31 for alex, 25 for squeeze).
+    size: height and width of the images without padding, if both were padded below and right, see
+    `feature_maps`. The distance is that of the images without padding.
+    Raises: ValueError for images that are too small (16 pixels a side for vgg, 31 for alex, 25 for
+    squeeze).
     """
     return jnp.sum(lpips_distances(weights, predicted, target, size))
 
@@ -368,13 +375,13 @@ def lpips(
 def vgg16_loss(
     weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
 ) -> Scalar:
-    """Returns the mean absolute difference of the features of VGG-16, relative to the mean of the
-    target's, averaged over five depths.
+    """Returns the mean absolute difference of two images' features of VGG-16, relative to the mean
+    of the target's features, averaged over five depths.
 
-    weights: of LPIPS "vgg"; its heads are not used. Where `perceptual_loss` wants the weights of
-    the original VGG-19, this one works with those of the extra `lpips`, and where LPIPS compares
-    directions of features, it compares their sizes, too. No gradient flows into the target. Raises:
-    ValueError for images under 16 pixels a side, and for another network.
+    weights: those of LPIPS "vgg", whose heads are not used. `perceptual_loss` needs the weights of
+    the original VGG-19; this loss works with the weights of the extra `lpips`. LPIPS compares the
+    directions of features; this loss compares their sizes, too. No gradient flows into the target.
+    Raises: ValueError for images under 16 pixels a side, and for another network.
     """
     if weights.net != "vgg":
         raise ValueError(f"vgg16_loss: expected LPIPS vgg, got {weights.net}")
@@ -389,7 +396,7 @@ def vgg16_loss(
 
 
 DIVISORS = (1.0, 2.6, 4.8, 3.7, 5.6, 0.15)
-"""Divisors of the errors of the pixels and of the five depths."""
+"""Divisors of the errors of the pixels and of the features at five depths."""
 
 
 @pytree_dataclass
@@ -403,12 +410,12 @@ class Vgg19:
 def perceptual_errors(
     vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
 ) -> Float[Array, "6"]:
-    """Returns the mean absolute differences of the pixels in [0, 255] and of the features of
-    VGG-19, with average pooling, at five depths.
+    """Returns the mean absolute differences of two images, (6,): of their pixels in [0, 255], and
+    of their features of VGG-19 (with average pooling) at five depths.
 
-    Colors enter as 255 * rgb - (123.68, 116.779, 103.939), which is what the weights of the
-    original VGG-19 expect (those of MatConvNet's file and of the released checkpoint; torchvision's
-    expect other scales and make another loss of it). The features are those after the second ReLU
+    Colors enter as 255 * rgb - (123.68, 116.779, 103.939). The weights of the original VGG-19
+    expect this (those of MatConvNet's file and of the released checkpoint). torchvision's weights
+    expect other scales, and would make another loss. The features are those after the second ReLU
     of each block. No gradient flows into the target.
     Raises: ValueError for images under 16 pixels a side.
     """

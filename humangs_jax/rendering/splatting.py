@@ -68,9 +68,9 @@ __all__ = [
 
 @pytree_dataclass
 class Rendering(Batchable):
-    """One image of a set of Gaussians; with leading axes, a batch of images.
+    """One image of a set of Gaussians. With leading axes, a batch of images.
 
-    Fields of `SplatConfig` ask for most of those that may be None.
+    Most fields that may be None are filled only if a field of `SplatConfig` asks for them.
     """
 
     rgb: Float[Array, "h w 3"]
@@ -78,42 +78,48 @@ class Rendering(Batchable):
     alpha: Float[Array, "h w"]
     """Share of the light that the Gaussians stop, (h, w), in [0, 1)."""
     depth: Float[Array, "h w"]
-    """Mean z of what is seen, weighted as the colors are, (h, w), metres; 0 where alpha is 0."""
+    """Mean z of the Gaussians seen, weighted as the colors are, (h, w), metres; 0 where
+    alpha is 0.
+    """
     overflow: Int[Array, ""]
     """Number of (splat, tile) pairs that did not fit in the buffers and were not drawn."""
     visibility: Float[Array, " g"] | None = None
-    """Largest weight alpha T of each Gaussian on any pixel, (g,), 0 if it is hidden; not
-    differentiable; None unless `SplatConfig.visibility`.
+    """Largest weight alpha T of each Gaussian on any pixel, (g,), 0 if it is hidden. It is not
+    differentiable. None unless `SplatConfig.visibility`.
     """
     features: Float[Array, "h w n"] | None = None
-    """Features summed with the weights of the colors, over a background of 0, (h, w, n). None
-    without features."""
+    """Features blended with the weights of the colors, over a background of 0, (h, w, n). None
+    without features.
+    """
     means2d: Float[Array, "g 2"] | None = None
     """Centres on the image, (g, 2), pixels; None unless `SplatConfig.means2d`."""
     radii: Float[Array, "g 2"] | None = None
-    """Half the width and height of the footprints, (g, 2), pixels, 0 where nothing is drawn; not
-    differentiable; None unless `SplatConfig.radii`.
+    """Half the width and height of the footprints, (g, 2), pixels, 0 where nothing is drawn. They
+    are not differentiable. None unless `SplatConfig.radii`.
     """
     depth_sum: Float[Array, "h w"] | None = None
-    """z summed by weight, (h, w), metres: depth times alpha; None unless `SplatConfig.depth_sum`.
+    """Sum of z by weight, (h, w), metres: depth times alpha. None unless
+    `SplatConfig.depth_sum`.
     """
     depth_median: Float[Array, "h w"] | None = None
-    """z of the Gaussian at which half of the light is left, (h, w), metres, 0 where more passes;
-    not differentiable; None unless `SplatConfig.depth_median`.
+    """z of the Gaussian at which half of the light is left, (h, w), metres; 0 where more than half
+    passes. It is not differentiable. None unless `SplatConfig.depth_median`.
     """
     distortion: Float[Array, "h w"] | None = None
     """Sum over pairs of w_i w_j (z_i - z_j)^2, (h, w), squared metres (2DGS,
-    https://arxiv.org/abs/2403.17888, eq. 13, with squares); None unless `SplatConfig.distortion`.
+    https://arxiv.org/abs/2403.17888, eq. 13, with squares). None unless `SplatConfig.distortion`.
     """
 
     def _repr_png_(self) -> bytes:
-        """Shows the image, or those of a batch side by side, in notebooks."""
+        """Returns the bytes of a PNG for notebooks. Images of a batch are side by side."""
         images = np.asarray(self.rgb)
         return png_bytes(image_row(images.reshape(-1, *images.shape[-3:]), images.shape[-3]))
 
 
 Background = Float[Array, "3"] | Float[np.ndarray, "3"] | Sequence[float | int] | str | None
-"""(3,) RGB, three numbers in [0, 1], a CSS name or "#rrggbb"; None: white."""
+"""The color of the background: (3,) RGB, three numbers in [0, 1], a CSS name or "#rrggbb". None
+means white.
+"""
 
 
 @checked_arguments
@@ -125,8 +131,8 @@ def render(
     features: Float[Array, "g n"] | None = None,
     shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
-    """Draw Gaussians as one camera sees them. Gradients are of reverse mode, first derivatives: no
-    `jvp`, no Hessian.
+    """Draw Gaussians as one camera sees them. Only first derivatives in reverse mode are supported:
+    no `jvp`, no Hessian.
 
     After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079).
 
@@ -216,10 +222,10 @@ def visible_gaussians(
     config: SplatConfig | str = DEFAULT_CONFIG,
     threshold: float = ALPHA_MIN,
 ) -> Bool[Array, " g"]:
-    """Says which Gaussians weigh at least `threshold` on some pixel of some camera (leading axis
-    v).
+    """Returns which Gaussians weigh at least `threshold` on some pixel of some camera, (g,).
+    `cameras` has one leading axis.
 
-    The others can be left out for cameras like these: an avatar's inside is never seen.
+    The other Gaussians can be left out for cameras like these: an avatar's inside is never seen.
     """
     visibility = render_views(
         gaussians, cameras, dataclasses.replace(splat_config(config), visibility=True)
@@ -276,17 +282,18 @@ def _render(
 
 @functools.cache
 def _jitted(draw: Callable[..., Rendering]) -> Callable[..., Rendering]:
-    """Compiles `draw` or `draw_views`, for eager calls."""
+    """Returns the compiled `draw` or `draw_views` for eager calls."""
     return jax.jit(draw, static_argnums=3, compiler_options=compiler_options())
 
 
 @jax.custom_vjp
 def _once_per_image(array: Array, camera: Camera) -> Array:
-    """Returns the same array; where `vmap` shares it among cameras, each camera gets a copy.
+    """Returns the array unchanged. Where `vmap` shares the array among cameras, each camera gets a
+    copy.
 
-    Its gradient is then summed over the cameras once, and not at each of the dozen operations of
-    the projection that mix what is shared with what is not, which on a CPU cost a fifth of the
-    image.
+    The gradients of the copies are then summed over the cameras once. Without copies they would be
+    summed at each of the dozen operations of the projection that mix shared and unshared arrays,
+    which cost a fifth of an image's time on a CPU.
     """
     return _own(array, camera.K)
 
@@ -316,7 +323,7 @@ def _own_in_batch(
 def with_background(
     gaussians: Gaussians, cameras: Camera, background: Background
 ) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
-    """Returns Gaussians, cameras and the background's color (3,), in float32 at least.
+    """Returns Gaussians, cameras and the background's color (3,), all at least float32.
 
     Raises: ValueError if the background is no color.
     """
@@ -324,7 +331,7 @@ def with_background(
 
 
 def features_of(features: Float[Array, "g n"] | None, count: int) -> Float[Array, "g n"] | None:
-    """Returns features in float32 at least.
+    """Returns the features, at least float32. None stays None.
 
     Raises: ValueError unless there is one row for each of `count` Gaussians.
     """
@@ -334,8 +341,9 @@ def features_of(features: Float[Array, "g n"] | None, count: int) -> Float[Array
 
 
 def _color(background: object, dtype: np.dtype) -> Array:
-    """Returns a background as three numbers (3,), white for None. Raises: ValueError if it is no
-    color.
+    """Returns a background as three numbers (3,). None becomes white.
+
+    Raises: ValueError if the background is no color.
     """
     if background is None:
         return from_host(np.ones(3), dtype)
@@ -361,8 +369,8 @@ def _color(background: object, dtype: np.dtype) -> Array:
 
 
 def _of_bytes(color: Any) -> bool:
-    """Says whether an array of integers has a value above 1, as colors in bytes have. Traced values
-    are not looked at.
+    """Says whether an array of integers has a value above 1, as colors in bytes have. False for
+    traced values, which cannot be read.
     """
     if isinstance(color, Tracer) or jnp.issubdtype(color.dtype, jnp.inexact):
         return False
@@ -377,8 +385,8 @@ def draw(
     features: Float[Array, "g n"] | None = None,
     shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
-    """Draws as `render` does, but with buffers of the size that `config.max_pairs` says. It is pure
-    and checks nothing.
+    """Draws as `render` does, with buffers of the size `config.max_pairs`. The function is pure and
+    checks nothing.
     """
     gaussians, features = jax.tree.map(
         lambda leaf: _once_per_image(leaf, camera), (gaussians, features)
@@ -396,7 +404,7 @@ def draw_views(
     config: SplatConfig,
     features: Array | None = None,
 ) -> Rendering:
-    """Calls `draw` for every camera of a batch, one after the other."""
+    """Draws every camera of a batch as `draw` does, one after the other."""
 
     def project(camera):
         return project_gaussians(gaussians, camera, config)
@@ -475,7 +483,7 @@ def _blank(
     config: SplatConfig,
     others: Array | None,
 ) -> Rendering:
-    """Returns the image that is drawn when there are no Gaussians."""
+    """Returns the rendering of no Gaussians."""
     count = 4 + 2 * config.distortion
     if others is not None:
         count += others.shape[1]
@@ -491,8 +499,8 @@ def _blank(
 
 
 def _powers(behind: Float[Array, " g"], visible: Array) -> Float[Array, "g 2"]:
-    """Returns z and its square for each Gaussian. z is relative to the mean of what is drawn,
-    because small numbers have small squares.
+    """Returns z and z^2 of each Gaussian, (g, 2). z is relative to the mean of the visible
+    Gaussians, because small numbers have small squares.
     """
     count = jnp.maximum(jnp.sum(visible), 1)
     z = jnp.where(visible, behind - lax.stop_gradient(jnp.sum(behind) / count), 0.0)
@@ -508,13 +516,13 @@ def _blended(
     overflow: Array,
     config: SplatConfig,
 ) -> Rendering:
-    """Puts what was composited over the background.
+    """Returns the rendering of composited tiles over the background.
 
-    features: (t, 4 + n, p) premultiplied rgb, z - nearest and others. transmittance: (t, 1, p) the
-    final one.
+    features: (t, 4 + n, p), premultiplied rgb, z - nearest, and n others. transmittance: (t, 1, p),
+    the share of light that passes all Gaussians.
 
-    Tile by tile, and each output on its own: an output that nobody reads then costs nothing, nor
-    does its gradient.
+    Each output is computed separately, tile by tile. An output that nobody reads then costs
+    nothing, nor does its gradient.
     """
     alpha = 1 - transmittance
     rgb = features[:, :3] + transmittance * background[:, None]

@@ -1,11 +1,12 @@
 """Finds the stage of a training step in which numbers stopped being finite.
 
-Stages are the modules of the network, by their path, and the steps beside it that are a
-`parts.tap`. An interceptor of Linen keeps what they return, and adds zeros to what they take and
-return: the gradients with respect to these zeros are those that pass back there.
+Stages are the modules of the network, by their path, and the steps outside of modules that are a
+`parts.tap`. An interceptor of Linen keeps what each stage returns. It also adds zeros to what each
+stage takes and returns: the gradients with respect to these zeros are the gradients that pass back
+at that place.
 
-For one process and device. It needs the memory of a step that recomputes nothing; JAX_PLATFORMS=cpu
-helps where an accelerator has too little.
+This runs in one process on one device. It needs the memory of a step that recomputes nothing.
+JAX_PLATFORMS=cpu helps if an accelerator has too little memory.
 """
 
 import dataclasses
@@ -37,37 +38,37 @@ from humangs_jax.training.step import seed_numbers, subject_keys, subject_loss, 
 
 T = TypeVar("T")
 Named = dict[str, Any]
-"""Arrays, or a `Leaf` for each, by path in a pytree; the path of a bare array is ""."""
+"""Arrays by path in a pytree, or a `Leaf` for each array. The path of a bare array is ""."""
 FAILED = ("skipped", "nonfinite")
 """Events of a run's log that a diagnosis looks for."""
 PARTS = (("encoder",), ("reader",), ("decoder",))
-"""Modules of these are stages."""
+"""The modules whose submodules are stages, too."""
 DEEPEST = 3
-"""How deep modules are stages: encoder.transformer.block_0 is at 3."""
+"""Largest depth of a module that is a stage: encoder.transformer.block_0 has depth 3."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Leaf:
-    """Statistics of one array. All but `bad` and `first` count its finite entries only."""
+    """Statistics of one array. All but `bad` and `first` are of its finite entries only."""
 
     name: str
     """The path of the array in its pytree."""
     bad: int
-    """How many entries are not finite."""
+    """Number of entries that are not finite."""
     first: tuple[int, ...]
-    """The index of the first of these; () if there is none."""
+    """Index of the first entry that is not finite; () if there is none."""
     smallest: float
     """The smallest entry, +inf without any."""
     largest: float
     """The largest entry, -inf without any."""
     mean: float
-    """The mean of the magnitudes."""
+    """The mean magnitude, 0 without entries."""
     norm: float
     """The Euclidean norm."""
 
     @classmethod
     def of(cls, name: str, array: np.ndarray) -> "Leaf":
-        """The numbers of an array."""
+        """Returns the statistics of an array."""
         wrong = ~np.isfinite(array.astype(np.promote_types(array.dtype, np.float32), copy=False))
         finite = array[~wrong].astype(np.float64)
         first = ()
@@ -82,24 +83,24 @@ class Leaf:
 
 @pytree_dataclass
 class StageReport:
-    """What went through a stage, forward and back. Each field holds arrays by name, or a `Leaf` for
-    each array.
+    """The arrays that passed through a stage, forward and back. Each field holds arrays by name, or
+    a `Leaf` for each array.
     """
 
     name: str = static_field()
     """The name of the stage."""
     values: Named
-    """What the stage gave, or what was stored there."""
+    """What the stage returned, or the arrays that were stored there."""
     taken: Named = dataclasses.field(default_factory=dict)
-    """Gradients with respect to what it took."""
+    """Gradients with respect to what the stage took."""
     returned: Named = dataclasses.field(default_factory=dict)
-    """Gradients with respect to what it gave."""
+    """Gradients with respect to what the stage returned."""
     gradients: Named = dataclasses.field(default_factory=dict)
-    """Gradients with respect to its parameters."""
+    """Gradients with respect to the stage's parameters."""
 
     @property
     def gradient_norm(self) -> float:
-        """Euclidean norm of the gradients of its parameters."""
+        """Euclidean norm of the gradients of the stage's parameters."""
         return math.hypot(*(leaf.norm for leaf in self.gradients.values()))
 
     @property
@@ -134,7 +135,7 @@ def _numbers(report: StageReport) -> StageReport:
 @dataclasses.dataclass(frozen=True)
 class Fault:
     """An array that is not finite. It was stored (in the state or the batch), computed by a stage,
-    or sent back by a stage.
+    or sent back by a stage as a gradient.
     """
 
     direction: Literal["stored", "forward", "backward"]
@@ -159,12 +160,8 @@ class Fault:
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """The diagnosis of one subject of a step: the first with a fault, or else the one with the
-    largest gradient.
-
-    step: steps done before it. stored: what the step began with, state and batch. stages: in the
-    order in which they end.
-    skip_norm: gradients longer than this are skipped.
+    """The diagnosis of one subject of a step. It is the first subject with a fault, or else the one
+    with the largest gradient.
     """
 
     step: int
@@ -176,7 +173,7 @@ class Diagnosis:
     skip_norm: float
     """Steps whose gradient is longer than this are skipped."""
     stored: tuple[StageReport, ...]
-    """What the step began with: state and batch."""
+    """Reports of what the step began with: state and batch."""
     stages: tuple[StageReport, ...]
     """The stages in the order in which they end."""
 
@@ -187,8 +184,8 @@ class Diagnosis:
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """Everything stored that is not finite, then the first stage to blame. That is the first
-        one going forward, or else the first one going back.
+        """All stored arrays that are not finite, then the stage to blame: the first stage forward,
+        or else the first stage backward.
         """
         stored = [
             Fault("stored", part.name, leaf)
@@ -214,7 +211,7 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """What was found, in one line or a few."""
+        """The result of the diagnosis, in one line or a few."""
         if self.faults:
             return "\n".join(map(str, self.faults))
         norm = self.gradient_norm
@@ -281,8 +278,8 @@ class Recorder:
     """An interceptor for `nn.intercept_methods` that records the stages of one traced computation,
     in the order in which they end.
 
-    given: what each stage returned, by stage. probes: for each stage the zeros that are added to
-    what it takes and to what it returns. They are None in a first run, which finds their `shapes`.
+    `given` holds what each stage returned, by stage. probes: by stage, the zeros that are added to
+    what the stage takes and to what it returns. None in a first run, which finds their `shapes`.
     """
 
     def __init__(self, probes: dict[str, tuple[Named, Named]] | None = None):
@@ -342,11 +339,12 @@ def observe_subject(
     config: TrainConfig,
     networks: LossNetworks,
 ) -> tuple[Scalar, list[StageReport]]:
-    """The loss (`subject_loss`), and all its stages in the order in which they end.
+    """Returns the loss of a subject (`subject_loss`) and a report of each stage, in the order in
+    which the stages end.
 
-    Blocks are neither looped over nor recomputed, so that each can be watched, and everything is
-    kept: this needs more memory than a step (the published network at 512 pixels, 4 views each: 2.4
-    GB are kept).
+    Blocks are neither looped over nor recomputed, so that each can be watched, and all values are
+    kept. So this needs more memory than a step: the published network at 512 pixels and 4 views
+    keeps 2.4 GB.
     """
     config = dataclasses.replace(config, model=config.model.with_runtime(scan=False, remat="none"))
 
@@ -383,11 +381,11 @@ def diagnose_step(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
 ) -> Diagnosis:
-    """Diagnose the step that `train_step` would make of these arguments; the state is not given
-    away.
+    """Returns the diagnosis of the step that `train_step` would make with these arguments. Unlike
+    `train_step`, this keeps the state's buffers.
 
-    It works subject by subject: each has its own batch statistics, even where a microbatch would
-    share them.
+    Subjects are computed one by one. Each has its own batch statistics, even where a microbatch
+    would share them.
     """
     config, step = config.at(int(state.step)), int(state.step)
     parts = {
@@ -422,13 +420,13 @@ def diagnose_run(
     networks: LossNetworks = NO_NETWORKS,
     variables: Variables | None = None,
 ) -> Diagnosis:
-    """Repeat the first step of a run that its log calls skipped or not finite, from the newest
-    checkpoint before it.
+    """Repeats the first step of a run that its log calls skipped or not finite, from the newest
+    checkpoint before that step, and returns its diagnosis.
 
-    Without such a step: the one that would come next. body, training, networks, variables: as the
-    run had them. Batches are functions of seed and step, so that on the device that the run had the
-    step is repeated bit for bit.
-    Raises: FileNotFoundError without a run in `out`.
+    If the log has no such step, the step that would come next is diagnosed. body, training,
+    networks, variables: as the run had them. Batches are functions of seed and step, so the step is
+    repeated bit for bit on the device that the run had.
+    Raises: FileNotFoundError if `out` holds no run.
     """
     config = load_config(out)
     if isinstance(training, Sequence):
@@ -461,8 +459,8 @@ def diagnose_run(
 
 
 def first_failed_step(log: Path) -> int | None:
-    """Number of the first step that a log calls skipped or not finite, counted from 0; None if
-    there is none.
+    """Returns the number of the first step that a log calls skipped or not finite, counted from 0.
+    None if there is none.
     """
     if not log.is_file():
         return None

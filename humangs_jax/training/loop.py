@@ -1,4 +1,4 @@
-"""The training loop: the one place of this package's training with side effects.
+"""Runs the training loop, the only part of training with side effects.
 
 out/config.json, out/checkpoints/    see `checkpoint`; a run continues from the newest one by itself
 out/log.jsonl                        one object per line; {"step", "loss", ...} while training,
@@ -54,7 +54,9 @@ from humangs_jax.training.step import seed_numbers, train_step, update
 
 logger = logging.getLogger("humangs_jax.training")
 MANY_SKIPPED = 20
-"""Number of consecutive steps that is reported if all were skipped, or all had a gradient of 0."""
+"""Number of consecutive steps after which the log reports that all were skipped, or that all had a
+gradient of 0.
+"""
 ALL_SKIPPED = "were skipped: `humangs train --diagnose` names the first stage that fails"
 NO_GRADIENT = (
     "had a gradient of 0: no loss depends on a parameter any more; a learning rate that is too high"
@@ -62,14 +64,14 @@ NO_GRADIENT = (
 )
 
 NO_ROOM = "(splat, tile) pairs of a step had no room and were not drawn"
-"""What the log says of a step that overflowed."""
+"""Text of the log about a step whose buffers overflowed."""
 
 
 class RunLog:
-    """The records of a run that continues after `step`: records of later steps, from a run that was
-    killed, are dropped.
+    """Writes the log of a run that continues after `step`, and shows its progress. Records of later
+    steps, which a killed run left, are dropped.
 
-    recording: False in all processes but one; then nothing is written or shown.
+    recording: whether this process writes and shows anything. It is True in one process only.
     """
 
     def __init__(
@@ -103,8 +105,10 @@ class RunLog:
     def steps(
         self, done: int, metrics: dict[str, Any], subjects: int, waiting: Waiting, broken: int
     ) -> None:
-        """Numbers of the last step done. subjects: per step; seconds and samples a second are since
-        the last line.
+        """Logs the metrics of the last step done, with times and rates since the last such line.
+
+        subjects: number of subjects in a step. waiting: time that the loop has waited for data,
+        seconds. broken: number of capture folders that could not be used.
         """
         numbers = {name: float(value) for name, value in metrics.items()}
         before, began, waited = self._previous
@@ -125,21 +129,21 @@ class RunLog:
         )
 
     def numbers(self, done: int, numbers: dict[str, float], group: str) -> None:
-        """Numbers after a step, as a line and as curves "group/name"."""
+        """Logs numbers after step `done`, as a line and as curves "group/name" of TensorBoard."""
         self._write({"step": done} | numbers)
         if self._board is not None:
             for name, value in numbers.items():
                 self._board.add_scalar(f"{group}/{name}", value, done)
 
     def image(self, done: int, name: str, image: np.ndarray) -> None:
-        """An (h, w, 3) image in [0, 1] for TensorBoard."""
+        """Gives an (h, w, 3) image in [0, 1] to TensorBoard."""
         if self._board is not None:
             self._board.add_image(
                 name, (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8), done, dataformats="HWC"
             )
 
     def event(self, done: int, event: str, message: str, **details: float | list[str]) -> None:
-        """Something worth knowing, as a line and beside the progress bar."""
+        """Logs an event as a line, and shows `message` beside the progress bar."""
         self._write({"step": done, "event": event} | details)
         if self._recording:
             say(f"step {done}: {message}")
@@ -159,8 +163,8 @@ class RunLog:
 
 
 class Watch:
-    """Reads every step's metrics one step late, so that the device is never idle, and reports
-    failed steps.
+    """Reads every step's metrics one step late, so that the device is never idle, and logs steps
+    that failed.
     """
 
     def __init__(self, log: RunLog, state: TrainState):
@@ -174,8 +178,10 @@ class Watch:
     def __call__(
         self, done: int, metrics: dict[str, Any], bad_samples: Callable[[], list[str]] = list
     ) -> None:
-        """The metrics of the step that was just begun; done: steps with it. bad_samples: asked if
-        it failed, see `sources`.
+        """Reads the metrics of the step before, and keeps those of the step that was just begun.
+
+        done: number of steps, this one included. bad_samples: called if the step failed; it returns
+        a line for each bad sample, see `sources`.
         """
         # one step may wait behind the one that runs: enough to keep a device busy, and the run
         # reacts to a signal soon
@@ -184,7 +190,7 @@ class Watch:
         self._pending = done, {name: metrics[name] for name in names}, bad_samples
 
     def look(self) -> None:
-        """Read the metrics of the pending step, and report it if it failed."""
+        """Reads the metrics of the kept step, and logs the step if it failed."""
         if self._pending is None:
             return
         (done, metrics, bad_samples), self._pending = self._pending, None
@@ -225,11 +231,11 @@ class Watch:
 
 
 def forget_after(path: Path, step: int) -> None:
-    """Drop the lines of later steps, and a last line that was not written to its end; the file
-    changes whole or not.
+    """Drops the lines of later steps from a log, and a last line that is incomplete. The file
+    changes whole or not at all.
 
-    Raises: FileError for a file that is no log: no text, too large, or with another line that is no
-    record.
+    Raises: FileError if the file is no log: no text, too large, or with a line other than the last
+    that is no record.
     """
     if not path.is_file():
         return
@@ -250,7 +256,7 @@ def forget_after(path: Path, step: int) -> None:
 
 @contextlib.contextmanager
 def _naming(path: Any) -> Generator[None]:
-    """A full disk becomes an error that names the file."""
+    """Turns an OSError, such as that of a full disk, into one that names the file."""
     try:
         yield
     except OSError as error:
@@ -270,23 +276,23 @@ def _tensorboard(folder: Path, step: int) -> Any:
 
 
 VALIDATED = 8
-"""Subjects that a validation looks at, without another number."""
+"""Default number of subjects in a validation."""
 SHOWN = 4
-"""Validation subjects on the sheet."""
+"""Number of validation subjects on the sheet."""
 DROPPED = {
     "dropped_tokens": (
         "patches without room, mean: model.runtime.token_capacity is too small for these photos"
     ),
     "overflow": "(splat, tile) pairs without room, mean: they were not drawn",
 }
-"""What the numbers of a validation say that should be 0."""
+"""What it means if one of these numbers of a validation is not 0."""
 
 
 class TrainingInterrupted(KeyboardInterrupt):
     """`train` was asked to stop before its end, by Ctrl-C, SIGTERM or the loss of a machine. All is
-    saved: the same call goes on.
+    saved, and the same call continues the run.
 
-    A KeyboardInterrupt, so that a loop of runs stops, too. state: the one that was saved.
+    It is a KeyboardInterrupt, so that a loop of several runs stops, too. state: the saved state.
     """
 
     def __init__(self, state: TrainState, steps: int):
@@ -311,8 +317,8 @@ def train(
     stop_at: int | None = None,
     progress: bool = True,
 ) -> TrainState:
-    """Train until `config.steps`, from the newest checkpoint in `out` if there is one, on all
-    devices of all processes.
+    """Train until `config.steps`, on all devices of all processes. If `out` holds a checkpoint,
+    training continues from the newest one.
 
     Ctrl-C and SIGTERM finish the step, save and raise `TrainingInterrupted`; a second Ctrl-C
     interrupts at once.
@@ -472,8 +478,8 @@ def _rehearse(
     networks: LossNetworks,
     mesh: Mesh | None,
 ) -> None:
-    """Trace a step of a later stage: sizes that do not fit raise before the run, not in the middle
-    of it.
+    """Traces a step of a later stage, so that sizes that do not fit raise before the run and not in
+    the middle of it.
     """
     batch = stage_loader(make_source, config, step, mesh).batch_at(step)
     part = config.at(step)
@@ -500,12 +506,12 @@ def _report(
 
 @contextlib.contextmanager
 def stop_requested() -> Generator[Callable[[int], bool], None, None]:
-    """A function of the number of steps done: whether to stop after them, for Ctrl-C or because the
-    machine is taken away.
+    """Yields a function that takes the number of steps done and says whether to stop after them,
+    because of Ctrl-C or SIGTERM, or because the machine is taken away.
 
-    All processes must ask it after every step. One process checks its own signals, a second of
-    which does what it did before. Several may receive one at different steps, so that jax's
-    coordination service agrees on a step
+    All processes must call the function after every step. A single process checks its own signals;
+    a second signal has its usual effect. Several processes may receive a signal at different steps,
+    so jax's coordination service agrees on a step
     (https://docs.jax.dev/en/latest/_autosummary/jax.experimental.multihost_utils.html).
     """
     if jax.process_count() > 1:

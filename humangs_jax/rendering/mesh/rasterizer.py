@@ -1,25 +1,25 @@
-"""Triangle meshes to pixels: which face is seen at every pixel centre, where on that face, and how
-far away.
+"""Rasterizes triangle meshes: finds for every pixel centre which face is seen, where on that face,
+and how far away.
 
-Conventions: OpenCV cameras, pixel centres at +0.5, depth is the camera's z. The nearest face wins,
-of equally near ones the one of lower index; both sides of a face are seen. A face covers the pixel
-centres inside it AND on its edges. Faces without area in the image cover nothing. Faces that reach
-behind the near plane are dropped whole; those that also reach in front of it may be missing from
-the image and are counted in `Fragments.overflow`.
+Conventions: cameras are OpenCV's, pixel centres are at +0.5, and depth is the camera's z. The
+nearest face wins, and of equally near faces the one with the lower index. Both sides of a face are
+seen. A face covers the pixel centres inside it AND on its edges. Faces without area in the image
+cover nothing. Faces that reach behind the near plane are dropped whole. Those that also reach in
+front of it may be missing from the image, and are counted in `Fragments.overflow`.
 
-Method: scanlines. Faces of a body cover a few pixels or none, so that tiles of pixels times lists
-of faces would mostly test pixels that a face does not touch. Instead each face is expanded to its
-rows of pixel centres and each row to the pixels of its span (see `_window`); these fragments meet
-in a z-buffer by two scatters, first the least depth of a pixel, then the least face number at that
-depth. Both levels run in steps of a fixed number of slots, and as many steps as the mesh needs:
-shapes are static, and there is no capacity that a mesh could exceed.
+Method: the rasterizer works by scanlines. Faces of a body cover a few pixels or none, so tiles of
+pixels times lists of faces would mostly test pixels that a face does not touch. Instead each face
+is expanded to its rows of pixel centres, and each row to the pixels of its span (see `_window`).
+These fragments meet in a z-buffer by two scatters: first the smallest depth of a pixel, then the
+smallest face number at that depth. Both levels run in steps of a fixed number of slots, and take as
+many steps as the mesh needs. So shapes are static, and no capacity can be exceeded.
 
-Watertight: an edge function is taken from the pixel's point of view, (a - p) x (b - p), the ends a
-and b in an order that depends on their positions alone. Two faces that share an edge therefore
-compute the same number with opposite signs, however the compiler contracts it, and close to a
-vertex the differences are exact: both may cover a pixel, but never neither.
+Watertightness: an edge function is computed relative to the pixel, (a - p) x (b - p), and the order
+of the ends a and b depends on their positions alone. Two faces that share an edge therefore compute
+the same number with opposite signs, however the compiler contracts the expression. Close to a
+vertex the differences are exact: both faces may cover a pixel, but never neither.
 
-Derivatives: fragments are constants (`stop_gradient`); `interpolate_attributes` is differentiable
+Derivatives: fragments are constants (`stop_gradient`). `interpolate_attributes` is differentiable
 with respect to the attributes.
 """
 
@@ -40,23 +40,23 @@ from humangs_jax.geometry.camera import Camera, require_pinhole
 from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, owners
 
 NO_FACE = jnp.iinfo(jnp.int32).max
-"""Face number of a pixel without a face: the least number wins, so any face beats it."""
+"""Face number of a pixel without a face. The smallest number wins, so any face replaces it."""
 
 Slice = Annotated[int, Range(64, 1 << 24)]
 
 
 @configuration
 class RasterConfig:
-    """Settings of the rasterizer; the image depends on `near` alone."""
+    """Settings of the rasterizer. The image depends on `near` alone."""
 
     near: Spread = 0.01
     """Faces with a corner at z <= near are dropped, in the units of the vertices."""
     rows_per_step: Slice = 1 << 15
-    """Slots for rows of pixels per step of the outer loop. Large steps spend time on empty slots,
-    small ones on the overhead of more steps.
+    """Slots for rows of pixels in a step of the outer loop. Large steps spend time on empty slots,
+    small steps on the overhead of more steps.
     """
     fragments_per_step: Slice = 1 << 16
-    """Slots for pixels per step of the inner loop; the same trade."""
+    """Slots for pixels in a step of the inner loop. The trade-off is that of `rows_per_step`."""
 
 
 DEFAULT_CONFIG = RasterConfig()
@@ -64,7 +64,9 @@ DEFAULT_CONFIG = RasterConfig()
 
 @pytree_dataclass
 class Fragments(Batchable):
-    """What a camera sees of a mesh."""
+    """The face, the place on it and the depth that a camera sees at each pixel of a mesh's
+    image.
+    """
 
     face_ids: Int[Array, "h w"]
     """Index of the face that is seen, (h, w); -1 where there is none."""
@@ -77,8 +79,8 @@ class Fragments(Batchable):
     face.
     """
     overflow: Int[Array, ""]
-    """Number of faces that may be missing from the image: they cross the near plane, are not finite
-    numbers of pixels, or come after the first 2^30 rows of pixels.
+    """Number of faces that may be missing from the image. They cross the near plane, have pixel
+    positions that are not finite, or come after the first 2^30 rows of pixels.
     """
 
 
@@ -90,7 +92,7 @@ def rasterize_mesh(
     camera: Camera,
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> Fragments:
-    """Finds the nearest face at every pixel centre of one camera; batch with `jax.vmap`."""
+    """Returns the nearest face at every pixel centre of one camera. Use `jax.vmap` for batches."""
     vertices, camera = lax.stop_gradient((vertices, camera))
     if faces.shape[0] == 0 or vertices.shape[0] == 0:  # a face without area stands for no face
         vertices, faces = jnp.ones((1, 3), vertices.dtype), jnp.zeros((1, 3), jnp.int32)
@@ -124,12 +126,12 @@ def interpolate_attributes(
     attributes: Float[Array, "n c"],
     background: Float[Array, " c"],
 ) -> Float[Array, "h w c"]:
-    """Blends values at the corners of the faces over the seen surface; `background` where there is
-    no face.
+    """Returns the attributes (h, w, c) interpolated over the seen surface; `background` where there
+    is no face.
 
-    Corners may be numbered in another way: with `faces` the texture indices of the same faces, in
-    the same order, and `attributes` the texture coordinates, this is the texture coordinate of
-    every pixel.
+    faces: rows of `attributes` at the corners of each face, in the order of the rasterized faces.
+    They need not be the faces that were rasterized: with texture faces and texture coordinates, the
+    result is the texture coordinate of every pixel.
     """
     if faces.shape[0] == 0:
         return jnp.broadcast_to(background, (*fragments.face_ids.shape, background.shape[0]))
@@ -146,7 +148,7 @@ def interpolate_attributes(
 def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3"]:
     """Returns the pixel position x, y and the depth z of vertices, (n, 3).
 
-    Written out: matrix products are of low precision on GPU and TPU.
+    The products are written out, because matrix products have low precision on GPU and TPU.
     """
     require_pinhole("the rasterizer of meshes", camera)
     R, t, K = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3], camera.K
@@ -159,23 +161,23 @@ def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3
 
 
 def _first_pixel(low: Array, size: int) -> Array:
-    """Returns the first pixel whose centre is at `low` or after; clipped to [0, size]."""
+    """Returns the first pixel whose centre is at `low` or after, clipped to [0, size]."""
     return jnp.clip(jnp.ceil(low - 0.5), 0, size).astype(jnp.int32)
 
 
 def _last_pixel(high: Array, size: int) -> Array:
-    """Returns the last pixel whose centre is at `high` or before; clipped to [-1, size - 1]."""
+    """Returns the last pixel whose centre is at `high` or before, clipped to [-1, size - 1]."""
     return jnp.clip(jnp.floor(high - 0.5), -1, size - 1).astype(jnp.int32)
 
 
 def _pixel_centers(pixel: Array, width: int, dtype: np.dtype) -> tuple[Array, Array]:
-    """Returns x and y of the centres of pixels, which are numbered row by row."""
+    """Returns x and y of the centres of pixels. Pixels are numbered row by row."""
     return (pixel % width).astype(dtype) + 0.5, (pixel // width).astype(dtype) + 0.5
 
 
 def _drawn(corners: Float[Array, "f 9"], near: float) -> tuple[Array, Array]:
-    """Says which faces are before the near plane and have an area in the image; also counts the
-    faces that are left out but may be seen.
+    """Returns which faces lie in front of the near plane and have an area in the image, (f,), and
+    the number of faces that are dropped but may be seen.
     """
     z = corners[:, 2::3]
     ab, ac = corners[:, 3:5] - corners[:, 0:2], corners[:, 6:8] - corners[:, 0:2]
@@ -190,8 +192,8 @@ def _drawn(corners: Float[Array, "f 9"], near: float) -> tuple[Array, Array]:
 def _rows(
     corners: Float[Array, "f 9"], drawn: Array, width: int, height: int
 ) -> tuple[Array, Array]:
-    """Returns the first row of pixel centres of every face, and how many rows; 0 if its bounding
-    box holds no pixel centre.
+    """Returns the first row of pixel centres of every face, (f,), and the number of rows, (f,). The
+    number is 0 if no column of pixel centres lies in the face's bounding box.
     """
     x, y = (jnp.where(drawn[:, None], corners[:, i::3], 0.0) for i in range(2))
     drawn &= _first_pixel(x.min(-1), width) <= _last_pixel(x.max(-1), width)
@@ -200,8 +202,8 @@ def _rows(
 
 
 def _spans(corners: Array, row: Array, width: int) -> tuple[Array, Array]:
-    """Returns the first column, and the number, of the pixel centres of this row that may lie
-    inside the face.
+    """Returns the first column of the pixel centres in this row that may lie inside the face, and
+    their number.
     """
     y = row.astype(corners.dtype) + 0.5
     left, right = jnp.full_like(y, jnp.inf), jnp.full_like(y, -jnp.inf)
@@ -221,8 +223,8 @@ def _spans(corners: Array, row: Array, width: int) -> tuple[Array, Array]:
 
 
 def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Array]:
-    """Returns perspective-correct weights (three arrays), the depth, and whether the face covers
-    the points (x, y).
+    """Returns the perspective-correct weights of the corners (three arrays), the depth, and whether
+    the face covers the point (x, y).
     """
     # edge functions from the points' view, with the two ends of an edge in a fixed order
     corner_x = [corners[..., 3 * i] for i in range(3)]
@@ -252,7 +254,7 @@ def _weigh(corners: Array, x: Array, y: Array) -> tuple[list[Array], Array, Arra
 def _weights_by_pixel(corners: Array, face_ids: Array, width: int, pixels_per_step: int) -> Array:
     """Returns the weights of the corners of each pixel's face, (h w, 3).
 
-    In steps: small buffers are several times faster on CPU.
+    The pixels are computed in steps, because small buffers are several times faster on CPU.
     """
 
     def weights(pixel_and_face):
@@ -264,8 +266,8 @@ def _weights_by_pixel(corners: Array, face_ids: Array, width: int, pixels_per_st
 
 
 def _window(first: Array, end: Array, start: Array, size: int) -> tuple[Array, Array, Array]:
-    """Returns for the slots start .. start + size of items that own the slots first .. end the item
-    of each, its place in the item, and whether it is used.
+    """Returns the item, the place within the item, and whether it is used, for each of the slots
+    start .. start + size - 1, (size,) each. Item i owns the slots from first[i] up to end[i].
     """
     item = owners(first, size, start)
     slot = start + jnp.arange(size, dtype=jnp.int32)
@@ -281,8 +283,8 @@ def _z_buffer(
     height: int,
     config: RasterConfig,
 ) -> tuple[Array, Array]:
-    """Returns the depth and the face of every pixel (h w): infinity and NO_FACE where there is
-    none.
+    """Returns the depth and the face number of every pixel, (h w,) each: infinity and NO_FACE where
+    there is no face.
     """
 
     def draw_rows(state):
@@ -333,12 +335,12 @@ def _z_buffer(
 def sample_texture(
     texture: Float[Array, "th tw c"], uv: Float[Array, "h w 2"]
 ) -> Float[Array, "h w c"]:
-    """Looks up a texture bilinearly. Differentiable with respect to the texture and, inside a
-    texel, to uv.
+    """Returns the texture's bilinear values at texture coordinates, (h, w, c). It is differentiable
+    with respect to the texture and, inside a texel, to uv.
 
-    As in OBJ files: u to the right, v UP, (0, 0) the lower left corner of the texture and (1, 1)
-    its upper right one; row 0 is the top. Texel (row, column) is at u = (column + 0.5) / width, v =
-    1 - (row + 0.5) / height. Beyond the outermost centres the border texels continue (no
+    As in OBJ files, u points right and v UP: (0, 0) is the lower left corner of the texture, (1, 1)
+    its upper right one, and row 0 is the top. Texel (row, column) is at u = (column + 0.5) / width,
+    v = 1 - (row + 0.5) / height. Beyond the outermost centres the border texels continue (no
     repetition).
     """
     height, width = texture.shape[:2]
@@ -361,9 +363,9 @@ def sample_texture(
 # through a Gouraud shader with a point light.
 
 BACKGROUND = 1.0
-"""Each coordinate of the position beside the body, normalised units."""
+"""Each coordinate of the position of pixels beside the body, normalised units."""
 BACKGROUND_DEPTH = -1.0
-"""Depth beside the body."""
+"""Depth of pixels beside the body."""
 
 
 def plain_position_map(
@@ -373,7 +375,9 @@ def plain_position_map(
     camera: Camera,
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """Returns the position map and depth map of one view; everything in normalised units."""
+    """Returns the position map (h, w, 3) and the depth map (h, w) of one view. All lengths are in
+    normalised units.
+    """
     return _map(posed_vertices, canonical_vertices, faces, camera, config)
 
 
@@ -384,8 +388,8 @@ def gouraud_position_map(
     camera: Camera,
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """Returns the release's position map (lit by a point light) and depth map of one view;
-    everything in normalised units.
+    """Returns the position map (h, w, 3) of the released network, lit by a point light, and the
+    depth map (h, w) of one view. All lengths are in normalised units.
     """
     albedo = (canonical_vertices + 1) / 2
     colors = _light(albedo, posed_vertices, vertex_normals(posed_vertices, faces), camera.center)
@@ -394,8 +398,8 @@ def gouraud_position_map(
 
 @jax.jit
 def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> Float[Array, "n 3"]:
-    """Returns unit normals: the sum of (v1 - v0) x (v2 - v0) over the faces at a vertex, as wound;
-    0 where that vanishes.
+    """Returns unit normals, (n, 3): the direction of the sum of (v1 - v0) x (v2 - v0) over the
+    faces at a vertex. A normal is 0 where this sum is.
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = jnp.cross(b - a, c - a)
@@ -405,8 +409,8 @@ def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> F
 
 @jax.jit
 def _light(albedo: Array, points: Array, normals: Array, eye: Array) -> Array:
-    """Lights the vertices by Phong's model: ambient and diffuse times the albedo, and a white
-    highlight.
+    """Returns the colors of vertices lit by Phong's model: ambient and diffuse light times the
+    albedo, plus a white highlight.
     """
 
     def dot(a, b):
