@@ -35,8 +35,8 @@ EXACT = transform.EXACT
 
 
 def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
-    """Returns the indices (j,) of every joint's parent, then grandparent, then the fourth, eighth
-    ... ancestor; j where there is none.
+    """Returns arrays (j,) of the index of every joint's parent, then of its second, fourth, eighth
+    ... ancestor. The index is j where there is no such ancestor.
 
     Raises: ValueError unless all joints descend from one root (-1).
     """
@@ -61,15 +61,14 @@ def joint_transforms(
     rotations: Float[Array, "j 3"],
     translation: Float[Array, "3"],
 ) -> Float[Array, "j 4 4"]:
-    """Returns the G_j of every joint.
+    """Returns the rigid transforms G_j of every joint from rest to posed space, (j, 4, 4).
 
-    Arguments: rest_joints in metres; parents, root -1; rotations as axis-angle in radians, relative
-    to the parent; translation in metres, applied last. Returns: rigid transforms from rest to posed
-    space.
+    Arguments: rest_joints in metres; parents, -1 for the root; rotations as axis-angle in radians,
+    relative to the parent; translation in metres, applied last.
 
-    The chain is composed by doubling: after each round a transform reaches twice as many joints up.
-    Ten levels are four iterations, and the program compiles in a third of the time of one that goes
-    level by level.
+    The chain is composed by doubling: after each round a transform includes twice as many
+    ancestors. Ten levels take four rounds, and the program compiles in a third of the time of one
+    that goes level by level.
     """
     local = quaternion.matrix_from_axis_angle(rotations)
     iterations = ancestors(parents)
@@ -87,7 +86,7 @@ def joint_transforms(
 
 
 def _product(a: Float[Array, "*b i j"], b: Float[Array, "*b j k"]) -> Float[Array, "*b i k"]:
-    """Multiplies matrices by multiplying and adding: exact on every backend.
+    """Returns the product of matrices by multiplying and adding, which is exact on every backend.
 
     XLA's CPU compiler (jax 0.10 to 0.12) rejects the batched `dot` that two nested vmaps make of
     this product.
@@ -111,18 +110,19 @@ def blend_leg_weights(
     legs: Bool[Array, "2 j"],
     reach: float,
 ) -> Float[Array, "g j"]:
-    """Returns skinning weights of points off the skin between the legs, by the body around them and
-    not by one vertex.
+    """Returns skinning weights (g, j) of points off the skin. Points between the legs take the mean
+    weights of the body around them, instead of those of one vertex.
 
     A hem that belongs to the vertices of one leg tears when the legs part. A point at a distance d
-    from the vertex that it belongs to takes the mean of the weights of the vertices around it, by a
-    normal kernel whose standard deviation is d. It keeps its own where d is less than 3/4 of
-    `reach`, or where one of the legs has no share in that mean: hair and sleeves stay as they are.
-    At most a quarter of the points change, those with the largest d. LHM diffuses weights through a
-    grid of voxels to the same end (https://arxiv.org/abs/2503.10625).
+    from its vertex takes the mean of the weights of the vertices around it, by a normal kernel
+    whose standard deviation is d. The point keeps its weights if d is less than 3/4 of `reach`, or
+    if one of the legs has no share in that mean, so hair and sleeves stay as they are. At most a
+    quarter of the points change, those with the largest d. LHM diffuses weights through a grid of
+    voxels to the same end (https://arxiv.org/abs/2503.10625).
 
-    Arguments: points in the rest pose, metres. distances: from the vertex of each. weights: of that
-    vertex. legs: the joints of each leg.
+    Arguments: points: in the rest pose, metres. distances: of each point from its vertex, metres.
+    weights: of the vertex of each point. legs: whether each joint belongs to each leg, (2, j).
+    reach: metres.
     """
     # every eighth vertex is enough to average skinning weights over centimetres
     near, near_weights = vertices[::8], vertex_weights[::8]
@@ -149,20 +149,24 @@ def blend_leg_weights(
 
 @pytree_dataclass
 class SurfacePoints:
-    """p points of a body with j joints; concatenations of them are points, too."""
+    """p points of a body with j joints. They can be posed without the rest of the body, and joined
+    with others.
+    """
 
     rest: Float[Array, "p 3"]
     """The points of the mean shape in T-pose, (p, 3), metres."""
     directions: Float[Array, "p 3 s"]
-    """Their change per unit of a shape coefficient, (p, 3, s), metres."""
+    """Change of the points per unit of a shape coefficient, (p, 3, s), metres."""
     corrections: Float[Array, "p 3 q"] | None
-    """Their change by the pose's features, (p, 3, q), see `pose_features`, or None."""
+    """Change of the points per unit of the pose's features, (p, 3, q), see `pose_features`, or
+    None.
+    """
     weights: Float[Array, "p j"]
     """Skinning weights, (p, j)."""
 
 
 def surface_points(body: "BodyModel") -> SurfacePoints:
-    """Returns all vertices as points."""
+    """Returns all vertices of a body as points."""
     return SurfacePoints(
         body.template, body.shape_directions, body.pose_directions, body.skinning_weights
     )
@@ -171,7 +175,9 @@ def surface_points(body: "BodyModel") -> SurfacePoints:
 def shaped(
     mean: Float[Array, "p 3"], directions: Float[Array, "p 3 s"], betas: Float[Array, " s_used"]
 ) -> Float[Array, "p 3"]:
-    """Returns the points or joints of a person in T-pose, metres; missing coefficients are 0."""
+    """Returns the points or joints of a person in T-pose, (p, 3), metres. Missing coefficients
+    count as 0.
+    """
     return mean + jnp.einsum("pas,s->pa", directions[..., : betas.shape[0]], betas, precision=EXACT)
 
 
@@ -181,8 +187,10 @@ def pose_points(
     features: Float[Array, " q"] | None,
     transforms: Float[Array, "j 4 4"],
 ) -> Float[Array, "p 3"]:
-    """Returns where the points of a person are, metres. features: of the pose; ignored by bodies
-    without correctives.
+    """Returns the points of a person in a pose, (p, 3), metres.
+
+    features: `pose_features` of the pose, ignored by points without `corrections`. transforms: of
+    the joints, from rest to posed space.
     """
     rest = shaped(points.rest, points.directions, betas)
     if points.corrections is not None:
@@ -196,7 +204,7 @@ def pose_points(
 
 @pytree_dataclass
 class Texels:
-    """Which point of the body's surface each texel of a map shows; row 0 on top."""
+    """The point of the body's surface that each texel of a map shows. Row 0 is the top."""
 
     corners: Int[Array, "h w 3"]
     """Vertices of the texel's face, (h, w, 3)."""
@@ -205,11 +213,13 @@ class Texels:
 
     @property
     def covered(self) -> Bool[Array, "h w"]:
-        """Which texels show the surface."""
+        """Whether each texel shows the surface, (h, w)."""
         return jnp.any(self.weights > 0, axis=-1)
 
     def interpolate(self, values: Float[Array, "n c"]) -> Float[Array, "h w c"]:
-        """Interpolates values at vertices for each texel; 0 where a texel shows nothing."""
+        """Returns values at vertices (n, c) interpolated for each texel, (h, w, c); 0 where a texel
+        shows nothing.
+        """
         a, b, c = (self.weights[..., i : i + 1] * values[self.corners[..., i]] for i in range(3))
         return a + b + c
 
@@ -221,10 +231,10 @@ class BodyModel:
     template: Float[Array, "n 3"]
     """Vertices of the mean T-pose, metres."""
     shape_directions: Float[Array, "n 3 s"]
-    """How vertices move per unit of a shape coefficient, metres."""
+    """Change of the vertices per unit of a shape coefficient, (n, 3, s), metres."""
     pose_directions: Float[Array, "n 3 q"] | None
-    """How vertices move with the pose, metres per unit of its features: the q = 9 (j - 1) entries
-    of R_j - I, row-major, joints 1 and up.
+    """Change of the vertices per unit of the pose's features, (n, 3, q), metres, or None. The q = 9
+    (j - 1) features are the entries of R_j - I, row-major, of joints 1 and up.
     """
     joint_regressor: Float[Array, "j n"]
     """Weights of the rest vertices in each joint; rows sum to 1."""
@@ -239,14 +249,15 @@ class BodyModel:
     collapse_order: Int[Array, " n"] | None = None
     """Order in which vertices vanish in progressive decimation, (n,): `body.resolution`."""
     collapse_into: Int[Array, " n"] | None = None
-    """Vertex that each of them is merged with, (n,)."""
+    """Vertex that each vertex is merged with, (n,), or None."""
     relative_vertex_spacing: Float[Array, " n"] | None = None
-    """Distance to neighboring vertices relative to the mesh that was subdivided: `body.resolution`.
+    """Distance to neighbouring vertices relative to the mesh before subdivision, (n,), see
+    `body.resolution`. None: the mesh was not subdivided.
     """
     texels: Texels | None = None
     """A map of the surface, for networks that work on one: `network.parts`."""
     expressions: Expressions | None = None
-    """The expressions of its face; None: the face is rigid."""
+    """Expressions of the body's face. None: the face is rigid."""
     parents: tuple[int, ...] = static_field(default=())
     """Parent of each joint, -1 for the root."""
     joint_names: tuple[str, ...] = static_field(default=())
@@ -256,7 +267,9 @@ class BodyModel:
     name: str = static_field(default="body")
     """Name of the body in messages."""
     remesh_key: tuple | None = static_field(default=None)
-    """The sizes that `data.views.gaussian_body` has made it for; None: a body as it was read."""
+    """Sizes for which `data.views.gaussian_body` has made this body. None: a body as it was
+    read.
+    """
 
 
 @pytree_dataclass
@@ -268,14 +281,14 @@ class BodyPose(Batchable):
     translation: Float[Array, "3"]
     """Translation, metres, applied last."""
     expression: Float[Array, " e"] | None = None
-    """A coefficient for each of the body's expressions, mostly in [0, 1]; None: a face at rest,
-    without any work for it.
+    """A coefficient for each of the body's expressions, (e,), mostly in [0, 1]. None: a face at
+    rest, which costs no computation.
     """
 
 
 @pytree_dataclass
 class RestBody(Batchable):
-    """A shaped body in T-pose (theta = 0)."""
+    """A body with a person's shape, in T-pose (theta = 0)."""
 
     vertices: Float[Array, "n 3"]
     """Vertices, (n, 3), metres."""
@@ -285,7 +298,7 @@ class RestBody(Batchable):
 
 @pytree_dataclass
 class PosedBody(Batchable):
-    """A posed body."""
+    """A body in a pose."""
 
     vertices: Float[Array, "n 3"]
     """Vertices, (n, 3), metres."""
@@ -304,9 +317,9 @@ def rest_pose(body: BodyModel) -> BodyPose:
 
 @checked_arguments
 def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
-    """Returns a person in T-pose.
+    """Returns the body of a person in T-pose.
 
-    Arguments: betas, coefficients of the first directions; missing ones are 0.
+    Arguments: betas: coefficients of the first shape directions; missing ones count as 0.
     Raises: ValueError if there are more coefficients than directions.
     """
     used, available = betas.shape[0], body.shape_directions.shape[-1]
@@ -329,8 +342,8 @@ def _shaped_body(
 
 
 def without_expression(body: BodyModel) -> BodyModel:
-    """Returns the body without the directions of facial expressions, which come last in SMPL-X
-    models: those are no shape of a person.
+    """Returns the body without the shape directions of facial expressions, which are no part of a
+    person's shape. They come last in SMPL-X models.
     """
     count = sum(not name.startswith("expression_") for name in body.shape_names)
     if not body.shape_names or count == len(body.shape_names):
@@ -345,12 +358,10 @@ def without_expression(body: BodyModel) -> BodyModel:
 def expressed(
     expressions: Expressions | None, rest: RestBody, pose: BodyPose
 ) -> tuple[RestBody, BodyPose]:
-    """Applies a pose's expression to the rest body.
+    """Returns the rest body with a pose's expression applied, and the pose without the expression.
+    Joints that the expression turns are turned in the returned pose.
 
-    Returns the changed body, and the pose without the expression, but with the joints turned that
-    the expression turns.
-
-    Raises: ValueError if the pose has other expressions than the body.
+    Raises: ValueError if the number of coefficients is not that of the body's expressions.
     """
     if pose.expression is None:
         return rest, pose
@@ -376,7 +387,9 @@ def expressed(
 
 
 def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
-    """Returns R_j - I of joints 1 and up, row-major: what the pose correctives are linear in."""
+    """Returns R_j - I of joints 1 and up, row-major, (q,). Pose correctives are linear in these
+    features.
+    """
     matrices = quaternion.matrix_from_axis_angle(rotations[1:])
     return (matrices - jnp.eye(3, dtype=matrices.dtype)).reshape(-1)
 
@@ -384,13 +397,15 @@ def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
 def person_vertices(
     body: BodyModel, betas: Float[Array, " s_used"], pose: BodyPose
 ) -> Float[Array, "n 3"]:
-    """Returns the vertices of a person in a pose, metres."""
+    """Returns the vertices of a person in a pose, (n, 3), metres."""
     return pose_body(body, shape_body(body, betas), pose).vertices
 
 
 @checked_arguments
 def pose_body(body: BodyModel, rest: RestBody, pose: BodyPose) -> PosedBody:
-    """Pose a shaped body: expression, correctives, blend skinning, translation."""
+    """Returns a shaped body in a pose. Expression, pose correctives, blend skinning and translation
+    are applied in this order.
+    """
     rest, pose = expressed(body.expressions, rest, pose)
     vertices = rest.vertices
     if body.pose_directions is not None:

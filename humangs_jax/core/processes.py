@@ -1,9 +1,9 @@
-"""What concerns whole processes: the memory they keep, Ctrl-C at times when it would do harm,
-workers, compiled programs on disk.
+"""Functions that concern whole processes: the memory they keep, Ctrl-C at times when it would do
+harm, worker processes, and compiled programs on disk.
 
 XLA's CPU backend allocates the temporaries of a program as one block in each call and frees it
 afterwards. glibc gives blocks above 32 MiB back to the system, and the next call waits for each of
-its pages to be mapped anew: `keep_freed_memory` prevents it.
+its pages to be mapped anew. `keep_freed_memory` prevents this.
 """
 
 import contextlib
@@ -25,11 +25,11 @@ from typing import Any, TypeVar
 
 
 def keep_freed_memory() -> bool:
-    """Lets the process keep what it frees. Programs call it once, before the first large array; the
-    library never does.
+    """Makes the process keep the memory that it frees. Returns whether the C library has this
+    setting (glibc).
 
-    Returns whether this C library has the setting (glibc). The process then never gets smaller than
-    its peak.
+    Programs call it once, before the first large array; the library never does. The process then
+    never gets smaller than its peak.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -43,11 +43,11 @@ def keep_freed_memory() -> bool:
 
 @contextlib.contextmanager
 def peak_memory() -> Generator[list[float | None]]:
-    """Measures what the work inside adds to the memory of the process at its peak, MiB, in a list
-    of one number.
+    """Yields a list of one number. After the block, the number is the memory in MiB that the block
+    added to the process at its peak.
 
-    None where the system does not tell: it is read from Linux's /proc, with glibc. Memory of a GPU
-    or TPU is not in it.
+    The number is None on systems other than Linux with glibc, because it is read from /proc. It
+    does not include the memory of a GPU or TPU.
     """
     result: list[float | None] = [None]
     trim = None
@@ -69,9 +69,10 @@ def peak_memory() -> Generator[list[float | None]]:
 
 
 def memory_status(name: str) -> float:
-    """Reads a line of /proc/self/status, MiB: "VmRSS", resident now; "VmHWM", at the peak.
+    """Returns a number of /proc/self/status in MiB: "VmRSS" is the resident memory now, "VmHWM"
+    that at the peak.
 
-    Linux alone.
+    This works on Linux only.
     """
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{name}:"))
@@ -79,7 +80,7 @@ def memory_status(name: str) -> float:
 
 @contextlib.contextmanager
 def undisturbed() -> Generator[None]:
-    """Makes Ctrl-C wait until the block is over: for what is short and must not be left
+    """Makes Ctrl-C wait until the end of the block. Use it for short work that must not be left
     half-done.
     """
     if threading.current_thread() is not threading.main_thread():  # only that one gets it
@@ -98,10 +99,10 @@ def undisturbed() -> Generator[None]:
 @contextlib.contextmanager
 def started_deaf() -> Generator[None]:
     """Keeps Ctrl-C, which reaches all processes of a terminal, from processes that are started in
-    the block: this one decides.
+    the block. The starting process decides when they end.
 
-    Otherwise it would end, with tracebacks, processes that are still importing. On Windows, which
-    has no masks of signals, it does.
+    Otherwise Ctrl-C would end processes that are still importing, with tracebacks. On Windows,
+    which has no masks of signals, this still happens.
     """
     with undisturbed():
         if not hasattr(signal, "pthread_sigmask"):
@@ -125,11 +126,12 @@ def in_processes(
     prepare: Callable[..., object],
     *given: Any,
 ) -> Iterator[tuple[K, T]]:
-    """Yields (name, work(*arguments)) of tasks by name, as they end, from several processes of one
-    thread each, on the CPU.
+    """Yields (name, work(*arguments)) for each named task, in the order in which the tasks end.
+    Several processes of one thread each run them, on the CPU.
 
-    Arguments: prepare: called as prepare(*given) when a process starts. All of it is pickled. If
-    the caller stops, by Ctrl-C or otherwise, unfinished tasks are dropped and the processes end.
+    Arguments: tasks: the arguments of `work` by name. workers: largest number of processes.
+    prepare: called as prepare(*given) when a process starts. All of these are pickled. If the
+    caller stops, by Ctrl-C or otherwise, unfinished tasks are dropped and the processes end.
     Raises: OSError if a process is killed.
     """
     import concurrent.futures.process
@@ -154,7 +156,7 @@ def in_processes(
 
 
 def _begin(prepare: Callable[..., object], given: tuple[Any, ...]) -> None:
-    """Prepares a working process, which gets one thread: the processes are the parallelism."""
+    """Prepares a worker process. It gets one thread, because the processes are the parallelism."""
     import signal
 
     import jax
@@ -169,11 +171,11 @@ def _begin(prepare: Callable[..., object], given: tuple[Any, ...]) -> None:
 
 
 def end_with_parent() -> None:
-    """Called in a worker: it ends as soon as the process that started it has ended, however that
-    ended.
+    """Makes a worker process end as soon as the process that started it has ended, for any reason.
+    Call it in the worker.
 
-    The workers of a pool whose process is killed would otherwise wait for work for ever: their
-    queue stays open in each other.
+    If the process of a pool is killed, its workers would otherwise wait for work for ever, because
+    their queue stays open in each other.
     """
     parent = multiprocessing.parent_process()
     if parent is None:
@@ -192,18 +194,18 @@ def end_with_parent() -> None:
 VARIABLE = "HUMANGS_COMPILE_CACHE"
 """Environment variable that names the folder of compiled programs."""
 OF_JAX = "JAX_COMPILATION_CACHE_DIR"
-"""JAX's environment variable for the same."""
+"""JAX's environment variable for the folder of compiled programs."""
 LARGEST = 2 << 30
-"""Bytes; the files that were not used for longest are deleted beyond.
-
-JAX's own limit needs the package `filelock`.
+"""Largest size of the cache, bytes. Beyond it, the files that were not used for longest are
+deleted. JAX's own limit needs the package `filelock`.
 """
 
 
 QUICKEST_OF_JAX = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 QUICKEST = 0.1
-"""Seconds of compilation from which a program is kept on disk. With JAX's own second most programs
-of a command are compiled again each time."""
+"""Shortest compilation after which a program is kept on disk, seconds. With JAX's default of a
+second, most programs of a command are compiled again each time.
+"""
 
 
 def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
@@ -258,9 +260,9 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
 
 
 def user_cache() -> Path:
-    """Returns the user's cache folder, as the platform has it.
+    """Returns the user's cache folder on this platform.
 
-    Raises: RuntimeError without a home.
+    Raises: RuntimeError if there is no home.
     """
     folder = os.environ.get("XDG_CACHE_HOME")
     if folder:
@@ -274,8 +276,8 @@ def user_cache() -> Path:
 
 
 def _processor() -> str:
-    """Returns a short mark of the processor and its instructions: machines of a cluster share a
-    home, but not their programs.
+    """Returns a short hash of the processor and its instructions. Machines of a cluster share a
+    home, but not their compiled programs.
     """
     about = platform.machine() + platform.processor()
     with contextlib.suppress(OSError):
@@ -285,8 +287,8 @@ def _processor() -> str:
 
 
 def _delete_oldest(root: Path, largest: int) -> None:
-    """Deletes the cached programs under `root`, of all versions, that were not used for longest,
-    beyond `largest` bytes.
+    """Deletes cached programs under `root` until at most `largest` bytes are left. Programs that
+    were not used for longest go first, whatever their version of JAX.
     """
     files = []
     for file in root.glob("jax-*/*-cache"):
@@ -306,19 +308,20 @@ CPU_COMPILER_OPTIONS = {
         "cpu-parallel-task-assigner,cse_barrier_expander,small-while-loop-hoisting"
     ),
 }
-"""`jax.jit(..., compiler_options=compiler_options())` of a program that draws on a CPU: wide
-vectors make the loops over pixels up to a third faster where there is AVX-512; XLA no longer
-divides its small kernels, tens of microseconds each, among several threads, which took twice the
-CPU time and gained nothing; and it keeps barriers, so that tables are stored before they are
-gathered from (the loops of tiny images must then not become single kernels, which know no
-barriers). Eager calls use it; your own jitted functions need it themselves. Works from jax 0.10 to
-0.12."""
+"""Compiler options of `jax.jit` for a program that draws on a CPU. They work from jax 0.10 to 0.12.
+
+Wide vectors make the loops over pixels up to a third faster where there is AVX-512. XLA no longer
+divides its small kernels, of tens of microseconds each, among several threads; this took twice the
+CPU time and gained nothing. Barriers are kept, so that tables are stored before they are gathered
+from. The loops of tiny images must then not become single kernels, which know no barriers. Eager
+calls use these options; pass `compiler_options()` to your own jitted functions.
+"""
 
 
 def compiler_options() -> dict[str, Any] | None:
-    """Returns options for `jax.jit` that make programs like these faster on CPUs.
+    """Returns options for `jax.jit` that make programs of this package faster on CPUs.
 
-    Call it late: asking for the backend starts it.
+    Call it late, because it asks for the backend and so starts it.
 
     Returns:
         `CPU_COMPILER_OPTIONS` if the default backend is the CPU, else None.
@@ -336,12 +339,12 @@ def compiler_options() -> dict[str, Any] | None:
 def compile_ahead(program: Any, *arguments: Any) -> threading.Thread:
     """Compiles a jitted function in a thread, beside other work, and returns the thread.
 
-    A call with such arguments waits until that is done, and compiles nothing itself. What cannot
-    be compiled fails where it is called.
+    A call with such arguments waits until the compilation is done, and compiles nothing itself. An
+    error of the compilation is ignored here, and raised where the function is called.
 
     Args:
-        program: what `jax.jit` returned.
-        *arguments: as of the call; arrays may be `jax.ShapeDtypeStruct`.
+        program: a function that `jax.jit` returned.
+        *arguments: arguments of the call; arrays may be `jax.ShapeDtypeStruct`.
     """
 
     def compile_it() -> None:
@@ -354,21 +357,24 @@ def compile_ahead(program: Any, *arguments: Any) -> threading.Thread:
 
 
 Call = tuple[Any, tuple[Any, ...]]
-"""What `jax.jit` returned, and the arguments of a call; arrays may be `jax.ShapeDtypeStruct`."""
+"""A function that `jax.jit` returned, and the arguments of a call; arrays may be
+`jax.ShapeDtypeStruct`.
+"""
 AT_ONCE = 2
-"""Programs that are compiled at once: each takes up to a gigabyte, and the work beside them has a
-core, too."""
+"""Number of programs that are compiled at once. Each takes up to a gigabyte, and the work beside
+them needs a core, too.
+"""
 
 
 class Ahead:
-    """Compiles in threads, beside other work, what that work will call: see `compile_ahead`.
+    """Compiles functions in threads, beside the work that will call them: see `compile_ahead`.
 
         with Ahead() as ahead:
             ahead.add(calls_of_fit(body, kind, views))
             ...
 
-    A program that is never called has cost time, nothing else. At the end of the block no further
-    ones are begun.
+    A program that is never called has cost time, nothing else. After the end of the block no
+    further compilation begins.
     """
 
     def __init__(self) -> None:
@@ -382,8 +388,9 @@ class Ahead:
         self._over.set()
 
     def add(self, calls: Iterable[Call]) -> None:
-        """Compiles these, one after the other. A fault in one of them ends that in silence: it is
-        an error where the program is called.
+        """Compiles the functions of these calls, in the order of the calls. If the iterable raises,
+        the rest is dropped in silence. If a compilation fails, the error appears where the function
+        is called.
         """
         # threads that do not keep the process alive: its end waits for no program
         threading.Thread(target=self._begin, args=(calls,), daemon=True).start()

@@ -1,8 +1,8 @@
-"""Frozen dataclasses that are JAX pytrees, and batches of them that can be indexed.
+"""Defines frozen dataclasses that are JAX pytrees, and batches of them that can be indexed.
 
-`jax.vmap`, `jax.lax.scan` and friends rebuild pytrees with leaves of other ranks, tracers or plain
-objects. A rebuild here never calls `__init__`, so shape checks of the constructor (jaxtyping) hold
-for what users build and never for what JAX builds.
+`jax.vmap`, `jax.lax.scan` and others rebuild pytrees with leaves of other ranks, tracers or plain
+objects. A rebuild here never calls `__init__`. So shape checks of the constructor (jaxtyping) apply
+to what users build, and never to what JAX builds.
 """
 
 import dataclasses
@@ -28,16 +28,15 @@ _PYTREES: set[type] = set()
 
 
 def static_field(**kwargs: Any) -> Any:
-    """Makes a dataclass field that belongs to the tree structure (hashable, compared by `==`), not
-    to its leaves.
+    """Returns a dataclass field that belongs to the tree structure and not to the leaves. Its
+    values must be hashable and are compared by `==`.
     """
     return dataclasses.field(metadata={"static": True}, **kwargs)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(static_field, dataclasses.field))
 def pytree_dataclass(cls: type[T]) -> type[T]:
-    """Makes a class a frozen, keyword-friendly dataclass that is registered as a pytree with named
-    leaves.
+    """Makes a class a frozen dataclass that is registered as a pytree with named leaves.
 
     With `Batchable` as a base class, batches of it can be indexed and iterated over.
     """
@@ -72,14 +71,15 @@ def pytree_dataclass(cls: type[T]) -> type[T]:
 
 
 _EXPORTABLE: dict[str, str] = {}
-"""Names of pytrees in files of `jax.export`, and the modules that they are from."""
+"""Name of each pytree in files of `jax.export` -> module that defines the pytree."""
 
 
 def _make_exportable(cls: type[Any]) -> None:
-    """Let `jax.export` serialize functions whose arguments or results are of this class.
+    """Registers the class, so that `jax.export` can serialize functions with arguments or results
+    of this class.
 
-    The name in its files is that of the package and the class, so that files outlive a module that
-    moves. Classes that are defined inside functions have no such name.
+    Its name in such files consists of the package and the class, so that files stay readable if a
+    module moves. Classes that are defined inside functions have no such name and are left out.
     """
     name = f"{cls.__module__.partition('.')[0]}.{cls.__qualname__}"
     if "<locals>" in name or cls.__module__ == "__main__":
@@ -100,16 +100,16 @@ def _make_exportable(cls: type[Any]) -> None:
 
 
 def _static_bytes(values: tuple[Any, ...]) -> bytes:
-    """Writes static fields as JSON.
+    """Returns static fields as JSON.
 
-    Raises: TypeError if a field holds anything but numbers, texts and tuples of them.
+    Raises: TypeError if a field holds anything but numbers, texts and tuples of these.
     """
     return json.dumps(values).encode()
 
 
 def _static_values(data: bytes | bytearray) -> tuple[Any, ...]:
-    """Reads what `_static_bytes` wrote. Lists become tuples again, because static fields can be
-    hashed.
+    """Returns the static fields that `_static_bytes` wrote. Lists become tuples again, because
+    static fields must be hashable.
     """
 
     def as_tuples(x):
@@ -121,12 +121,13 @@ def _static_values(data: bytes | bytearray) -> tuple[Any, ...]:
 
 
 SHORT = 80
-"""A value that is no array is not printed in full if it has more characters than this."""
+"""Largest number of characters at which a value that is no array is printed in full."""
 
 
 def short_repr(tree: Any) -> str:
-    """Shows a dataclass on one line, arrays by type and shape, as equinox prints them:
-    "Gaussians(means=f32[100,3], ...)". Fields that nobody has set are left out.
+    """Returns a dataclass as one line, with arrays by type and shape as equinox prints them:
+    "Gaussians(means=f32[100,3], ...)". Texts and None are left out where they are the field's
+    default.
     """
     values = {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
     usual = {field.name: field.default for field in dataclasses.fields(tree)}
@@ -160,10 +161,10 @@ def _shortened(value: Any) -> str:
 
 
 class Batchable:
-    """Base of the pytree dataclasses whose leaves may share leading batch axes: indexing, length,
-    iteration.
+    """Base class of pytree dataclasses whose leaves may share leading batch axes. It adds indexing,
+    length and iteration.
 
-    The annotations of the fields are unbatched, so the batch axes are those that a leaf has in
+    The annotations of the fields are unbatched. The batch axes are the axes that a leaf has in
     addition: a `Camera` whose `K` is (4, 3, 3) is a batch of 4 cameras.
     """
 
@@ -190,15 +191,15 @@ class Batchable:
         )
 
     def __bool__(self) -> bool:
-        """Is True, whatever the length: `if camera` asks whether there is one."""
+        """Returns True, whatever the length, so that `if camera` asks whether there is a camera."""
         return True
 
     def __getitem__(self: B, index: Any) -> B:
-        """Returns one example of a batch (integer), or some of them (slice, mask or array of
-        integers), along the first axis.
+        """Returns one example of a batch (for an integer), or a batch of some examples (for a
+        slice, a mask or an array of integers), along the first axis.
 
-        Raises: TypeError for one example; IndexError for an integer out of range. JAX clamps traced
-        integers and arrays.
+        Raises: TypeError if this is no batch; IndexError for an integer out of range. JAX clamps
+        traced integers and arrays instead.
         """
         size = len(self)
         if not isinstance(index, slice | Tracer) and getattr(index, "ndim", 0) == 0:
@@ -215,9 +216,7 @@ class Batchable:
 
 
 def types_and_marks(annotation: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """Returns the types that an annotation stands for, and the marks of what is `Annotated` in
-    it.
-    """
+    """Returns the types that an annotation stands for, and the marks of its `Annotated` parts."""
     if typing.get_origin(annotation) in (typing.Union, types.UnionType):
         options = [types_and_marks(each) for each in typing.get_args(annotation)]
         found = tuple(kind for kinds, _ in options for kind in kinds)
@@ -229,7 +228,7 @@ def types_and_marks(annotation: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
 
 
 def _annotated_rank(annotation: Any) -> int | None:
-    """Returns the number of axes in a jaxtyping annotation, or in that of an optional array; None
+    """Returns the number of axes in the jaxtyping annotation of an array or an optional array. None
     for any other annotation.
     """
     for option in types_and_marks(annotation)[0]:
@@ -240,8 +239,8 @@ def _annotated_rank(annotation: Any) -> int | None:
 
 
 def shape_fault(tree: Any) -> str | None:
-    """Says which field of a pytree dataclass does not fit its annotation: ".colors: expected shape
-    ...". Returns None if all fit, or if the tree is no pytree dataclass.
+    """Returns a text that says which field of a pytree dataclass does not fit its annotation:
+    ".colors: expected shape ...". Returns None if all fit, or if the tree is no pytree dataclass.
 
     The rules:
 
@@ -287,15 +286,15 @@ class _Field:
     axes: tuple[str | int, ...] | None
     """Names and sizes of the axes. None if the field is a pytree and not an array."""
     floating: bool
-    """It holds floating-point numbers."""
+    """Whether the array must hold floating-point numbers."""
     optional: bool
-    """It may be None."""
+    """Whether the field may be None."""
 
 
 def _array_fault(value: Any, field: _Field, batch_rank: int, sizes: dict[str, int]) -> str | None:
-    """Says what is wrong with one array; None if nothing is.
+    """Returns a text that says what is wrong with one array, or None.
 
-    sizes: the known sizes of axes, by name. Those of this array are added to it.
+    sizes: the known sizes of axes, by name. The sizes of this array's axes are added to it.
     """
     axes = field.axes
     assert axes is not None
@@ -334,7 +333,9 @@ def _shown_shape(axes: Sequence[str | int]) -> str:
 
 @functools.cache
 def _annotated_fields(cls: Any) -> dict[str, _Field]:
-    """Returns the fields that are not static. Arrays annotated with any shape are left out."""
+    """Returns the annotations of the fields that are not static, by name. Arrays annotated with any
+    shape are left out.
+    """
     found = {}
     for field in dataclasses.fields(cls):
         if field.metadata.get("static"):
@@ -352,7 +353,7 @@ def _annotated_fields(cls: Any) -> dict[str, _Field]:
 
 
 def annotated_axes(array: Any) -> tuple[str | int, ...] | None:
-    """Returns names and sizes of the axes in a jaxtyping annotation; None for arrays of any
+    """Returns the names and sizes of the axes in a jaxtyping annotation. None for arrays of any
     shape.
     """
     texts = str(array.dim_str).split()
@@ -369,8 +370,8 @@ def is_floating(array: Any) -> bool:
 
 
 def replace(tree: T, **changes: Any) -> T:
-    """Copies a pytree with some fields exchanged, without checks of shapes, so that it works on
-    batches, too.
+    """Returns a copy of a pytree with other values of some fields. Shapes are not checked, so this
+    also works on batches.
 
     Args:
         tree: an instance of a dataclass.
@@ -398,8 +399,8 @@ def replace(tree: T, **changes: Any) -> T:
 
 
 def inexact_leaves(tree: Any) -> Iterator[tuple[str, Any]]:
-    """Yields (path, leaf) of all floating-point arrays of a tree, as "cameras.K"; "" for a bare
-    array.
+    """Yields (path, leaf) of each floating-point array of a tree. A path looks like "cameras.K",
+    and is "" for a bare array.
     """
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         if hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jnp.inexact):

@@ -1,8 +1,7 @@
-"""Arrays of files: whether they are what they should be, their checksums, and npz archives, read
-without pickle.
+"""Checks arrays of files, computes their checksums, and reads npz archives without pickle.
 
-Raises: InvalidFileError, see `io.reading`; `ArrayFile` knows its file, and every fault is one line
-with file and key.
+Functions raise InvalidFileError, see `io.reading`. `ArrayFile` knows its file, so each of its
+errors is one line with file and key.
 """
 
 import hashlib
@@ -31,7 +30,9 @@ from humangs_jax.io.reading import (
 from humangs_jax.io.restricted_pickle import as_array, plain_array, read_pickle
 
 SHORT = 16
-"""Hexadecimal digits of a checksum that names a file or stands in a manifest: 64 bits."""
+"""Number of hexadecimal digits (64 bits) of a checksum that names a file or stands in a
+manifest.
+"""
 
 
 def numbers(
@@ -46,11 +47,12 @@ def numbers(
     dtype: type[np.floating] = np.float64,
     error: type[FileError] = FileError,
 ) -> np.ndarray:
-    """Makes an array of real numbers of a file, which are finite in float32.
+    """Returns a value of a file as an array of real numbers that are finite in float32.
 
     Arguments:
-        shape: None in it is any size, None for it any shape. some: there has to be one at least.
-        nulls: null is NaN, and numbers need not be finite. largest: in magnitude.
+        shape: expected sizes of the axes; None in it is any size, and None for it any shape. some:
+            whether there must be at least one number. nulls: whether null becomes NaN; numbers then
+            need not be finite. largest: largest magnitude that is allowed.
 
     Raises: `error` with file, field and what was expected.
     """
@@ -91,7 +93,7 @@ def numbers(
 
 
 Shape = tuple[int | str | None, ...]
-"""Sizes of axes; a name or None stands for any size."""
+"""Expected sizes of axes. A name or None stands for any size."""
 
 
 def _fits(array: np.ndarray, shape: Shape) -> bool:
@@ -102,7 +104,7 @@ def _fits(array: np.ndarray, shape: Shape) -> bool:
 
 
 def _in_words(shape: Shape) -> str:
-    """Shows a shape for an error line."""
+    """Returns a shape as text for an error line."""
     return str(tuple("any" if size is None else size for size in shape)).replace("'", "")
 
 
@@ -113,8 +115,10 @@ def check_array(
     low: float = -math.inf,
     high: float = math.inf,
 ) -> None:
-    """Checks that an array has real numbers in [low, high] that are finite in float32, and a shape
-    in which None and names are any size.
+    """Checks that an array has the shape, and real numbers in [low, high] that are finite in
+    float32. None and names in the shape stand for any size.
+
+    Raises: InvalidFileError.
     """
     if not _fits(array, shape):
         raise InvalidFileError(f"{name}: expected shape {_in_words(shape)}, got {array.shape}")
@@ -152,7 +156,10 @@ def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], b
 
 
 def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
-    """Checks that joints have names and make a tree with one root, whose parent is -1."""
+    """Checks that joints have names and form a tree with one root, whose parent is -1.
+
+    Raises: InvalidFileError.
+    """
     check_limit("joints", len(parents), "joints")
     count = len(parents)
     if (
@@ -174,7 +181,7 @@ def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
 
 
 def checksum(arrays: Mapping[str, Any], *texts: str) -> str:
-    """Returns the SHA-256, in hexadecimal, of named arrays with their types and shapes, and of
+    """Returns the SHA-256, in hexadecimal, of named arrays (with their types and shapes) and of
     texts.
     """
     digest = hashlib.sha256()
@@ -195,7 +202,11 @@ def file_checksum(file: Path) -> str:
 
 
 def check_checksum(recorded: Any, found: str) -> None:
-    """Checks that a file records this checksum. None: a file of a version that wrote none."""
+    """Checks that the recorded checksum is the one that was found. None, from versions that
+    recorded none, is accepted.
+
+    Raises: InvalidFileError.
+    """
     if recorded not in (None, found):
         raise InvalidFileError(
             f"damaged: its contents have the checksum {found[:12]}, recorded is"
@@ -204,9 +215,7 @@ def check_checksum(recorded: Any, found: str) -> None:
 
 
 class ArrayFile:
-    """Named arrays of a file. error: the class of what is raised for a value that is not what it
-    should be.
-    """
+    """The named arrays of a file. error: class of the error for a value that is not as expected."""
 
     def __init__(
         self,
@@ -224,10 +233,10 @@ class ArrayFile:
         error: type[FileError] = FileError,
         wanted: Callable[[str], bool] | None = None,
     ) -> "ArrayFile":
-        """Opens an npz archive, by suffix or content, or else a pickle (read without running
-        anything in it).
+        """Opens an npz archive, or else a pickle, without running anything in it. The suffix or the
+        content decides.
 
-        Arguments: wanted: which arrays of an archive to read; None: all.
+        Arguments: wanted: says by name which arrays of an archive to read; None: all.
         Raises: `error` if the file is damaged or larger than the limits allow; for a missing file
         see `reading`.
         """
@@ -242,7 +251,7 @@ class ArrayFile:
         return key in self.values
 
     def array(self, key: str) -> np.ndarray:
-        """Returns what is under a key, as an array of any kind. Raises: `error`."""
+        """Returns the value of a key as an array of any type. Raises: `error`."""
         if key not in self.values:
             found = ", ".join(sorted(map(str, self.values))) or "none"
             reason = "a pickled object, which is never read"
@@ -257,17 +266,23 @@ class ArrayFile:
     def numbers(
         self, key: str, shape: tuple[int | None, ...] | None, largest: float = np.inf
     ) -> Float[np.ndarray, "..."]:
-        """Returns finite float64 numbers under a key, at least one, see `numbers`."""
+        """Returns the value of a key as finite float64 numbers, at least one. Raises: as
+        `numbers`.
+        """
         return numbers(
             self.array(key), self.path, key, shape, some=True, largest=largest, error=self.error
         )
 
     def number(self, key: str) -> float:
-        """Returns a single number, however nested. Raises: as `numbers`."""
+        """Returns the value of a key, an array of any rank with a single number. Raises: as
+        `numbers`.
+        """
         return float(self.numbers(key, (1,) * self.array(key).ndim).reshape(-1)[0])
 
     def indices(self, key: str, bound: int) -> np.ndarray:
-        """Returns triangles (f, 3) of integers in [0, bound)."""
+        """Returns the value of a key as triangles (f, 3) of integers in [0, bound). Raises:
+        `error`.
+        """
         array = self.numbers(key, (None, 3)).astype(np.int64)
         if array.min() < 0 or array.max() >= bound:
             raise self.error(self.path, key, f"expected indices in [0, {bound})")
@@ -279,26 +294,27 @@ class ArrayFile:
 
 
 _ONE_AT_A_TIME = threading.Lock()
-"""numpy reads the header of an array through Python's syntax trees, and CPython 3.11 counts the
-depth of these for all threads together: two at once are rarely, but then "AST constructor recursion
-depth mismatch" (python/cpython#106905)."""
+"""Lock around reading the header of an array. numpy reads headers through Python's syntax trees,
+and CPython 3.11 counts the depth of these for all threads together. Two at once rarely fail with
+"AST constructor recursion depth mismatch" (python/cpython#106905).
+"""
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 LONGEST_HEADER = 512
-"""Characters; that of a plain array takes some hundred, and longer ones can exhaust Python's
-parser.
+"""Largest number of characters of a header. A plain array takes some hundred, and longer headers
+can exhaust Python's parser.
 """
 
 
 def read_npz(
     path: str | Path, wanted: Callable[[str], bool] | None = None
 ) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """Reads the arrays of an npz archive by name; also gives the names of the entries that are
-    pickled objects (never read).
+    """Returns the arrays of an npz archive by name, and the names of entries that are pickled
+    objects. These are never read.
 
-    Arguments: wanted: which names to read; None: all.
+    Arguments: wanted: says by name which entries to read; None: all.
     Raises: FileNotFoundError; FileError if the file is no npz archive, is damaged, or is larger
     than the limits allow.
     """
@@ -324,7 +340,7 @@ def read_npz(
 
 
 def read_npy(path: str | Path) -> np.ndarray | None:
-    """Reads the array of an npy file; None for a pickled object.
+    """Returns the array of an npy file, or None if it holds a pickled object.
 
     Raises: FileNotFoundError; FileError.
     """
@@ -333,9 +349,10 @@ def read_npy(path: str | Path) -> np.ndarray | None:
 
 
 def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
-    """Opens a zip archive whose members together stay within the limits.
+    """Opens a zip archive of `size` bytes, after checking that its members together stay within the
+    limits.
 
-    Raises: InvalidFileError; what zipfile raises for damaged archives.
+    Raises: InvalidFileError; anything that zipfile raises for damaged archives.
     """
     # the list of members is not read yet
     ending = zipfile._EndRecData(file)  # ty: ignore[missing-attribute]
@@ -358,8 +375,8 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
 
 
 def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Reads the shape, the order (columns first?) and the type of an npy array, whose bytes follow
-    in the file.
+    """Returns the shape of an npy array, whether columns come first, and its type. The array's
+    bytes follow in the file.
 
     Raises: InvalidFileError.
     """
@@ -371,9 +388,9 @@ def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def _read_array(member: Any, size: int) -> np.ndarray | None:
-    """Reads the array of a member of `size` bytes; None for pickled objects.
+    """Returns the array of an archive's member of `size` bytes, or None for pickled objects.
 
-    Nothing is made before its size is checked.
+    Memory is allocated only after the size is checked.
     """
     shape, columns_first, dtype = read_header(member)
     if dtype.hasobject:
@@ -400,8 +417,8 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
 def write_npz(
     path: str | os.PathLike[str], arrays: Mapping[str, Any], compressed: bool = True
 ) -> None:
-    """Write an npz archive of array-likes by name, under any suffix; it appears whole or not at
-    all. Raises: OSError.
+    """Writes array-likes by name into an npz archive, under any suffix. The file appears whole or
+    not at all. Raises: OSError.
     """
     save = np.savez_compressed if compressed else np.savez
     converted: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}

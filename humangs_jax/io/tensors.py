@@ -1,15 +1,15 @@
-"""Named tensors of a file: safetensors, or what `torch.save` writes, without torch and without
-running anything in it.
+"""Reads named tensors from safetensors files, and from files that `torch.save` writes, without
+torch and without running anything in them.
 
-The first bytes of a file decide; its name does not matter. For torch's format the unpickler
-(`restricted_pickle`) knows the calls which rebuild the tensors of a state dict and refuses every
-other name. What those calls return is immutable, so that no later instruction of the pickle can
-change it. A tensor comes out as a description: a view of a storage, whose numbers lie elsewhere in
-the file. Only the storages of wanted tensors are read.
+The first bytes of a file decide its format; its name does not matter. For torch's format the
+unpickler (`restricted_pickle`) knows the calls which rebuild the tensors of a state dict, and
+refuses every other name. These calls return immutable objects, so that no later instruction of the
+pickle can change them. A tensor is read as a description: a view of a storage, whose numbers lie
+elsewhere in the file. Only the storages of wanted tensors are read.
 
-The file is a zip archive of the pickle and one member per storage. Before torch 1.6 it was a
-stream of pickles and numbers, which is refused. Tensors in a plain pickle still have one such
-stream for each storage.
+The file is a zip archive of the pickle and one member per storage. Before torch 1.6 it was a stream
+of pickles and numbers, which is refused. Tensors in a plain pickle still have one such stream for
+each storage.
 """
 
 import functools
@@ -40,16 +40,20 @@ from humangs_jax.io.restricted_pickle import NAMES, Call, PlainDict, RestrictedU
 
 ZIP_START = b"PK\x03\x04"
 STREAM_START = b"\x8a\x0a" + 0x1950A86A20F9469CFC6C.to_bytes(10, "little") + b"."
-"""How a stream of torch begins, behind two bytes of the protocol: the pickle of a magic number."""
+"""First bytes of a stream of torch, behind two bytes of the protocol: the pickle of a magic
+number.
+"""
 OLD_STREAM = (
     "written before torch 1.6: torch.save(torch.load(FILE), FILE) of a newer torch writes it again"
 )
-"""What to do about a file that is such a stream."""
+"""Error about a file that is such a stream, and what to do about it."""
 LARGEST_RATIO = 16
-"""Members may unpack to this many times the size of the file: torch does not compress at all."""
+"""Largest size to which members may unpack, relative to the file. torch does not compress at
+all.
+"""
 LARGEST_SHARE = 4
-"""Tensors may take this many times the size of the file: bfloat16 is widened, and weights may be
-tied.
+"""Largest size of the tensors together, relative to the file. It is above 1 because bfloat16 is
+widened, and weights may be tied.
 """
 MOST_AXES = 32
 
@@ -83,22 +87,22 @@ class _Storage(NamedTuple):
     """A run of stored numbers."""
 
     kind: str
-    """Their type, a key of `STORAGE_DTYPES`."""
+    """Type of the numbers, a key of `STORAGE_DTYPES`."""
     name: str
     """The name of the storage in its file."""
     count: Any
-    """How many numbers it has, as the pickle says."""
+    """Number of numbers, as the pickle gives it."""
     read: Callable[[str], Any]
-    """Returns the bytes of a storage by its name."""
+    """Function that returns the bytes of a storage by its name."""
 
 
 class _Tensor(NamedTuple):
-    """A tensor that is not read yet: a view of a storage, offset and strides in elements."""
+    """A tensor that is not read yet: a view of a storage."""
 
     storage: _Storage
     """The storage that holds the numbers."""
     offset: int
-    """Place of the first number in the storage."""
+    """Index of the first number in the storage."""
     shape: tuple[int, ...]
     """Sizes of the axes."""
     strides: tuple[int, ...]
@@ -131,7 +135,7 @@ class _Tensor(NamedTuple):
 
 
 def _counts(x: Any) -> bool:
-    """Says whether this is a tuple of counts."""
+    """Says whether a value is a tuple of integers that are not negative."""
     return type(x) is tuple and all(type(n) is int and n >= 0 for n in x)
 
 
@@ -154,17 +158,21 @@ def _rebuild_parameter(tensor: Any, *_: Any) -> _Tensor:
 
 
 def _ordered_dict(*arguments: Any) -> PlainDict:
-    """Makes an empty dict, whose items follow."""
+    """Returns an empty dict. The pickle adds its items later. Raises: InvalidFileError for
+    arguments.
+    """
     if arguments:
         raise InvalidFileError("an ordered dict that is made of something")
     return PlainDict()
 
 
 def _storage_of_bytes(data: bytes) -> _Storage:
-    """Reads the storage of a tensor in a plain pickle, which is a separate stream.
+    """Returns the storage of a tensor in a plain pickle, which is a separate stream of bytes.
 
-    It is a magic number, pickles of a version, the machine, the storage and a list of its name, the
-    count of its numbers, and these.
+    The stream consists of a magic number, pickles (of a version, the machine, the storage and a
+    list of its name), the count of its numbers, and the numbers.
+
+    Raises: InvalidFileError.
     """
     if data[2:15] != STREAM_START:
         raise InvalidFileError("a storage that is not a stream of torch")
@@ -194,7 +202,9 @@ _NAMES: dict[tuple[str, str], Any] = {
 
 
 class _TorchUnpickler(RestrictedUnpickler):
-    """Knows tensors, ordered dicts and storages, whose bytes `read` returns by their name."""
+    """An unpickler that knows tensors, ordered dicts and storages. `read` returns the bytes of a
+    storage by its name.
+    """
 
     def __init__(
         self, file: Any, names: Mapping = _NAMES, read: Callable[[str], bytes] | None = None
@@ -207,7 +217,9 @@ class _TorchUnpickler(RestrictedUnpickler):
         self.read_storage = functools.cache(read or {}.__getitem__)
 
     def persistent_load(self, pid: Any) -> _Storage:
-        """Returns the storage that a pickle names."""
+        """Returns the storage that a pickle refers to. Raises: InvalidFileError for any other
+        object.
+        """
         known = type(pid) is tuple and len(pid) in (5, 6) and pid[0] == "storage"
         if not (known and isinstance(pid[1], _StorageType) and isinstance(pid[2], str)):
             raise InvalidFileError("refused to load a persistent object that is no storage")
@@ -224,7 +236,11 @@ class _TorchUnpickler(RestrictedUnpickler):
 
 
 def _of_archive(archive: zipfile.ZipFile, size: int, names: Mapping) -> Any:
-    """Reads the pickle in an archive; its tensors can be read as long as the archive is open."""
+    """Returns the content of the pickle in an archive. Its tensors can be read while the archive is
+    open.
+
+    Raises: InvalidFileError.
+    """
     if sum(member.file_size for member in archive.infolist()) > LARGEST_RATIO * size:
         raise InvalidFileError(
             f"its members unpack to more than {LARGEST_RATIO} times the size of the file"
@@ -245,18 +261,19 @@ def _of_archive(archive: zipfile.ZipFile, size: int, names: Mapping) -> Any:
 
 
 def everything(key: str) -> bool:
-    """Wants every tensor."""
+    """Returns True for any name: all tensors are wanted."""
     return True
 
 
 def read_torch_file(
     path: str | os.PathLike[str], wanted: Wanted = everything
 ) -> tuple[Tensors, int]:
-    """Reads the tensors of a state dict whose names are wanted, and counts the others.
+    """Returns the wanted tensors of a state dict by name, and the number of the others.
 
-    bfloat16 comes as float32, everything else as it is stored.
+    bfloat16 becomes float32; other types stay as stored.
     Raises: FileNotFoundError; FileError if the file is no checkpoint or a damaged one, if its
-    pickle asks for more than tensors, or if a storage is missing or too short, naming it.
+    pickle asks for more than tensors, or if a storage is missing or too short. The error names the
+    storage.
     """
     with reading(path, "torch file"), open_file(path) as file:
         # keys of training scripts; what lies under others (the optimizer's state) is never read
@@ -265,15 +282,18 @@ def read_torch_file(
 
 
 def tensors_in(data: bytes, keys: tuple[str, ...]) -> Tensors:
-    """Reads all tensors of a dict that lies under one of the keys, in the bytes of a file of
-    `torch.save`.
+    """Returns all tensors of the state dict in the bytes of a `torch.save` file. The state dict
+    lies under one of `keys`, or is the whole content.
+
     Raises: InvalidFileError.
     """
     return _tensors_of(io.BytesIO(data), len(data), everything, keys)[0]
 
 
 def _tensors_of(file: Any, size: int, wanted: Wanted, keys: tuple[str, ...]) -> tuple[Tensors, int]:
-    """Reads the wanted tensors of an open file, and counts the others. Raises: InvalidFileError."""
+    """Returns the wanted tensors of an open file, and the number of the others. Raises:
+    InvalidFileError.
+    """
     start = file.read(15)
     file.seek(0)
     if start[2:] == STREAM_START:
@@ -287,10 +307,11 @@ def _tensors_of(file: Any, size: int, wanted: Wanted, keys: tuple[str, ...]) -> 
 def _state_dict(
     content: Any, size: int, wanted: Wanted, keys: tuple[str, ...]
 ) -> tuple[Tensors, int]:
-    """Reads the wanted tensors of the state dict in what was unpickled, and counts the others.
+    """Returns the wanted tensors of the state dict in unpickled content, and the number of the
+    others.
 
-    The state dict is what lies under one of the keys, or else the content itself. What tensors take
-    together is bounded by the size of the file. Raises: InvalidFileError.
+    The state dict lies under one of the keys, or is the content itself. The size of the file bounds
+    the size of the tensors together. Raises: InvalidFileError.
     """
     # the dict with the tensors
     model, label = content, None
@@ -332,9 +353,10 @@ def _state_dict(
 
 
 def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> tuple[Tensors, int]:
-    """Reads the tensors whose names are wanted, and counts the others. Nothing in the file is run.
+    """Returns the wanted tensors of a file by name, and the number of the others. Nothing in the
+    file is run.
 
-    Raises: FileNotFoundError; FileError if it is none of these formats, is damaged, or asks for
+    Raises: FileNotFoundError; FileError if the file has neither format, is damaged, or asks for
     more than tensors.
     """
     if is_safetensors(path):
@@ -344,7 +366,7 @@ def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> t
 
 def is_safetensors(path: str | os.PathLike[str]) -> bool:
     """Says whether a file begins as safetensors files do: with the length of a JSON object, and its
-    brace.
+    opening brace.
     """
     with reading(path, "file of tensors"), open_file(path) as file:
         start = file.read(9)
@@ -354,8 +376,7 @@ def is_safetensors(path: str | os.PathLike[str]) -> bool:
 def read_safetensors(
     path: str | os.PathLike[str], wanted: Wanted = everything
 ) -> tuple[Tensors, int, dict[str, str]]:
-    """Reads the tensors whose names are wanted, counts the others, and returns the strings in the
-    header.
+    """Returns the wanted tensors by name, the number of the others, and the strings in the header.
 
     Raises: FileNotFoundError; FileError.
     """
@@ -373,8 +394,8 @@ def read_safetensors(
 
 
 def read_values(path: str | os.PathLike[str]) -> Any:
-    """Reads what a pickle, a file of joblib or `torch.save`, or an npy of an object holds: dicts,
-    lists and what `as_array` takes.
+    """Returns the content of a pickle, of a file of joblib or `torch.save`, or of an npy of an
+    object. It consists of dicts, lists and values that `as_array` takes.
 
     Nothing in the file is run. Raises: FileNotFoundError; FileError as `read_pickle`.
     """

@@ -1,5 +1,5 @@
-"""The terms of the training loss, unreduced, and their weights; metrics of an image against a
-photo, both (h, w, 3) in [0, 1].
+"""The terms of the training loss and their weights, and metrics of an image against a photo, both
+(h, w, 3) in [0, 1].
 """
 
 import dataclasses
@@ -26,16 +26,17 @@ from humangs_jax.network.parts import Drawn
 
 T = TypeVar("T")
 FAR_SURFACE = 0.1
-"""Largest distance between surfaces that counts, metres."""
+"""Distance between surfaces beyond which the depth loss does not grow, metres."""
 
 
 @configuration
 class LossConfig:
-    """Weights of the terms, each a mean over pixels or vertices and over the targets.
+    """Weights of the terms of the loss. Each term is a mean over pixels or vertices, and over the
+    targets.
 
-    Squared errors make semi-transparent foreground where the network is in doubt; the terms after
-    `lpips` are against it. They and the perceptual ones, which need networks that the user has
-    (`losses.loss_networks`), are computed only where their weight is not 0.
+    Squared errors make a semi-transparent foreground where the network is in doubt. The terms after
+    `lpips` work against it. These terms, and the perceptual terms, are computed only where their
+    weight is not 0. Perceptual terms need networks that the user has (`losses.loss_networks`).
     """
 
     squared: Weight = 1.0
@@ -43,28 +44,29 @@ class LossConfig:
     structural: Weight = 0.2
     """Structural dissimilarity at `structural_scales` sizes."""
     structural_scales: Annotated[int, Range(1, 16)] = 3
-    """Number of sizes, each half the one before."""
+    """Number of sizes, each half of the one before."""
     silhouette: Weight = 0.1
-    """Squared error of the coverage."""
+    """Squared error of the coverage (alpha against mask)."""
     tightness: Weight = 0.1
-    """Squared tight offsets, normalised units."""
+    """Squared offsets of tight Gaussians from their vertex, normalised units."""
     perceptual: Weight = 0.0
     """Difference of the features of VGG-19."""
     vgg16: Weight = 0.0
     """Difference of the features of VGG-16, with the backbone of LPIPS "vgg"."""
     lpips: Weight = 0.0
-    """Learned distance of features."""
+    """LPIPS distance."""
     absolute: Weight = 0.0
-    """Absolute error of colors."""
+    """Absolute error of the colors."""
     boundary: Weight = 0.0
-    """Absolute error of coverage."""
+    """Absolute error of the coverage."""
     depth: Weight = 0.0
-    """Distance between the surfaces seen, metres; 0 for people on disk, whose depths are unknown.
+    """Distance between the drawn and the true surface, metres. It is 0 for people on disk, whose
+    depths are unknown.
     """
     distortion: Weight = 0.0
     """Spread of the weights along the rays."""
     opaque: Weight = 0.0
-    """4 o (1 - o) of the opacities o."""
+    """4 o (1 - o) of the opacities o, which is largest for half-transparent Gaussians."""
     random_background: Share = 0.5
     """Share of the targets that are seen against one random color instead of white, so that white
     Gaussians differ from missing ones."""
@@ -78,8 +80,8 @@ def loss_terms(
     config: LossConfig,
     networks: LossNetworks,
 ) -> dict[str, Scalar]:
-    """Returns the unweighted terms by the name of their weight, for renderings on the backgrounds
-    of `images`.
+    """Returns the unweighted terms of the loss by the name of their weight. The renderings must be
+    drawn on the backgrounds of `images`.
 
     depths: true z of the person, metres, see `surface_distance`. Raises: ValueError if a term has a
     weight but what it needs is missing.
@@ -128,7 +130,7 @@ def loss_terms(
 
 
 def _needed(thing: T | None, name: str, title: str) -> T:
-    """Returns what a term needs. Raises: ValueError if it is missing."""
+    """Returns `thing`, which a term needs. Raises: ValueError if it is None."""
     if thing is None:
         raise ValueError(f"loss.{name} is not 0, but there is no {title}")
     return thing
@@ -137,8 +139,8 @@ def _needed(thing: T | None, name: str, title: str) -> T:
 def _each(
     compare: Callable[..., Scalar], network: T, predicted: Array, targets: Array
 ) -> Float[Array, " v"]:
-    """Compares one view after the other: the features of all at once would be the largest arrays
-    of a step.
+    """Returns the loss of each view, (v,). Views are compared one after the other, because the
+    features of all at once would be the largest arrays of a step.
     """
     return jax.lax.map(jax.checkpoint(lambda pair: compare(network, *pair)), (predicted, targets))
 
@@ -146,11 +148,11 @@ def _each(
 def _each_lpips(
     network: Lpips, predicted: Float[Array, "v h w 3"], targets: Float[Array, "v h w 3"]
 ) -> Float[Array, " v"]:
-    """Returns the LPIPS of each view; the features of the truth are computed once, gradients or
-    not.
+    """Returns the LPIPS distance of each view, (v,). The features of the target are computed only
+    once.
 
-    The maps of VGG would be the largest arrays of a step: those of its images are computed again
-    for gradients, one view after the other.
+    VGG's feature maps would be the largest arrays of a step. So the views are compared one after
+    the other, and the features of the predicted image are computed again for gradients.
     """
 
     def one(pair: tuple[Array, Array]) -> Scalar:
@@ -165,9 +167,7 @@ def _each_lpips(
 
 
 def squared_error(predicted: Float[Array, "*b"], target: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """Returns the squared difference, elementwise, of images in [0, 1], or of coverages and
-    masks.
-    """
+    """Returns the elementwise squared difference of images in [0, 1], or of coverages and masks."""
     return jnp.square(predicted - target)
 
 
@@ -177,11 +177,11 @@ def surface_distance(
     target_depth: Float[Array, "*b"],
     mask: Float[Array, "*b"],
 ) -> Float[Array, "*b"]:
-    """Returns the distance between the surface drawn and the true one, in the unit of the depths,
-    where both are the person's.
+    """Returns the distance between the drawn and the true surface, in the unit of the depths,
+    weighted by alpha and mask.
 
-    0 where the true one is unknown (0). At most `FAR_SURFACE`: across a silhouette the nearest
-    surfaces are different limbs.
+    It is 0 where the true depth is unknown (0). It is at most `FAR_SURFACE`, because across a
+    silhouette the nearest surfaces are different limbs.
     """
     known = target_depth > 0
     return alpha * mask * known * jnp.minimum(jnp.abs(depth - target_depth), FAR_SURFACE)
@@ -193,11 +193,11 @@ def translucency(opacities: Float[Array, " g"]) -> Float[Array, " g"]:
 
 
 def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:
-    """Returns the distance of the tight Gaussians from their vertex: squared norm of the offset,
-    averaged over the k of a vertex.
+    """Returns the squared distance of the tight Gaussians from their vertex, averaged over the k
+    Gaussians of each vertex, (n,).
 
     Offsets are in normalised units (body height 1.8), so the weight of this term does not depend on
-    the subject's size. Without tight Gaussians (k = 0) it is 0.
+    the subject's size. Without tight Gaussians (k = 0) the distance is 0.
     """
     return jnp.sum(jnp.square(tight_offsets), axis=(-2, -1)) / max(1, tight_offsets.shape[-2])
 
@@ -207,11 +207,13 @@ def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:
 
 
 LARGEST_PSNR = 100.0
-"""dB reported for equal images, whose PSNR is infinite and would spoil any mean."""
+"""PSNR that is reported for equal images, dB. Their true PSNR is infinite and would spoil
+any mean.
+"""
 SEMI_TRANSPARENT = (0.05, 0.9)
-"""Between these alphas the foreground is semi-transparent."""
+"""Alphas between these two count as semi-transparent."""
 BOUNDARY = 3 / 256
-"""Half the width of the band at the silhouette, of the image's side."""
+"""Half the width of the band at the silhouette, relative to the height of the image."""
 
 
 def decibels(mean_squared_error: Float[Array, "*b"]) -> Float[Array, "*b"]:
@@ -220,8 +222,8 @@ def decibels(mean_squared_error: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 
 def psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Scalar:
-    """Returns the peak signal-to-noise ratio over the whole frame in dB, of the prediction clipped
-    to [0, 1].
+    """Returns the peak signal-to-noise ratio over the whole image, dB. The prediction is clipped to
+    [0, 1].
     """
     return decibels(jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target)))
 
@@ -229,16 +231,16 @@ def psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Sca
 def masked_psnr(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], mask: Float[Array, "h w"]
 ) -> Scalar:
-    """Returns the PSNR in dB over the pixels of a mask, each counted by its coverage; 100 where the
-    mask is empty.
+    """Returns the PSNR over the pixels of a mask, dB. Each pixel counts by its coverage. The result
+    is 100 where the mask is empty.
     """
     errors = jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target), axis=-1)
     return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
 
 
 def semi_transparent(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
-    """Returns the share of the pixels of a mask where alpha is `SEMI_TRANSPARENT`; 0 where the mask
-    is empty.
+    """Returns the share of the mask's pixels whose alpha is `SEMI_TRANSPARENT`. 0 where the mask is
+    empty.
     """
     inside = mask > 0.5
     partly = (alpha > SEMI_TRANSPARENT[0]) & (alpha < SEMI_TRANSPARENT[1]) & inside
@@ -246,8 +248,8 @@ def semi_transparent(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> S
 
 
 def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
-    """Returns the intersection over union of the pixels where alpha and where the mask is above a
-    half; 1 where both are empty.
+    """Returns the intersection over union of the pixels with alpha above a half and the pixels with
+    mask above a half. 1 where both are empty.
     """
     drawn, inside = alpha > 0.5, mask > 0.5
     union = jnp.sum(drawn | inside)
@@ -255,8 +257,8 @@ def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Sca
 
 
 def boundary_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """Marks the band to either side of the silhouette of a mask (h, w), see `BOUNDARY`, by 1, the
-    rest by 0; on the host.
+    """Returns 1 in the band to either side of the silhouette of a mask (h, w), and 0 elsewhere. Its
+    width is `BOUNDARY`. Computed on the host.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -277,7 +279,7 @@ def boundary_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
 STABILIZERS = (0.01**2, 0.03**2)
 """C1 and C2 of the paper, for values in [0, 1]."""
 MIDDLE = 0.5
-"""Moments are taken about this grey: E[x^2] - E[x]^2 of float32 whites would lose four digits to
+"""Grey that moments are taken about. E[x^2] - E[x]^2 of white in float32 would lose four digits to
 cancellation.
 """
 
@@ -287,15 +289,15 @@ class SsimWindow:
     """The window over which SSIM takes means and variances."""
 
     size: int = 11
-    """Side, pixels, odd."""
+    """Side of the window, pixels, odd."""
     sigma: float | None = 1.5
     """Standard deviation of the weights, pixels; None: all weights are equal."""
     sample: bool = True
-    """Whether covariances are over N - 1 instead of N."""
+    """Whether covariances are divided by N - 1 instead of N."""
 
     @property
     def weights(self) -> np.ndarray:
-        """The normalised window along one axis, (size,) float64."""
+        """The normalised weights along one axis, (size,) float64."""
         if self.sigma is None:
             return np.full(self.size, 1 / self.size)
         weights = np.exp(-0.5 * ((np.arange(self.size) - self.size // 2) / self.sigma) ** 2)
@@ -303,7 +305,7 @@ class SsimWindow:
 
     @property
     def covariance_factor(self) -> float:
-        """Factor of the windowed mean of products."""
+        """Factor that turns the windowed mean of products into the covariance."""
         if self.sample:
             return self.size**2 / (self.size**2 - 1)
         return 1.0
@@ -315,7 +317,9 @@ TORCHMETRICS = SsimWindow(sample=False)
 
 
 def _windowed(x: Float[Array, "*b h w c"], window: SsimWindow) -> Float[Array, "*b y x c"]:
-    """Sums shifted slices along rows, then along columns."""
+    """Returns the weighted sums over the window. Shifted slices are summed along rows, then along
+    columns.
+    """
     height, width = x.shape[-3] - window.size + 1, x.shape[-2] - window.size + 1
     rows = jnp.asarray(
         sum(float(weight) * x[..., i : i + height, :, :] for i, weight in enumerate(window.weights))
@@ -327,8 +331,8 @@ def _windowed(x: Float[Array, "*b h w c"], window: SsimWindow) -> Float[Array, "
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
 def blur(x: Float[Array, "*b h w c"], window: SsimWindow = GAUSSIAN) -> Float[Array, "*b y x c"]:
-    """Averages over the window around every pixel whose window lies inside the image: (h - size +
-    1, w - size + 1).
+    """Returns the weighted means over the windows that lie inside the image, (h - size + 1, w -
+    size + 1).
 
     Raises: ValueError for an image smaller than the window.
     """
@@ -374,8 +378,8 @@ def similarity_map(
 
 
 def mean_similarity(similarities: Float[Array, "y x c"], count: Int[Array, "2"]) -> Scalar:
-    """Returns the mean of the first count[0] rows and count[1] columns of a similarity map: of an
-    image that was padded below and right.
+    """Returns the mean of the first count[0] rows and count[1] columns of a similarity map. Images
+    that were padded below and right need this.
     """
     inside = [jnp.arange(side) < n for side, n in zip(similarities.shape[:2], count, strict=True)]
     counted = jnp.where(inside[0][:, None] & inside[1], jnp.mean(similarities, axis=-1), 0.0)
@@ -386,12 +390,14 @@ def mean_similarity(similarities: Float[Array, "y x c"], count: Int[Array, "2"])
 def structural_dissimilarity(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]
 ) -> Float[Array, "y x c"]:
-    """Returns (1 - SSIM) / 2 per pixel and channel, between 0 (the same) and 1 (the inverse)."""
+    """Returns (1 - SSIM) / 2 per pixel and channel, from 0 (equal images) to 1 (inverse images)."""
     return 0.5 * (1 - similarity_map(predicted, target))
 
 
 def halve(image: Float[Array, "h w c"]) -> Float[Array, "y x c"]:
-    """Averages an image to half its size, by boxes; an odd last row or column is left out."""
+    """Returns an image at half its size, averaged over boxes of 2 x 2 pixels. An odd last row or
+    column is left out.
+    """
     height, width, channels = image.shape
     even = image[: height // 2 * 2, : width // 2 * 2]
     return even.reshape(height // 2, 2, width // 2, 2, channels).mean(axis=(1, 3))
@@ -400,8 +406,8 @@ def halve(image: Float[Array, "h w c"]) -> Float[Array, "y x c"]:
 def multiscale_structural_dissimilarity(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], scales: int = 3
 ) -> Scalar:
-    """Returns the mean structural dissimilarity over `scales` box-halved sizes of the images,
-    weighing each size the same.
+    """Returns the mean structural dissimilarity over `scales` sizes of the images, each half of the
+    one before. All sizes have the same weight.
 
     Raises: ValueError where the smallest size has no whole window (it needs 11 pixels a side).
     """
