@@ -24,12 +24,12 @@ from humangs_jax.geometry import transform
 from humangs_jax.geometry.lens import check_lens, distorted
 
 RIGID_TOLERANCE = 1e-3
-"""Calibrations are stored with few digits: R R^T may be this far from the identity before a camera
-is refused.
+"""Largest difference of R R^T from the identity before a camera is refused. Calibrations are stored
+with few digits.
 """
 LARGEST_NUMBER = 1e7
-"""Pixels of a focal length, metres of a translation: larger ones are faults, and their products no
-numbers in float32.
+"""Largest focal length in pixels, and largest translation in metres. Larger numbers are faults, and
+their products overflow in float32.
 """
 
 
@@ -46,14 +46,16 @@ class Camera(Batchable):
     K: Annotated[Matrix3, Part("focal lengths", lambda K: K[..., [0, 1], [0, 1]], POSITIVE)]
     """Intrinsics, pixels."""
     cam_from_world: Matrix4
-    """Rigid, metres; OpenCV: x right, y down, z forward."""
+    """Rigid transform from the world to the camera, (4, 4), metres. Camera axes are OpenCV's: x
+    right, y down, z forward.
+    """
     width: int = static_field()
-    """Pixels."""
+    """Width of the image, pixels."""
     height: int = static_field()
-    """Pixels."""
+    """Height of the image, pixels."""
     distortion: Float[Array, " coefficients"] | None = None
-    """OpenCV's: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], of a fisheye k1 k2 k3 k4; None for no
-    distortion.
+    """Coefficients of OpenCV: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], or k1 k2 k3 k4 of a
+    fisheye. None for no distortion.
     """
     lens: str = static_field(default="pinhole")
     """ "fisheye": equidistant, fields of view below 180 degrees.
@@ -139,7 +141,7 @@ class Camera(Batchable):
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is a pinhole without distortion."""
+        """Whether the camera is a pinhole without distortion."""
         return self.lens == "pinhole" and self.distortion is None
 
     @property
@@ -153,7 +155,7 @@ class Camera(Batchable):
         return self.world_from_cam[..., :3, 3]
 
     def resized(self, width: int, height: int) -> "Camera":
-        """Returns the same camera for the image resampled to another size.
+        """Returns the camera for the same image at another size.
 
         Raises: ValueError for sides that are no whole numbers.
         """
@@ -163,7 +165,7 @@ class Camera(Batchable):
         return replace(self, K=from_host(K * scale[:, None]), width=width, height=height)
 
     def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
-        """Returns the same camera for a world whose lengths are divided by `unit`."""
+        """Returns the camera for the same world with all lengths divided by `unit`."""
         translation = self.cam_from_world[..., :3, 3] / unit
         moved = replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
         if self.lens != "orthographic":
@@ -188,8 +190,9 @@ class Camera(Batchable):
 
 
 def require_pinhole(what: str, camera: Camera) -> None:
-    """Raises: ValueError for a camera with another lens than a pinhole, or with distortion,
-    where `what` knows only those.
+    """Checks that a camera is a pinhole without distortion. what: the function that needs it.
+
+    Raises: ValueError.
     """
     if not camera.is_plain:
         kind = "distortion"
@@ -214,9 +217,9 @@ def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
 
 @checked_arguments
 def stack_cameras(cameras: list[Camera]) -> Camera:
-    """Makes a batch of cameras of one image size and lens.
+    """Returns a batch of cameras that have one image size and lens.
 
-    Raises ValueError if they differ or the list is empty.
+    Raises: ValueError if these differ or the list is empty.
     """
     if not cameras:
         raise ValueError("no cameras to stack")
@@ -231,9 +234,10 @@ def stack_cameras(cameras: list[Camera]) -> Camera:
 def project(
     camera: Camera, points: Float[Array, "*b 3"]
 ) -> tuple[Float[Array, "*b 2"], Float[Array, "*b"]]:
-    """Projects world points into one camera: pixel positions, and depths z in metres.
+    """Returns the pixel positions (..., 2) of world points in one camera, and their depths z,
+    metres.
 
-    No guard at z = 0: see `rendering.projection`.
+    z = 0 is not guarded against: see `rendering.projection`.
     """
     p = transform.apply(camera.cam_from_world, points)
     depth = p[..., 2]
@@ -253,8 +257,7 @@ def project(
 
 
 def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, height: int) -> Matrix3:
-    """Returns the K of a camera with square pixels and a centred axis; the field of view is in
-    radians.
+    """Returns the K of a camera with square pixels and a centred axis. vertical_fov: radians.
 
     Raises: ValueError for an angle that is not between 0 and pi.
     """
@@ -276,7 +279,7 @@ def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, heig
 def look_at(
     eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, height: int
 ) -> Camera:
-    """Makes a camera that looks at a point.
+    """Returns a camera that looks at a point.
 
     Args:
         eye: (3,) the camera's centre, metres.
@@ -315,7 +318,7 @@ def orbit(
     width: int,
     height: int,
 ) -> Camera:
-    """Makes cameras on circles around a point, y up; azimuth 0 stands at +z.
+    """Returns cameras on circles around a point, with y up. Azimuth 0 is at +z.
 
     Args:
         target: (3,) what they look at, metres.
@@ -360,8 +363,8 @@ def orbit(
 
 
 def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]]:
-    """Returns the centre of one pinhole camera and the unit directions through its pixel centres (x
-    + 0.5, y + 0.5).
+    """Returns the centre of one pinhole camera, (3,), and the unit directions through its pixel
+    centres (x + 0.5, y + 0.5), (h, w, 3), in the world.
 
     Raises: ValueError for another lens.
     """
@@ -378,8 +381,8 @@ def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]
 
 
 def plucker_rays(camera: Camera) -> Float[Array, "h w 6"]:
-    """Returns the moment, then the direction, of every pixel's ray (reference: HumanGS, after
-    Sitzmann et al., Light Field Networks).
+    """Returns the ray of every pixel, (h, w, 6): its moment, then its direction (reference:
+    HumanGS, after Sitzmann et al., Light Field Networks).
     """
     origin, directions = pixel_rays(camera)
     moments = jnp.cross(jnp.broadcast_to(origin, directions.shape), directions)

@@ -1,8 +1,8 @@
-"""Variants of a training run against the run itself: the same people, steps and seeds, differences
-with intervals.
+"""Compares variants of a training run with the run itself: the same people, steps and seeds, with
+intervals of the differences.
 
-All of them are compared on the same people, photos and targets, those that the base is validated
-on, whatever a variant changes.
+All runs are compared on the same people, photos and targets, those that the base is validated on,
+whatever a variant changes.
 """
 
 import dataclasses
@@ -37,24 +37,26 @@ BASE = "base"
 CONFIDENCE = 0.95
 DEFAULT_METRIC = "psnr_fg"
 LONGEST_NAME = 100
-"""Characters of a variant's name in the name of a folder; file systems allow 255 bytes."""
+"""Largest number of characters of a variant's name in a folder's name. File systems allow 255
+bytes.
+"""
 People = int | Sequence[str | Path] | SourceFactory
 
 
 class AblationRow(NamedTuple):
-    """A variant beside the base."""
+    """The result of a variant, compared with the base."""
 
     name: str
     """The name of the variant."""
     seeds: int
-    """How many seeds it has a score of."""
+    """Number of seeds with a score."""
     mean: float
-    """The mean score over these."""
+    """The mean score over these seeds."""
     difference: float
-    """The mean difference from the base, over the seeds that both have."""
+    """The mean difference from the base, over the seeds for which both have a score."""
     interval: float | None
-    """Half of the 95 % interval of `difference` by Student's t over paired seeds; None below two
-    pairs.
+    """Half of the 95 % interval of `difference`, by Student's t over paired seeds. None with fewer
+    than two pairs.
     """
 
     @property
@@ -65,7 +67,7 @@ class AblationRow(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Ablation:
-    """What `ablate` found."""
+    """The result of `ablate`."""
 
     metric: str
     """The name of the score."""
@@ -74,7 +76,7 @@ class Ablation:
 
     @property
     def rows(self) -> list[AblationRow]:
-        """The base first, then the variants that have a score, in their order."""
+        """The row of the base, then those of the variants that have a score, in their order."""
         base = self.scores[BASE]
         return [
             _row(name, own, base) for name, own in self.scores.items() if own.keys() & base.keys()
@@ -92,8 +94,8 @@ class Ablation:
         return "\n".join(text_table([head, *cells]))
 
     def plot(self) -> Any:
-        """Differences to the base with their intervals; gray where the interval contains 0. Without
-        a difference it says so.
+        """Returns a figure of the differences to the base with their intervals, gray where the
+        interval contains 0. If no variant has a score, the figure says so.
 
         Raises: ImportError without matplotlib, which the extra `notebooks` installs.
         """
@@ -205,7 +207,10 @@ def ablate(
 
 
 def _check_metric(metric: str, networks: LossNetworks) -> None:
-    """Raises: ArgumentError for one that validation does not find."""
+    """Checks that validation computes this metric.
+
+    Raises: ArgumentError.
+    """
     known = METRICS
     if networks.lpips is not None:
         known = *METRICS, "lpips"
@@ -219,7 +224,9 @@ def _check_metric(metric: str, networks: LossNetworks) -> None:
 def _checked_variants(
     base: TrainConfig, variants: Mapping[str, Mapping[str, Any]], networks: LossNetworks
 ) -> dict[str, TrainConfig]:
-    """The runs of the variants. Raises: ValueError naming the variant that cannot be trained."""
+    """Returns the run of each variant. Raises: ValueError, which names a variant that cannot be
+    trained.
+    """
     runs = {}
     for name, changes in variants.items():
         if name == BASE:
@@ -247,11 +254,12 @@ def _checked_variants(
 def _check_people(
     runs: Mapping[str, TrainConfig], people: Sequence[str | Path] | SourceFactory, body: BodyModel
 ) -> None:
-    """Checks that each run, in all of its stages, can use the people on disk that the base can.
+    """Checks that each run, in all of its stages, can use those people on disk that the base can
+    use.
 
     No photo is decoded.
 
-    Raises: ArgumentError naming the variant; ValueError if nobody can be used.
+    Raises: ArgumentError, which names the variant; ValueError if nobody can be used.
     """
     if isinstance(people, Sequence):
         make = captured_people(people, body)
@@ -267,7 +275,7 @@ def _check_people(
 
 
 def _unusable(make: SourceFactory, config: TrainConfig) -> dict[str, str]:
-    """Those people on disk that one of the stages of a run cannot use, and why."""
+    """Returns the people on disk that some stage of a run cannot use, each with the reason."""
     problems: dict[str, str] = {}
     for first, _ in config.spans(0, config.steps):
         source = make(config.at(first))
@@ -282,8 +290,11 @@ def _unusable(make: SourceFactory, config: TrainConfig) -> dict[str, str]:
 
 
 def _folder_names(names: Sequence[str]) -> dict[str, str]:
-    """A folder for each variant: its name without signs that file systems dislike, and a checksum
-    where another variant has that name too, also on file systems that ignore upper and lower case.
+    """Returns the name of a folder for each variant.
+
+    It is the variant's name, with `_` for characters that file systems dislike. A checksum is added
+    if another variant has the same folder name, also if they differ only in upper and lower case,
+    or if the name is too long or has no letter or digit.
     """
     plain = {name: re.sub(r"[^\w.+-]+", "_", name) for name in names}
     unusable = [
@@ -304,7 +315,9 @@ def _folder_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def _compared(validation: People, body: BodyModel, base: TrainConfig) -> tuple[SourceFactory, int]:
-    """Gives the people that all runs are compared on, and how many of them are looked at."""
+    """Returns the people that all runs are compared on, and the number of them that are
+    looked at.
+    """
     found, count = _source(validation, body, base, "validation", each_once=True), VALIDATED
     if isinstance(validation, int):
         count = validation
@@ -344,7 +357,7 @@ def _source(
 
 
 def _validated(folder: Path, step: int) -> dict[str, float]:
-    """What the validation after that step found; empty if there was none."""
+    """Returns the numbers of the validation after a step, by name. Empty if there was none."""
     file = folder / "log.jsonl"
     lines = []
     if file.is_file():

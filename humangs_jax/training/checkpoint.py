@@ -1,5 +1,5 @@
-"""Checkpoints of a run: the newest few and the best, each complete or not there, bit for bit what
-was saved.
+"""Saves and restores the checkpoints of a run: the newest few and the best. Each is complete or
+does not exist, and is restored bit for bit.
 
 Each records a checksum of its arrays. A damaged one is never used: the run continues from the
 newest good one and reports it.
@@ -44,16 +44,16 @@ ADJUSTABLE = (
     "keep_checkpoints",
     "microbatch_size",
 )
-"""What may change in the middle of a run without changing its numbers (but for shared batch
-statistics).
+"""Settings that may change in the middle of a run without changing its numbers, except for batch
+statistics that subjects share.
 """
 
 
 class Checkpoints:
-    """The checkpoints in a folder. `keep`: how many of the newest stay, besides the one of the
-    highest score.
+    """The checkpoints in a folder. `keep`: number of newest checkpoints that stay, besides the one
+    with the highest score.
 
-    read_only: nothing is written, deleted or tidied up.
+    read_only: nothing is written, deleted or set aside.
     """
 
     def __init__(self, folder: str | Path, keep: int = 2, read_only: bool = False):
@@ -82,28 +82,26 @@ class Checkpoints:
 
     @property
     def steps(self) -> list[int]:
-        """Steps of which there is a checkpoint, ascending."""
+        """Steps that have a checkpoint, ascending."""
         return sorted(self._manager.all_steps())
 
     @property
     def best_step(self) -> int | None:
-        """The step of the highest score, None without checkpoints."""
+        """Step of the checkpoint with the highest score. None without checkpoints."""
         return self._manager.best_step()
 
     def score(self, step: int) -> float | None:
-        """The score that a checkpoint was saved with; None without one, or for NaN, to which no
-        score compares.
-        """
+        """Returns the score that a checkpoint was saved with. None if it has no score, or NaN."""
         metrics = self._manager.metrics(step)
         unscored = metrics is None or metrics["score"] == UNSCORED or math.isnan(metrics["score"])
         return None if unscored else metrics["score"]
 
     def save(self, state: TrainState, score: float | None = None) -> None:
-        """Write the state under its step, in the background: see `wait`. The state may be donated
+        """Writes the state under its step, in the background: see `wait`. The state may be donated
         afterwards.
 
-        A step that is there already is left as it is. Raises: as `wait`, of this checkpoint or of
-        the one before.
+        If that step has a checkpoint already, nothing is written. Raises: as `wait`, for this
+        checkpoint or the one before.
         """
         step = int(state.step)
         if step in self._manager.all_steps():
@@ -120,7 +118,7 @@ class Checkpoints:
             )
 
     def wait(self) -> None:
-        """Return when all that was saved is on disk.
+        """Waits until all checkpoints are on disk.
 
         Raises: FileError if one could not be written, as on a full disk.
         """
@@ -137,10 +135,10 @@ class Checkpoints:
             ) from error
 
     def restore(self, like: TrainState, step: int | None = None) -> TrainState:
-        """The state of a step (None: the newest good one). `like`: a state of the same run, for
-        structure, shapes and devices.
+        """Returns the state of a step, or for None the newest state that is not damaged. `like`: a
+        state of the same run, for structure, shapes and devices.
 
-        Newer checkpoints that are damaged are reported and set aside.
+        Newer checkpoints that are damaged are logged and set aside.
         Raises: FileNotFoundError if there is no such checkpoint; FileError (a ValueError) if all
         are damaged or of another model.
         """
@@ -173,7 +171,9 @@ class Checkpoints:
         )
 
     def _restore(self, step: int, like: TrainState) -> tuple[TrainState | None, str]:
-        """The state, or what is wrong; all processes come to the same result."""
+        """Returns the state of a step and "", or None and a text that says what is wrong. All
+        processes get the same result.
+        """
         path, wanted = Path(self._manager.directory) / str(step), _as_dict(like)
         state, problem = None, ""
         try:
@@ -208,17 +208,19 @@ class Checkpoints:
         return state, problem
 
     def close(self) -> None:
-        """Wait for what is being written, and release what Orbax holds. Raises: as `wait`."""
+        """Waits for checkpoints that are being written, and releases what Orbax holds. Raises: as
+        `wait`.
+        """
         with self._writing():
             self._manager.close()
 
 
 CHECKSUM = "checksum"
-"""Beside the score of a checkpoint."""
+"""Key of the checksum among the metrics of a checkpoint."""
 
 
 def _everywhere(value: Any) -> np.ndarray:
-    """Values of all processes, one after the other."""
+    """Returns the values of all processes, one after the other along a new first axis."""
     if jax.process_count() == 1:
         return np.asarray(value)[None]
     from jax.experimental import multihost_utils
@@ -227,11 +229,11 @@ def _everywhere(value: Any) -> np.ndarray:
 
 
 def _checksum(state: TrainState) -> str:
-    """64 bits, in hexadecimal, of all arrays: the sum of their words, each times an odd number that
-    depends on its place.
+    """Returns a checksum of all arrays, 64 bits in hexadecimal. It is the sum of their words, each
+    times an odd number that depends on its place.
 
-    Any one word that changes changes it. It does not depend on how arrays lie on devices: each
-    process adds its own shards.
+    If any one word changes, the checksum changes. It does not depend on how arrays lie on devices,
+    because each process adds the shards that it holds.
     """
     total = 0
     for path, leaf in jax.tree_util.tree_leaves_with_path(_as_dict(state)):
@@ -261,7 +263,7 @@ def _weighted_sum(shard: Any, shape: tuple[int, ...]) -> int:
 
 
 def _without_score(folder: Path) -> list[Path]:
-    """Checkpoints whose score cannot be read; Orbax would stop at the first of them."""
+    """Returns the checkpoints whose score cannot be read. Orbax would stop at the first of them."""
     found = []
     for step in sorted(
         path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir()
@@ -276,7 +278,7 @@ def _without_score(folder: Path) -> list[Path]:
 
 
 def _set_aside(steps: list[Path]) -> None:
-    """Rename damaged checkpoints, so that their steps can be saved again; nothing is deleted."""
+    """Renames damaged checkpoints, so that their steps can be saved again. Nothing is deleted."""
     for step in steps if jax.process_index() == 0 else ():
         numbers = ("", *(f"-{i}" for i in range(1, 1000)))
         places = (step.with_name(f"damaged-{step.name}{i}") for i in numbers)
@@ -287,12 +289,13 @@ def _set_aside(steps: list[Path]) -> None:
 
 
 def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> None:
-    """Write out/config.json, or check the one that is there. write: only check otherwise.
+    """Writes out/config.json, after a check against the file that is there. write: False only
+    checks.
 
-    A finished run may get more steps: it goes on, and its learning rate is then that of the longer
-    run.
+    A finished run may get more steps. It then continues with the learning rate of the longer run.
 
-    Raises: ValueError, naming a field, if the folder belongs to a run of another configuration.
+    Raises: ValueError, which names a field, if the folder belongs to a run of another
+    configuration.
     """
     path = Path(out) / "config.json"
     if path.is_file():
@@ -313,9 +316,9 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
 
 
 def load_config(out: str | Path) -> TrainConfig:
-    """The configuration of the run in a folder.
+    """Returns the configuration of the run in a folder.
 
-    Raises: FileNotFoundError; ValueError, naming file and field.
+    Raises: FileNotFoundError; ValueError, which names file and field.
     """
     path = Path(out) / "config.json"
     if not path.is_file():
@@ -324,9 +327,10 @@ def load_config(out: str | Path) -> TrainConfig:
 
 
 def _placed_as(value: jax.Array, like: jax.Array) -> jax.Array:
-    """Through numpy: the buffers are XLA's own then, and may be donated.
+    """Returns a restored array on the devices of `like`. It is copied through numpy, so that its
+    buffers are XLA's own and may be donated.
 
-    Uncommitted stays uncommitted: no recompiling.
+    An array is uncommitted if `like` is, so that nothing is compiled again.
     """
     if not value.is_fully_addressable:
         return value
@@ -341,7 +345,7 @@ def _as_dict(state: TrainState) -> dict[str, Any]:
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """{"loss.squared": 1.0, ...} from nested dicts."""
+    """Returns nested dicts as one dict with paths as keys: {"loss.squared": 1.0, ...}."""
     items = {}
     for name, value in tree.items():
         if isinstance(value, dict):
@@ -352,7 +356,7 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _not_of_orbax(record: logging.LogRecord) -> bool:
-    """A filter of absl's logger: Orbax logs every step there, and prints in full the errors that it
-    also raises.
+    """Returns whether absl's logger shows a record: False for Orbax, which logs every step and
+    prints in full the errors that it also raises.
     """
     return "orbax" not in Path(record.pathname).parts

@@ -1,6 +1,4 @@
-"""Everything that a training run depends on, composed of the configurations beside what they
-configure.
-"""
+"""The configuration of a training run, composed of the configurations of its parts."""
 
 import dataclasses
 import itertools
@@ -34,7 +32,7 @@ from humangs_jax.training.augmentation import Augmentation
 
 logger = logging.getLogger(__name__)
 Decay = Annotated[float, Range(0, 0.999_999)]
-"""A decay of a running mean; at 1 it would never forget."""
+"""Decay of a running mean. At 1 it would never forget."""
 HOST_SETTINGS = {
     "seed": 0,
     "log_every": 1,
@@ -42,8 +40,8 @@ HOST_SETTINGS = {
     "checkpoint_every": 1,
     "keep_checkpoints": 1,
 }
-"""Settings of a run that no compiled program depends on, with the values that programs are compiled
-for.
+"""Settings of a run that no compiled program depends on, each with the value that programs are
+compiled for.
 """
 
 
@@ -54,15 +52,15 @@ class OptimizerConfig:
     name: Literal["adamw", "nadamw", "lamb", "lion"] = "adamw"
     """The name of the optimizer in `optax`."""
     learning_rate: Spread = 4e-4
-    """The peak of the learning rate, reached after `warmup_steps` from 0; then it falls by a cosine
-    to 0 at the end of the run.
+    """Peak of the learning rate. The rate rises from 0 to it in `warmup_steps`, then falls by a
+    cosine to 0 at the end of the run.
     """
     warmup_steps: Annotated[int, Range(0, 100_000_000)] = 3000
     """Steps over which the learning rate rises from 0 to its peak."""
     betas: tuple[Decay, Decay] = (0.9, 0.95)
     """The decays of the running means of gradients and of their squares."""
     weight_decay: Spread = 0.05
-    """The decay of parameters with two or more axes (products, textures, the class token)."""
+    """Weight decay of parameters with two or more axes (matrices, textures, the class token)."""
     clip_norm: Annotated[float, Range(0, 1e12)] = 1.0
     """Gradients longer than this are scaled down to it."""
     skip_norm: Annotated[float, Range(0, 1e12)] = 100.0
@@ -71,8 +69,8 @@ class OptimizerConfig:
 
 @configuration
 class Phase:
-    """What changes at step `start` of a run and holds until the next stage; None: as the run's own
-    configuration says.
+    """The settings that change at step `start` of a run, until the next stage. None keeps the run's
+    setting.
     """
 
     start: Steps
@@ -80,7 +78,7 @@ class Phase:
     image_size: InputSide | None = None
     """Side of the input photos, pixels."""
     token_capacity: CapacityOrAuto | None = None
-    """Tokens that the network has room for."""
+    """Number of tokens that the network has room for."""
     target_size: Side | None = None
     """Side of the targets, pixels."""
     batch_size: Count | None = None
@@ -93,12 +91,12 @@ STAGED = {
     "target_size": "target_size",
     "batch_size": "batch_size",
 }
-"""What the fields of a stage change in a `TrainConfig`."""
+"""Path in a `TrainConfig` that each field of a stage changes."""
 
 
 @configuration
 class TrainConfig:
-    """One run. Photos enter at `model.conventions.image_size` pixels.
+    """The configuration of one run. Photos enter at `model.conventions.image_size` pixels.
 
     Raises: ValueError for stages that are not in order, or sizes that do not divide each other.
     """
@@ -110,17 +108,17 @@ class TrainConfig:
     loss: LossConfig = LossConfig()
     """The weights of the terms of the loss."""
     augmentation: Augmentation = Augmentation()
-    """How examples are disturbed."""
+    """How examples are changed at random."""
     optimizer: OptimizerConfig = OptimizerConfig()
     """The optimizer and its learning rate."""
     splat: SplatConfig = SplatConfig()
-    """How targets are drawn. Without `max_pairs` there is room for twice what the first targets
-    need, where that is worth measuring (`training.room`).
+    """How targets are drawn. Without `max_pairs`, the buffers have room for twice what the first
+    targets need, where that is worth measuring (`training.room`).
     """
     target_size: Side = 128
     """Side of the targets, pixels."""
     steps: Steps = 20_000
-    """Steps of the whole run, which the learning rate ends with."""
+    """Steps of the whole run. The learning rate ends with them."""
     batch_size: Count = 1
     """Subjects per step."""
     microbatch_size: Count = knob(
@@ -129,18 +127,18 @@ class TrainConfig:
         gain="fewer, larger steps on accelerators",
         measured="performance.md",
     )
-    """How many subjects of a device it works on at once, gradients accumulating over the rest: 1
-    needs least memory and suits CPUs. The upsampler's batch statistics are of the subjects that all
-    devices work on at once."""
+    """Number of subjects that a device computes at once. Gradients accumulate over the rest of its
+    subjects. 1 needs least memory and suits CPUs. The upsampler's batch statistics are of the
+    subjects that all devices compute at once.
+    """
     stages: tuple[Phase, ...] = ()
     """The stages in the order of their starts, for instance larger photos for the last steps.
-
-    Before the first one the fields here hold.
+    Before the first stage the fields here hold.
     """
     ema_decay: Share | None = None
-    """The decay of the averaged parameters; None: there are none."""
+    """The decay of the averaged parameters. None: no averaged parameters."""
     seed: Seed = 0
-    """The seed of the first parameters, the order of the people and all that is drawn at random."""
+    """The seed of the first parameters, the order of the people and all other random numbers."""
     log_every: Steps = 20
     """Steps between two lines of the log."""
     validate_every: Steps = 1000
@@ -165,7 +163,7 @@ class TrainConfig:
             self.at(start)
 
     def at(self, step: int) -> "TrainConfig":
-        """The configuration in force at a step, without stages.
+        """Returns the configuration in force at a step, without stages.
 
         Raises: ValueError if its sizes do not fit together.
         """
@@ -179,8 +177,8 @@ class TrainConfig:
         return config
 
     def spans(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """(first, end) of the runs of steps between two steps during which the configuration stays
-        the same.
+        """Returns the ranges (first, end) of steps from `start` to `stop` in which the
+        configuration stays the same.
         """
         inner = [stage.start for stage in self.stages if start < stage.start < stop]
         if start < stop:
@@ -188,21 +186,21 @@ class TrainConfig:
         return []
 
     def examples_before(self, step: int) -> int:
-        """Subjects that the steps before this one have taken, over all stages."""
+        """Returns the number of subjects that all steps before this one have taken."""
         return sum((end - first) * self.at(first).batch_size for first, end in self.spans(0, step))
 
 
 def compiled_for(config: TrainConfig) -> TrainConfig:
-    """The same for all runs that share compiled programs: without what only the loop and the loader
-    read.
+    """Returns the configuration without the settings that only the loop and the loader read. Runs
+    that share compiled programs have the same one.
     """
     return dataclasses.replace(config, **HOST_SETTINGS)
 
 
 def small() -> TrainConfig:
-    """For the shipped network: some hours on a CPU of two cores.
+    """Returns the configuration for the shipped network: some hours on a CPU of two cores.
 
-    Its present weights had other losses (assets/weights.md).
+    The shipped weights were trained with other losses (assets/weights.md).
     """
     return TrainConfig(
         views=ViewSampling(input_counts=(1, 2, 4, 4, 4, 6), target_count=3, mixed_pose_share=0.2),
@@ -226,10 +224,10 @@ def small() -> TrainConfig:
 
 
 def published() -> TrainConfig:
-    """The release: 100,000 steps at 512 pixels, 4 input and 4 target views. Needs VGG-19 and LPIPS,
-    see `LossConfig`.
+    """Returns the configuration of the release: 100,000 steps at 512 pixels, 4 input and 4 target
+    views. It needs VGG-19 and LPIPS, see `LossConfig`.
 
-    The release has 2 subjects per device and does not say how many devices: 4 are taken here.
+    The release has 2 subjects per device and does not say how many devices. Four are assumed here.
     """
     return TrainConfig(
         model=presets.published(),
@@ -245,9 +243,8 @@ def published() -> TrainConfig:
 
 
 def paper() -> TrainConfig:
-    """The paper: 60,000 steps at 256 pixels with 8 subjects, then 10,000 at 512 with 4.
-
-    Needs VGG-19.
+    """Returns the configuration of the paper: 60,000 steps at 256 pixels with 8 subjects, then
+    10,000 at 512 pixels with 4. It needs VGG-19.
     """
     return dataclasses.replace(
         published(),
@@ -261,7 +258,7 @@ def paper() -> TrainConfig:
 
 
 def tiny() -> TrainConfig:
-    """Seconds, for tests."""
+    """Returns a configuration for tests, which trains in seconds."""
     return TrainConfig(
         model=presets.tiny(),
         views=ViewSampling(input_counts=(2,), target_count=2),
@@ -279,9 +276,9 @@ PRESETS = Presets({"published": published, "paper": paper, "small": small, "tiny
 
 
 def read_config(preset_or_path: str | Path) -> TrainConfig:
-    """A preset by its name, or a JSON file such as the config.json of a run.
+    """Returns the configuration of a preset, or of a JSON file such as the config.json of a run.
 
-    Raises: FileNotFoundError if it is neither; ValueError, naming file and field.
+    Raises: FileNotFoundError if the name is neither; ValueError, which names file and field.
     """
     if str(preset_or_path) in PRESETS:
         return PRESETS[str(preset_or_path)]()
@@ -294,7 +291,7 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
 
 
 def missing_networks(config: TrainConfig, networks: LossNetworks) -> list[str]:
-    """The losses of a run whose networks are missing."""
+    """Returns the names of the losses of a run whose networks are missing."""
     needing = ("perceptual", "vgg16", "lpips")
     return [
         name for name in needing if getattr(config.loss, name) and getattr(networks, name) is None
@@ -302,9 +299,10 @@ def missing_networks(config: TrainConfig, networks: LossNetworks) -> list[str]:
 
 
 def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:
-    """The run without the losses whose networks are missing; a warning names them.
+    """Returns the configuration without the losses whose networks are missing. A warning names
+    them.
 
-    Structural dissimilarity takes their place: its weight becomes at least that of `LossConfig()`.
+    Structural dissimilarity replaces them: its weight becomes at least that of `LossConfig()`.
     """
     missing = missing_networks(config, networks)
     if not missing:

@@ -1,5 +1,5 @@
-"""One step of training: a pure function of state, batch and body, on one device or on a mesh of
-them.
+"""One step of training, as a pure function of state, batch and body, on one device or on a mesh of
+devices.
 """
 
 import functools
@@ -28,23 +28,25 @@ from humangs_jax.training.forward import draw_targets, reconstruct_example
 from humangs_jax.training.state import GuardState, TrainState, learning_rate, make_optimizer
 
 SUBJECTS = "subjects"
-"""Name of the vmap axis over the subjects that a device works on at once, along which batch
-statistics are shared.
+"""Name of the vmap axis over the subjects that a device computes at once. Batch statistics are
+shared along this axis.
 """
 COUNTS = ("dropped_tokens", "overflow")
 """Metrics that are sums over a batch; all others are means."""
 AUGMENTED = 1
-"""Makes the key of a subject's augmentation from that of its backgrounds."""
+"""Number that makes the key of a subject's augmentation from the key of its backgrounds."""
 
 Seed = Shaped[Array, " n"] | Shaped[np.ndarray, " n"]
-"""`seed_numbers`."""
+"""The numbers that `seed_numbers` returns."""
 Metrics = dict[str, Shaped[Array, ""]]
 Gradients = tuple[Scalar, PyTree, PyTree, Metrics]
 """Loss, gradients, updated batch statistics, metrics."""
 
 
 def random_backgrounds(key: Key, count: int, share: float) -> Float[Array, "v 3"]:
-    """One color per target: random for about `share` of them, white for the rest."""
+    """Returns one color per target, (v, 3): random for about `share` of the targets, white for the
+    rest.
+    """
     numbers = uniform_by_name(key, {"colors": (count, 3), "choices": (count, 1)})
     return jnp.where(numbers["choices"] < share, numbers["colors"], 1.0)
 
@@ -52,21 +54,21 @@ def random_backgrounds(key: Key, count: int, share: float) -> Float[Array, "v 3"
 def change_background(
     images: Float[Array, "v h w 3"], masks: Float[Array, "v h w"], backgrounds: Float[Array, "v 3"]
 ) -> Float[Array, "v h w 3"]:
-    """Photos on white as they would look on other colors."""
+    """Returns photos on white as they would look on other colors."""
     return images + (1 - masks[..., None]) * (backgrounds[:, None, None, :] - 1)
 
 
 @functools.cache
 def seed_numbers(seed: int) -> Shaped[np.ndarray, " n"]:
-    """The key of a run as numbers on the host: an argument of a step's program, so that all seeds
-    share it.
+    """Returns the key of a run as numbers on the host. They are an argument of a step's program, so
+    that runs of all seeds share the program.
     """
     with jax.ensure_compile_time_eval():  # may be asked while a step is traced
         return np.asarray(jax.random.key_data(jax.random.key(seed)))
 
 
 def subject_keys(seed: Seed, step: Int[Array, ""], count: int) -> Array:
-    """One key per subject of a step. seed: `seed_numbers`."""
+    """Returns one key per subject of a step. seed: from `seed_numbers`."""
     return jax.random.split(
         jax.random.fold_in(jax.random.wrap_key_data(jnp.asarray(seed)), step), count
     )
@@ -82,7 +84,7 @@ def subject_loss(
     networks: LossNetworks = NO_NETWORKS,
     axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[Scalar, tuple[PyTree, Metrics]]:
-    """Loss of one subject, with the updated batch statistics and metrics."""
+    """Returns the loss of one subject, its updated batch statistics, and metrics."""
     # the avatar of the inputs, in training mode
     if config.augmentation.share:
         example = augment(jax.random.fold_in(key, AUGMENTED), example, body, config.augmentation)
@@ -127,12 +129,12 @@ def local_gradients(
     networks: LossNetworks = NO_NETWORKS,
     axes: tuple[str, ...] = (),
 ) -> Gradients:
-    """Gradients of one device's subjects: means over them, but sums of what was dropped. keys: one
-    per subject.
+    """Returns loss, gradients, batch statistics and metrics of one device's subjects. They are
+    means over the subjects, except for the sums `COUNTS`.
 
-    `config.microbatch_size` subjects are worked on at once, the gradients accumulate over the rest.
-    axes: of the mesh, along which batch statistics are shared too. Raises: ValueError if the
-    subjects cannot be divided so.
+    `config.microbatch_size` subjects are computed at once, and gradients accumulate over the rest.
+    keys: one per subject. axes: axes of the mesh, along which batch statistics are shared, too.
+    Raises: ValueError if the number of subjects is no multiple of the microbatch.
     """
     count, size = len(keys), config.microbatch_size
     if count % size:
@@ -185,7 +187,9 @@ def batch_gradients(
     networks: LossNetworks = NO_NETWORKS,
     mesh: Mesh | None = None,
 ) -> Gradients:
-    """`local_gradients` of a whole batch: each device of a mesh takes its share of the subjects."""
+    """Returns the `local_gradients` of a whole batch. Each device of a mesh takes its share of the
+    subjects.
+    """
     if mesh is None:
         return local_gradients(params, batch_stats, body, batch, keys, config, networks)
     specs = sharding.partition(params, mesh)
@@ -220,7 +224,9 @@ def train_step(
     networks: LossNetworks = NO_NETWORKS,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """`update`, compiled; the state is given away (donated)."""
+    """Returns the state after one more step, and metrics: `update`, compiled. The state is
+    donated.
+    """
     return compiled_update()(
         state, batch, body, networks, seed_numbers(config.seed), compiled_for(config), mesh
     )
@@ -231,8 +237,8 @@ def compiled_update() -> Callable[
     [TrainState, Example, BodyModel, LossNetworks, Seed, TrainConfig, Mesh | None],
     tuple[TrainState, Metrics],
 ]:
-    """`update` for the default backend; a step of all runs that differ in host settings alone is
-    one program.
+    """Returns `update`, compiled for the default backend. All runs whose configurations differ only
+    in `HOST_SETTINGS` share one program.
     """
     static, options = ("config", "mesh"), compiler_options()
     return jax.jit(
@@ -249,13 +255,14 @@ def update(
     config: TrainConfig,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """The state after one more step, and metrics: loss and its terms, psnr, grad_norm,
-    learning_rate, skipped and nonfinite (steps so far), dropped_tokens and overflow (what did not
-    fit its buffers in this step).
+    """Returns the state after one more step, and metrics.
+
+    Metrics are the loss and its terms, psnr, grad_norm, learning_rate, skipped and nonfinite (steps
+    so far), and dropped_tokens and overflow (what did not fit its buffers in this step).
 
     Arguments: batch: an `Example` with a leading axis of subjects. body: decimated already.
-    networks: of the losses that need them. seed: `seed_numbers`. config: static, of one stage.
-    mesh: static; where there is one, state, batch, body and networks lie on it, see `sharding`.
+    networks: those of the losses that need them. seed: from `seed_numbers`. config: static, of one
+    stage. mesh: static; with a mesh, state, batch, body and networks lie on it, see `sharding`.
     Raises: ValueError for parameters of fewer than 32 bits.
     """
     for name, leaf in inexact_leaves(state.params):
