@@ -37,24 +37,27 @@ from humangs_jax.rendering.splat_config import (
 from humangs_jax.rendering.splatting import Background, Rendering, render
 
 MARGIN = 1.12
-"""Room around a person in the frame: the extent is measured at the centres of Gaussians."""
+"""Factor on the room that a person takes in the frame, since the extent is measured at the centres
+of Gaussians.
+"""
 FOLLOWING = 0.5
-"""Seconds: standard deviation of the Gaussian that smooths the path of the camera. Steps and
-swinging arms, of about a second, do not reach it; a walk does."""
+"""Standard deviation of the Gaussian that smooths the path of the camera, seconds. The camera
+follows a walk, but not the swing of steps and arms, which takes about a second.
+"""
 WIDEST = 2
-"""The largest width of the Gaussian that smooths, over the length of the path: wider ones leave
-less than 1e-8 of anything but a straight line.
+"""The largest standard deviation of this Gaussian, as a multiple of the length of the path. Wider
+ones leave less than 1e-8 of anything but a straight line.
 """
 TRACKED = 1024
 """A person's extent is measured on this number of Gaussians, evenly spread."""
 TRACKED_OPACITY = 0.5
 """Least opacity of a Gaussian that the extent is measured on."""
 MOST_TRACKED = 1 << 25
-"""In all frames together, 400 MB: a motion of more than 32,768 frames is measured on fewer
-Gaussians.
+"""The most points in all frames together, 400 MB. A motion of more than 32,768 frames is measured
+on fewer Gaussians.
 """
 A_POSE = 48.0
-"""Degrees that the arms hang down in the A-pose, as in the page."""
+"""Degrees by which the arms hang down in the A-pose, as in the page."""
 
 posed = jax.jit(skin)
 
@@ -67,8 +70,9 @@ def draw(
     how: SplatConfig | None = None,
     exposure_gains: Float[np.ndarray, "v 3"] | None = None,
 ) -> Iterator[Rendering]:
-    """One rendering per pose and camera. how: None for what the avatar's weights were trained with.
-    exposure_gains: of the cameras, see `data.exposure`.
+    """Yields one rendering for each pose and its camera. how: the configuration; None: that which
+    the avatar's weights were trained with. exposure_gains: gains of the cameras, see
+    `data.exposure`.
     """
     if how is None:
         how = SPLAT_PRESETS[avatar.rendering]
@@ -90,10 +94,10 @@ def draw_gaussians(
     background: Background = None,
     how: SplatConfig = SPLAT_PRESETS["exact"],
 ) -> Iterator[Rendering]:
-    """One rendering per frame of Gaussians and camera.
+    """Yields one rendering for each frame of Gaussians and its camera.
 
-    Plans for the first frame with room to spare: compiles once per image size, and again only if a
-    frame needs more room than that.
+    Buffers are planned for the first frame, with room to spare. Programs are compiled once per
+    image size, and again only if a frame needs more room than that.
     """
     config = None
     for frame, camera in zip(gaussians, cameras, strict=True):
@@ -107,8 +111,8 @@ def draw_gaussians(
 
 
 def splatting_of(shot: FrameSettings, avatar: Avatar) -> SplatConfig:
-    """The preset of a shot; near_exact and fast keep the conventions that the avatar's weights were
-    trained with.
+    """Returns the configuration by which a shot is drawn. The presets near_exact and fast keep the
+    conventions that the avatar's weights were trained with.
     """
     if shot.splat == "as_trained":
         return SPLAT_PRESETS[avatar.rendering]
@@ -121,8 +125,8 @@ def splatting_of(shot: FrameSettings, avatar: Avatar) -> SplatConfig:
 def composite_over(
     rendering: Rendering, color: tuple[float, float, float] | None
 ) -> Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w 4"]:
-    """A rendering onto black as an image in [0, 1]: over a color, or with straight alpha for None,
-    as PNG and WebM have it.
+    """Returns a rendering onto black as an image in [0, 1]. color: the background, (h, w, 3) is
+    returned; None: transparent, (h, w, 4) with straight alpha is returned, as PNG and WebM have it.
     """
     rgb, alpha = np.asarray(rendering.rgb), np.asarray(rendering.alpha)[..., None]
     if color is not None:
@@ -132,12 +136,12 @@ def composite_over(
 
 
 def rest_pose_of(avatar: Avatar) -> BodyPose:
-    """The T-pose, at the place where the avatar's body is modelled."""
+    """Returns the T-pose, at the place where the avatar's body is modelled."""
     return BodyPose(from_host(np.zeros((len(avatar.parents), 3))), from_host(np.zeros(3)))
 
 
 def a_pose_of(avatar: Avatar) -> BodyPose:
-    """Arms down by 48 degrees.
+    """Returns the A-pose: the T-pose with the arms down by `A_POSE` degrees.
 
     Raises: ValueError for a body without the joints left_shoulder and right_shoulder.
     """
@@ -156,8 +160,8 @@ def a_pose_of(avatar: Avatar) -> BodyPose:
 
 
 def tracked_points(avatar: Avatar, poses: BodyPose) -> Float[np.ndarray, "m p 3"]:
-    """Where opaque Gaussians of the avatar are in each pose of a batch, metres: what a frame has to
-    show.
+    """Returns the places of opaque Gaussians of the avatar in each pose of a batch, metres. A frame
+    has to show these points.
     """
     opacities = np.asarray(avatar.gaussians.opacities)
     opaque = np.flatnonzero(opacities >= min(TRACKED_OPACITY, opacities.max()))
@@ -173,16 +177,16 @@ def shot_cameras(
     azimuths: Float[np.ndarray, " v"],
     smoothing: float | None,
 ) -> Camera:
-    """A batch of cameras, one per azimuth, that show all points of their frame, all from the same
-    distance.
+    """Returns a batch of cameras, one for each azimuth, that show all points of their frame from
+    the same distance.
 
-    Arguments: points: of each frame; of one frame: the same for all cameras. azimuths: degrees,
-    added to that of the shot.
-    smoothing: frames, the standard deviation with which the camera follows the middle of the
-    person; None: it stands still, and the image holds everything that happens.
+    Arguments: points: the points of each frame, metres; those of a single frame are used for all
+    cameras. azimuths: degrees, added to the azimuth of the shot. smoothing: the standard deviation,
+    in frames, with which the camera follows the middle of the person. None: the camera stands
+    still, and the image holds everything that happens.
 
-    Without `shot.distance` it is the smallest for which every point lies in the middle 1 / MARGIN
-    of the image.
+    Without `shot.distance`, the distance is the smallest for which every point lies in the middle 1
+    / MARGIN of the image.
 
     Raises: ValueError for a shot that is out of range.
     """
@@ -215,8 +219,8 @@ def shot_cameras(
 
 
 def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.ndarray, "m 3"]:
-    """A path smoothed by a Gaussian of this standard deviation; at its ends it is taken to go on as
-    it came (point mirrored).
+    """Returns a path smoothed by a Gaussian whose standard deviation is `frames` frames. Beyond its
+    ends the path is continued by its point reflection.
     """
     frames = min(frames, WIDEST * len(path))
     reach = int(np.ceil(3 * frames))
@@ -232,8 +236,8 @@ def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.nda
 def _fitting_distance(
     shot: FrameSettings, points: np.ndarray, targets: np.ndarray, axes: np.ndarray
 ) -> float:
-    """The least d with MARGIN |x| <= tangent (d + z) for all points: x across or down the image, z
-    behind the target.
+    """Returns the least distance d with MARGIN |x| <= tangent (d + z) for all points. x is a place
+    across or down the image, z the distance behind the target, metres.
     """
     needed = 0.0
     for i, target in enumerate(targets):
@@ -247,7 +251,9 @@ def _fitting_distance(
 def _paths(
     means: Array, weights: Array, rest_joints: Array, parents: tuple[int, ...], poses: BodyPose
 ) -> Array:
-    """(m, p, 3) places of Gaussians in each pose, one pose at a time."""
+    """Returns the places of Gaussians in each pose, (m, p, 3), metres. Poses are computed one at a
+    time.
+    """
 
     def one(pose):
         transforms = joint_transforms(rest_joints, parents, pose.rotations, pose.translation)
@@ -267,7 +273,8 @@ def trim_and_resample(
     fps: float | None = None,
     loop: int = 1,
 ) -> Motion:
-    """A motion from `start` to `stop` (seconds), at another frame rate, `loop` times.
+    """Returns a motion from `start` to `stop` (seconds), resampled to another frame rate and
+    repeated `loop` times.
 
     Every repetition starts where the one before has ended, at the same height. Raises: ValueError
     naming what is out of range.
@@ -314,8 +321,8 @@ def trim_and_resample(
 
 
 def motion_poses(avatar: Avatar, motion: Motion) -> BodyPose:
-    """A pose for each frame of a motion, which is put on the floor, with its expression if the
-    avatar has a face.
+    """Returns a pose for each frame of a motion, which is put on the floor. Poses have the motion's
+    expression if the avatar has a face.
 
     Raises: ValueError for another number of joints.
     """
@@ -330,10 +337,10 @@ def motion_poses(avatar: Avatar, motion: Motion) -> BodyPose:
 def motion_views(
     avatar: Avatar, motion: Motion, shot: FrameSettings, turn: float = 0.0, follow: bool = True
 ) -> tuple[BodyPose, Camera]:
-    """A pose and a camera for each frame of a motion, which is put on the floor.
+    """Returns a pose and a camera for each frame of a motion, which is put on the floor.
 
-    Arguments: turn: degrees that the camera travels around the person. follow: the camera goes
-    along with the person; else it stands still and is so far away that the person stays in the
+    Arguments: turn: degrees that the camera travels around the person. follow: whether the camera
+    goes along with the person; if not, it stands still, far enough away to keep the person in the
     image.
 
     Raises: ValueError if the motion has another number of joints than the avatar, or the shot is
@@ -348,7 +355,8 @@ def motion_views(
 def turntable_views(
     avatar: Avatar, pose: BodyPose, views: int, shot: FrameSettings
 ) -> tuple[BodyPose, Camera]:
-    """One pose, and cameras on a circle that starts at the azimuth of the shot.
+    """Returns one pose for all views, and cameras on a circle that starts at the azimuth of the
+    shot.
 
     Raises: ValueError for no view.
     """
@@ -361,8 +369,8 @@ def turntable_views(
 
 
 def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
-    """The pose and the camera of each view of a capture, in a world with y up: an avatar's light is
-    that of such a world.
+    """Returns the pose and the camera of each view of a capture, turned to a world with y up. An
+    avatar's light is that of such a world.
 
     Raises: ValueError if the capture's body has another number of joints than the avatar.
     """
@@ -382,7 +390,8 @@ def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
 def capture_renderings(
     avatar: Avatar, capture: Capture, background: Background = None, how: SplatConfig | None = None
 ) -> tuple[Camera, list[Rendering]]:
-    """The avatar in the poses and from the cameras of a capture. how: as for `draw`.
+    """Returns the cameras of a capture, and the avatar drawn in its poses and from these cameras.
+    how: as for `draw`.
 
     Raises: as `capture_views`.
     """
@@ -397,10 +406,10 @@ def images(
     shot: FrameSettings,
     progress: str | None = None,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
-    """One image per pose and camera, drawn when asked for, (h, w, 3) or with alpha (h, w, 4), see
-    `composite_over`.
+    """Yields one image for each pose and its camera, (h, w, 3), or (h, w, 4) with alpha, see
+    `composite_over`. Each is drawn when it is asked for.
 
-    progress: what a progress bar says; None: no bar.
+    progress: the label of a progress bar; None: no bar.
     """
     drawn = draw(avatar, poses, cameras, from_host(np.zeros(3)), splatting_of(shot, avatar))
     shown = bar(
@@ -433,11 +442,11 @@ def motion_frames(
 def without_unseen(
     avatar: Avatar, poses: BodyPose, cameras: Camera, how: SplatConfig, progress: str | None = None
 ) -> Avatar:
-    """The avatar without the Gaussians that weigh less than `ALPHA_MIN` on every pixel of every one
-    of these images.
+    """Returns the avatar without the Gaussians that weigh less than `ALPHA_MIN` on every pixel of
+    all these images.
 
-    Draws all of them once to find out: worth it for what is drawn several times. docs/video.md has
-    the error and the time.
+    All images are drawn once to find these Gaussians, which pays if they are drawn several times.
+    docs/video.md has the error and the time.
     """
     most = np.zeros(len(avatar.gaussians.means), np.float32)
     drawn = draw(avatar, poses, cameras, how=dataclasses.replace(how, visibility=True))

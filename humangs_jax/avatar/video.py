@@ -1,6 +1,6 @@
-"""Frames -> a video: .mp4 (H.264, plays everywhere), .webm (VP9, may be transparent), .gif (256
-colors for all frames, endless loop), or a folder of PNG files (may be transparent). At the end:
-sheets of labelled images, comparisons with the error in color.
+"""Writes frames as a video: .mp4 (H.264, plays everywhere), .webm (VP9, may be transparent), .gif
+(256 colors for all frames, endless loop), or a folder of PNG files (may be transparent). Also
+writes sheets of labelled images, and comparisons that show the error in color.
 """
 
 import contextlib
@@ -24,13 +24,14 @@ from humangs_jax.io.images import DRAWN, is_own_output, to_uint8, write_png
 
 Frame = Float[np.ndarray, "h w c"] | UInt8[np.ndarray, "h w c"]
 CHANNELS = (3, 4)
-"""The channels of a frame: colors, or colors and alpha."""
+"""The numbers of channels that a frame may have: colors, or colors and alpha."""
 CONSTANT_RATE_FACTOR = 17
 """x264's quality; 18 counts as visually lossless."""
 VP9_QUALITY = 18
-"""libvpx's constant quality, 0 to 63: its 18 is about as good as x264's."""
+"""libvpx's constant quality, 0 to 63. 18 is about as good as 18 of x264."""
 LARGEST_GIF = 1 << 30
-"""Bytes of all frames of a GIF in 24 bits, which are kept in memory: one palette is chosen for all.
+"""The most bytes of all frames of a GIF in 24 bits. All are kept in memory, because one palette is
+chosen for all.
 """
 LARGEST_GIF_FPS = 50
 """Viewers slow down frames that are shorter than 2/100 s."""
@@ -41,12 +42,12 @@ PALETTE_FRAMES = 16
 def check_video(
     path: str | Path, frames: int, width: int, height: int, transparent: bool = False
 ) -> VideoFormat:
-    """Check that such a video can be written; call it before its frames are drawn. Returns its
-    format.
+    """Check that a video with these frames can be written, before they are drawn. Returns the
+    video's format.
 
-    Raises: ValueError for a suffix that is no video (none is a folder of PNG files), transparency
-    that the format does not have, or a GIF that would not fit into memory, or something else of
-    that name.
+    Raises: ValueError for a suffix that is no video (no suffix is a folder of PNG files), for
+    transparency in a format without it, for a GIF that would not fit into memory, or if the path is
+    a folder in place of a file, or a file in place of a folder.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -136,8 +137,8 @@ def write_video(
 
 
 def video_size(path: str | Path, width: int, height: int) -> tuple[int, int]:
-    """Width and height of the video that frames of this size become: formats with `even_sides` make
-    odd ones longer.
+    """Returns the width and height of a video whose frames have this size. Formats with
+    `even_sides` add a row or column to odd sides.
     """
     suffix = Path(path).suffix.lower()
     even = any(form.even_sides for form in VIDEOS.values() if suffix in form.suffixes)
@@ -149,13 +150,16 @@ def video_size(path: str | Path, width: int, height: int) -> tuple[int, int]:
 def write_images(
     folder: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]
 ) -> None:
-    """PNG files of all frames."""
+    """Write each frame as a PNG file, frame_00000.png and so on."""
     for i, frame in enumerate(frames):
         write_png(folder / f"frame_{i:05d}.png", frame, mark=DRAWN)
 
 
 def _checked(path: Path, frames: Iterable[Frame]) -> Iterator[np.ndarray]:
-    """The frames as arrays, each after its check. Raises: ValueError that names the frame."""
+    """Yields the frames as arrays, each after a check.
+
+    Raises: ValueError that names the frame.
+    """
     shape = None
     for i, given in enumerate(frames):
         frame = np.asarray(given)
@@ -178,7 +182,10 @@ def _checked(path: Path, frames: Iterable[Frame]) -> Iterator[np.ndarray]:
 
 
 def _check_numbers(name: str, frame: np.ndarray) -> None:
-    """Raises: ValueError for numbers that are no colors."""
+    """Check that the numbers of a frame are colors: uint8, or floats in [0, 1].
+
+    Raises: ValueError.
+    """
     if frame.dtype == np.uint8:
         return
     if not jnp.issubdtype(frame.dtype, jnp.floating):  # numpy's own does not know bfloat16
@@ -196,7 +203,7 @@ def _check_numbers(name: str, frame: np.ndarray) -> None:
 
 
 def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
-    """H.264."""
+    """Write a video in H.264."""
     quality = [
         "-c:v",
         "libx264",
@@ -213,7 +220,7 @@ def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple
 def write_webm(
     path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]
 ) -> None:
-    """VP9."""
+    """Write a video in VP9."""
     quality = [
         "-c:v",
         "libvpx-vp9",
@@ -239,7 +246,7 @@ def write_webm(
 def _write_by_ffmpeg(
     path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...], quality: list[str]
 ) -> None:
-    """Through ffmpeg itself: imageio's writer does not tell when ffmpeg fails."""
+    """Write a video by a call of ffmpeg. imageio's writer does not report when ffmpeg fails."""
     import imageio_ffmpeg
 
     height, width, channels = shape
@@ -281,8 +288,8 @@ def _write_by_ffmpeg(
 
 
 def _indexed(frame: np.ndarray, palette: Any, background: np.ndarray) -> Any:
-    """A frame (h, w, 3) in the palette's colors; Pillow looks up colors by their upper 6 bits,
-    which white and 252 share.
+    """Returns a frame (h, w, 3) in the colors of a palette. Pixels of the background get index 255:
+    Pillow looks up colors by their upper 6 bits, in which white and 252 are equal.
     """
     from PIL import Image
 
@@ -294,8 +301,8 @@ def _indexed(frame: np.ndarray, palette: Any, background: np.ndarray) -> Any:
 
 
 def _commonest(pixels: np.ndarray) -> tuple[int, int, int]:
-    """The most frequent color (3,) of (h, w, 3) pixels: the background, where it is of one
-    color.
+    """Returns the most frequent color (3,) of pixels (h, w, 3): that of the background, where it
+    has one color.
     """
     packed = pixels.reshape(-1, 3).astype(np.int32) @ (1 << 16, 1 << 8, 1)
     values, counts = np.unique(packed, return_counts=True)
@@ -304,7 +311,7 @@ def _commonest(pixels: np.ndarray) -> tuple[int, int, int]:
 
 
 def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
-    """One palette for all frames."""
+    """Write a GIF, with one palette for all frames."""
     from PIL import Image
 
     step = int(np.ceil(fps / LARGEST_GIF_FPS))
@@ -340,9 +347,9 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple
 
 
 LARGEST_ERROR = 0.25
-"""Mean absolute difference of the channels that gets the last of `ERROR_COLORS`."""
+"""Mean absolute difference of the channels that is shown in the last of `ERROR_COLORS`."""
 GAP = 4
-"""Pixels of white between tiles."""
+"""White pixels between tiles."""
 TEXT_SHARE = 1 / 14
 """Height of the letters as a share of the width of a tile."""
 SMALLEST_TEXT = 10
@@ -373,8 +380,8 @@ def side_by_side(
     *,
     labels: Sequence[str] | None = None,
 ) -> None:
-    """Write a PNG with truth, ours and the error of every view, and the scale of the error below.
-    labels: one per view.
+    """Write a PNG with the truth, our image and the error of every view, and the scale of the error
+    below. labels: one for each view.
     """
     errors = error_colors(np.abs(truth - ours).mean(axis=-1), LARGEST_ERROR)
     triples = np.stack([truth, ours, errors], axis=1).reshape(-1, *truth.shape[1:])
@@ -395,12 +402,12 @@ def tile(
     headers: Sequence[str] | None = None,
     columns: int | None = None,
 ) -> Float[np.ndarray, "height width 3"]:
-    """A white sheet with the images in rows.
+    """Returns a white sheet with the images in rows.
 
     Arguments:
-        labels: one per image, written above it; what does not fit is cut off. headers: one per
-            column.
-        columns: images in a row; about as many as rows if left out.
+        labels: one per image, written above it; what does not fit is cut off.
+        headers: one per column.
+        columns: images in a row. None: about as many as there are rows.
     """
     count, height, width = images.shape[:3]
     if columns is None:
@@ -430,7 +437,9 @@ def write_texts(
     texts: Sequence[tuple[str, int, int, int]],
     text_height: int,
 ) -> Float[np.ndarray, "height width 3"]:
-    """The sheet with black texts; each is (text, left, top, width in pixels that it may take)."""
+    """Returns the sheet with black texts. texts: (text, left, top, largest width) of each,
+    pixels.
+    """
     from PIL import Image, ImageDraw, ImageFont
 
     if not any(text for text, *_ in texts):
@@ -449,8 +458,8 @@ def write_texts(
 def error_colors(
     errors: Float[np.ndarray, "*shape"], largest: float | int
 ) -> Float[np.ndarray, "*shape 3"]:
-    """Colors of non-negative errors: `ERROR_COLORS`, linear in between; errors above `largest` get
-    the last.
+    """Returns the colors of non-negative errors: `ERROR_COLORS`, linear in between. Errors above
+    `largest` get the last color.
     """
     stops = np.linspace(0, largest, len(ERROR_COLORS))
     return np.stack(
@@ -459,7 +468,7 @@ def error_colors(
 
 
 def _error_legend(width: int, text_height: int) -> Float[np.ndarray, "height width 3"]:
-    """A strip with the scale of `error_colors` and its ends in numbers."""
+    """Returns a strip with the scale of `error_colors`, and the numbers at its ends."""
     legend = np.ones((2 * GAP + text_height, width, 3))
     left, right = width // 3, max(2 * width // 3, width // 3 + 2)
     scale = np.linspace(0, LARGEST_ERROR, right - left)

@@ -1,4 +1,5 @@
-"""Masks that are too large or too small, moved to where the photo has its edges.
+"""Corrects masks that are too large or too small: their silhouettes are moved to the edges in the
+photos.
 
 Segmentation leaves silhouettes that are some pixels off. A pixel too much shows the background at
 the person's rim, a pixel too little cuts the person, in all photos alike, so no later stage can
@@ -22,61 +23,65 @@ from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.io.images import resized
 
 PERSON_HEIGHT = 200
-"""Lengths below are in pixels of a person who is that high."""
+"""Lengths below are in units of the pixels of a person who is that many pixels high."""
 REACH = 4.0
-"""Largest distance that a silhouette is moved, such pixels."""
+"""Largest distance that a silhouette is moved, in these units."""
 STEP = 0.5
-"""Distance between the moves that are tried, such pixels."""
+"""Distance between the moves that are tried, in these units."""
 NEIGHBORHOOD = 4.0
-"""Standard deviation of the part of the silhouette whose colors decide about a point, such pixels.
+"""Standard deviation of the Gaussian that weights the silhouette around a point, whose colors
+decide about the point; in these units.
 """
 SMOOTHING = 2.0
-"""Standard deviation of the smoothing of the distances found, such pixels."""
+"""Standard deviation of the smoothing of the distances that were found, in these units."""
 LEAST = 0.75
-"""Masks whose silhouette is off by less on average stay as they are: exact ones would only lose
-(docs/stability.md).
+"""Masks whose silhouette is off by less than this on average stay as they are, because exact masks
+would only lose (docs/stability.md). In these units.
 """
 LEAST_MOVE = 0.5
-"""Parts of the silhouette that would move by less stay where they are."""
+"""Parts of the silhouette that would move by less stay where they are. In these units."""
 MOST_PIXELS = 400
-"""Height of the person at which the photo is searched; larger photos are reduced."""
+"""Height of the person at which the photo is searched, pixels. Larger photos are reduced to it."""
 LEAST_PART = 0.005
 """Connected parts of a mask that are smaller, as a share of the largest one's area, are specks and
 not the person.
 """
 WHITE = 0.98
-"""A photo with nothing darker around the mask, beyond `REACH`, shows no background: there is
-nothing to find.
+"""A photo shows no background if nothing around the mask, beyond `REACH`, is darker than this. Then
+no edge can be found.
 """
 SECTORS = 16
 """Parts of the silhouette, of equal numbers of points, by the angle about its middle."""
 SECTOR_POINTS = 8
-"""Least number of points of a part: where points are few, there are fewer parts."""
+"""The least number of points of a sector. Where points are few, there are fewer sectors."""
 AGREE = 0.7
-"""Share of the sectors, of all views that would be moved alike, that must find the edge at one
-distance.
+"""Share of the sectors, over all views that would be moved in the same direction, that must find
+the edge at one distance.
 """
 AGREE_ALONE = 0.5
-"""Share of the sectors of the view that must find it there."""
+"""Share of the sectors of the view itself that must find the edge there."""
 EDGE = 0.06
-"""At an edge, colors change more than beside it by this share of the strongest change there."""
+"""At an edge, colors change more than beside it, by this share of the strongest change in the
+sector.
+"""
 OF_TEXTURE = 1.0
-"""They also change more by this share of the change beside it."""
+"""Colors also change more by this share of the change beside the edge."""
 SEEN_APART = 1.5
 """Pixels within which an edge counts as the mask's."""
 CLEAR = 1.3
 """Pixels within which a blurred edge ends."""
 THIN = 0.0007
 """Area of the parts of a mask that are too thin for one that is too large, over the area that it
-would lose.
+would lose. Masks with a larger share are not moved.
 """
 
 
 class _Shift(NamedTuple):
-    """What the photo says about a mask: it is too large by `excess` pixels (0: it stays), in
-    `window` by `moves` at each pixel.
+    """The correction of a mask that a photo suggests. The mask is too large by `excess` pixels
+    (negative: too small; 0: it stays), and by `moves` at each pixel of `window`.
 
-    votes: sectors for it and against it. thin: see `THIN`.
+    unit: pixels of the photo for one of a person `PERSON_HEIGHT` high. votes: the number of sectors
+    for and against the correction. thin: see `THIN`.
     """
 
     excess: float
@@ -90,12 +95,14 @@ class _Shift(NamedTuple):
 def masks_at_edges(
     images: Sequence[Float[np.ndarray, "h w 3"]], masks: Sequence[Float[np.ndarray, "h w"]]
 ) -> list[tuple[Float[np.ndarray, "h w"], float]]:
-    """Each mask with its silhouette at the photo's edges, and by how many pixels of the photo it
-    was too large (negative: small).
+    """Returns each mask with its silhouette moved to the photo's edges, and by how many pixels of
+    the photo it was too large (negative: too small).
 
     Arguments: images: the photos of one person with their background, values in [0, 1]. masks:
-    coverage in [0, 1]. A mask is kept, with 0, if it is empty, full or a line, off by less than
-    `LEAST`, or of a photo without a background; and if the silhouette has an edge where the mask
+    coverage in [0, 1].
+
+    A mask is kept, with 0, if it is empty, full or a line, if it is off by less than `LEAST`, or if
+    its photo shows no background. It is also kept if the silhouette has an edge where the mask
     ends, if its sectors do not agree, or if most views are right as they are.
     """
     found = [_shift(image, mask) for image, mask in zip(images, masks, strict=True)]
@@ -110,7 +117,9 @@ def masks_at_edges(
 
 
 def _believed(shift: _Shift, seen: Sequence[_Shift]) -> bool:
-    """Whether a shift is one of the mask and not of the person's colors."""
+    """Returns whether a shift corrects the mask and does not follow the person's colors. seen: the
+    shifts of all views.
+    """
     alike = [other for other in seen if other.excess * shift.excess > 0]
     if not alike or 2 * len(alike) < len(seen) or np.mean([other.thin for other in alike]) > THIN:
         return False
@@ -125,7 +134,7 @@ def _believed(shift: _Shift, seen: Sequence[_Shift]) -> bool:
 
 
 def _moved(mask: Float[np.ndarray, "h w"], shift: _Shift) -> Float[np.ndarray, "h w"]:
-    """The mask with its silhouette where the photo has its edges."""
+    """Returns the mask with its silhouette moved to the photo's edges."""
     own = mask[shift.window].astype(np.float32)
     moved = np.clip(signed_distance(own) - shift.moves + 0.5, 0, 1)
     fitted = mask.copy()
@@ -134,7 +143,7 @@ def _moved(mask: Float[np.ndarray, "h w"], shift: _Shift) -> Float[np.ndarray, "
 
 
 def _shift(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) -> _Shift | None:
-    """The `_Shift` of one view; None where nothing can be found."""
+    """Returns the correction that one photo suggests; None where nothing can be found."""
     (top, bottom), _ = box = person_box(mask >= 0.5)
     if not bottom or mask.min() >= 0.5 or min(mask.shape) < 2:
         return None
@@ -164,8 +173,8 @@ def _shift(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) ->
 def _boundary_moves(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], unit: float
 ) -> tuple[float, Float[np.ndarray, "h w"]]:
-    """How far inside the mask's silhouette (pixels; negative: outside) the photo has its edges: on
-    the whole, and near each pixel.
+    """Returns how far inside the mask's silhouette the photo has its edges, pixels (negative:
+    outside): one number for the whole, and one near each pixel.
 
     unit: pixels of this image for one of a person `PERSON_HEIGHT` high.
     """
@@ -194,9 +203,12 @@ def _boundary_moves(
 def _sector_votes(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], whole: float, unit: float
 ) -> tuple[int, int]:
-    """How many sectors of the silhouette have their edge about `whole` pixels inside of it, and how
-    many do not, or have one where the mask ends. Sectors whose edge is not clear say nothing; nor
-    do those where both sides of it are white.
+    """Returns the numbers of sectors for and against a move. A sector is for it if its edge lies
+    about `whole` pixels inside of the silhouette; against it if the edge lies elsewhere, or there
+    is one where the mask ends.
+
+    Sectors without a clear edge do not count, nor do sectors where both sides of the edge are
+    white.
     """
     distances = signed_distance(mask)
     # points on the end of the mask, with the direction inwards, in sectors around the middle
@@ -211,7 +223,9 @@ def _sector_votes(
     sectors = np.argsort(np.argsort(angles)) * count // len(angles)
 
     def colors(depth):
-        """At that distance inside of the points; not beyond the middle of a limb or the frame."""
+        """Returns the colors `depth` pixels inside of the points, and which of them count: those
+        that are not beyond the middle of a limb or outside of the image.
+        """
         at = points + depth * normal
 
         def sample(values):
@@ -265,11 +279,11 @@ def _sector_votes(
 
 
 def _thin_parts(mask: Float[np.ndarray, "h w"], excess: float) -> float:
-    """Area of the parts of a mask that it could not have if it were that much too large (in units),
-    over the area of the excess.
+    """Returns the area of the parts of a mask that are too thin for a mask that is too large by
+    `excess`, over the area of the excess. excess: in pixels of a person `PERSON_HEIGHT` high.
 
-    A silhouette that has grown by some distance has no part thinner than twice that; one with
-    fingers has not grown.
+    A silhouette that has grown by some distance has no part thinner than twice that distance. A
+    mask with thin fingers has not grown.
     """
     if excess <= 0:
         return 0.0
@@ -283,8 +297,8 @@ def _thin_parts(mask: Float[np.ndarray, "h w"], excess: float) -> float:
 
 
 def person_box(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
-    """`box_of` the person among the True pixels: the largest connected part, and others of at least
-    `LEAST_PART` of its area.
+    """Returns `box_of` the person among the True pixels: the largest connected part, and others of
+    at least `LEAST_PART` of its area.
     """
     parts, _ = ndimage.label(inside, np.ones((3, 3)))
     areas = np.bincount(parts.ravel())
@@ -293,8 +307,8 @@ def person_box(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
 
 
 def box_of(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
-    """First row and the one after the last, then columns, of the True pixels; zeros if there are
-    none.
+    """Returns the box of the True pixels: ((first row, row after the last), (first column, column
+    after the last)); zeros if there are none.
     """
     box = np.zeros((2, 2), int)
     for i, axis in enumerate((1, 0)):
@@ -305,8 +319,8 @@ def box_of(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
 
 
 def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Pixels from the silhouette, positive inside; where the mask is neither 0 nor 1, its values
-    say how far.
+    """Returns the distance of each pixel from the silhouette, pixels, positive inside. Along the
+    silhouette the values of the mask between 0 and 1 give the distance.
     """
     inside = mask >= 0.5
     whole = np.where(
@@ -324,29 +338,30 @@ def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 # the person's.
 
 RIM_HEIGHT = 440
-"""Lengths below are in pixels of a person who is that high."""
+"""Lengths below are in units of the pixels of a person who is that many pixels high."""
 DEPTH = 2.0
-"""Pixels that are nearer to the edge than this are cleaned, by the means of what lies further
-inside and further outside.
+"""Pixels that are nearer to the edge than this are cleaned, by the mean colors further inside and
+further outside.
 """
 SPREAD = 1.5
 """Standard deviation of the Gaussian that weights these means, pixels."""
 LEAST_WEIGHT = 1e-3
-"""Weight of what lies further inside below which there is nothing: of fingers, which are thinner,
-the rim stays as it is.
+"""Least weight of the pixels further inside. Below it there are none, as in fingers, which are
+thinner; their rim stays as it is.
 """
 CONTRAST = 0.02
 """A pixel is taken for a mixture where the two means differ by more than this."""
 CERTAIN = 0.15
-"""It is cleaned if the room's share in the mixture exceeds this."""
+"""A pixel is cleaned if the room's share in its mixture exceeds this."""
 
 
 def clean_rims(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """A photo without the room's share in the pixels along the edge of the mask, and beyond: what
-    they have of the difference between the colors further outside and further inside is taken away,
-    and all other detail stays.
+    """Returns a photo without the room's share in the pixels along and beyond the edge of the mask.
+
+    The share of a pixel is measured between the colors further inside and further outside, and this
+    part of the difference is subtracted. All other detail stays.
     """
     inside = mask > 0.5
     if not inside.any() or inside.all():
@@ -373,8 +388,8 @@ def clean_rims(
 
 
 def _depth(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Pixels from each pixel's centre to the edge, negative outside; the photo's own border is no
-    edge of the person.
+    """Returns the distance of each pixel's centre to the edge of the mask, pixels, negative
+    outside. The border of the photo is no edge.
     """
 
     def of(part):
@@ -388,7 +403,9 @@ def _depth(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 def _blurred(
     colors: Float[np.ndarray, "h w 3"], where: Bool[np.ndarray, "h w"], sigma: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The mean color of what is nearby and True, and whether there is anything."""
+    """Returns the mean color of the True pixels around each pixel, weighted by a Gaussian, and
+    whether there are any.
+    """
 
     def blur(values):
         return ndimage.gaussian_filter(

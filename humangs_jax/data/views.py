@@ -1,4 +1,6 @@
-"""Photos of one subject with the body parameters of each, and what the network computes of them."""
+"""The photos of one subject with the body parameters of each, and the network's inputs that are
+computed from them.
+"""
 
 import dataclasses
 import functools
@@ -41,8 +43,8 @@ logger = logging.getLogger(__name__)
 
 @pytree_dataclass
 class SubjectViews:
-    """Views of one subject. Each view has a pose, so that inputs of varying poses are no special
-    case.
+    """Views of one subject. Each view has its pose, so that photos of different poses need no
+    special case.
     """
 
     images: Float[Array, "v h w 3"]
@@ -58,22 +60,26 @@ class SubjectViews:
     betas: Float[Array, " s"]
     """Shape coefficients, (s,)."""
     view_count: Int[Array, ""] | None = None
-    """How many are views; those after them are padding (see `pad_views`). None: all are."""
+    """The number of views; those after them are padding (see `pad_views`). None: there is no
+    padding.
+    """
     depths: Float[Array, "v h w"] | None = None
     """The mean z of the person in each pixel where the mask is not 0, (v, h, w), metres; 0: unknown
     there. None: unknown everywhere.
     """
     displacement: Float[Array, "n 3"] | None = None
-    """How far the vertices of the shaped body move in the T-pose, (n, 3), metres
-    (`data.vertex_offsets`). None: nowhere.
+    """The displacement of the vertices of the shaped body in the T-pose, (n, 3), metres
+    (`data.vertex_offsets`). None: there is none.
     """
     unknown: Bool[Array, "v h w"] | None = None
-    """Where the person may be hidden and masks are 0, (v, h, w). None: nowhere."""
+    """Where somebody or something may hide the person, (v, h, w); masks are 0 there. None:
+    nowhere.
+    """
 
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
-    """The views, then ignored copies of the last one, so that subjects with fewer views can share a
-    batch.
+    """Returns `count` views: the given ones, then copies of the last one, which are ignored.
+    Subjects with fewer views can thus share a batch.
 
     Raises: ValueError if there are no views, or more than `count`.
     """
@@ -90,8 +96,8 @@ def pad_views(views: SubjectViews, count: int) -> SubjectViews:
 
 @checked_arguments
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
-    """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the
-    weights want it; with the map of its surface where the network works on one.
+    """Returns the body whose vertices carry the Gaussians. It is decimated, then long edges are
+    split, as the weights need it. It has a map of its surface if the network works on one.
 
     Its `relative_vertex_spacing` is relative to the mesh that the weights were trained with: 1
     unless `runtime.max_edge_length` asks for more vertices or `runtime.body_vertices` for fewer.
@@ -111,15 +117,15 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
 
 
 def has_mesh_of(body: BodyModel, config: HumanGSConfig) -> bool:
-    """Whether a body is one of `gaussian_body` for this configuration; any is if the configuration
-    asks for nothing.
+    """Returns whether a body is the `gaussian_body` of this configuration; true for any body if the
+    configuration asks for no other mesh.
     """
     key = remesh_key(config)
     return body.remesh_key == key or not any(key)
 
 
 def remesh_key(config: HumanGSConfig) -> tuple[Any, ...]:
-    """All of a configuration that `gaussian_body` depends on."""
+    """Returns all settings of a configuration that `gaussian_body` depends on."""
     trained, asked = config.conventions, config.runtime
     return (
         trained.body_vertices,
@@ -131,7 +137,9 @@ def remesh_key(config: HumanGSConfig) -> tuple[Any, ...]:
 
 
 class _ByContent:
-    """A key of caches: bodies that were read twice are equal."""
+    """A cache key of a body. Bodies with equal contents have equal keys, even if they were read
+    twice.
+    """
 
     def __init__(self, body: BodyModel) -> None:
         leaves, structure = jax.tree.flatten(body)
@@ -154,8 +162,8 @@ def _remeshed(
     longest: float | int | None,
     wanted: Any,
 ) -> tuple[BodyModel, sparse.csr_array]:
-    """The body that carries the Gaussians, and the matrix (m, n) that makes a linear quantity of
-    the given body's vertices one of its vertices.
+    """Returns the body that carries the Gaussians, and a matrix (m, n) that takes a linear quantity
+    of the given body's n vertices to its m vertices.
     """
     body = key.body
     weights = sparse.eye_array(len(body.template), format="csr")
@@ -187,8 +195,8 @@ def _remeshed(
 def on_gaussian_body(
     displacement: Float[np.ndarray, "n 3"], body: BodyModel, config: HumanGSConfig
 ) -> Float[Array, "m 3"]:
-    """A displacement of a body's vertices, of those of its `gaussian_body`: midpoints of edges move
-    by the mean of the ends.
+    """Returns a displacement of a body's vertices as a displacement of the vertices of its
+    `gaussian_body`, metres. Midpoints of edges move by the mean of the ends.
     """
     if has_mesh_of(body, config):
         return from_host(displacement)
@@ -199,7 +207,9 @@ def on_gaussian_body(
 def subject_rest(
     body: BodyModel, betas: Float[Array, " s"], displacement: Float[Array, "n 3"] | None
 ) -> RestBody:
-    """The person's body in the T-pose; a displacement does not move the joints."""
+    """Returns the person's body in the T-pose, with displaced vertices. The displacement (metres)
+    does not move the joints.
+    """
     rest = shape_body(body, betas)
     if displacement is None:
         return rest
@@ -208,8 +218,8 @@ def subject_rest(
 
 @checked_arguments
 def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
-    """Pose the body for every view and rasterize it: position maps, depth maps and the foreground
-    of the photos.
+    """Returns the network's inputs: the body is posed for every view and rasterized into position
+    maps and depth maps, and the foreground of the photos is found.
 
     Pure and jittable; nothing here is differentiated with respect to the body.
     """
@@ -273,9 +283,9 @@ CROP_MARGIN = 0.04
 
 
 def _crop_boxes(masks: Float[np.ndarray, "v h w"] | None) -> list[tuple[int, int, int]] | None:
-    """The square (left, top, side) around the person in each mask, pixels.
+    """Returns the square (left, top, side) around the person in each mask, pixels.
 
-    None if there are no masks, if one is empty, or if no square is smaller than its photo.
+    Returns None if there are no masks, if one is empty, or if no square is smaller than its photo.
     """
     if masks is None:
         return None
@@ -292,8 +302,9 @@ def _crop_boxes(masks: Float[np.ndarray, "v h w"] | None) -> list[tuple[int, int
 
 
 def cropped(capture: Capture, size: int) -> Capture:
-    """The photos, each cut to a square around the person in its mask and resized to `size` pixels;
-    all as they are where there are no such squares (`_crop_boxes`).
+    """Returns the capture with each photo cut to a square around the person in its mask, and
+    resized to `size` pixels. Returns the capture as it is where `_crop_boxes` finds no such
+    squares.
     """
     boxes = _crop_boxes(capture.masks)
     if boxes is None or capture.masks is None:
@@ -321,8 +332,8 @@ def _squares(
     boxes: Sequence[tuple[int, int, int]],
     size: int,
 ) -> tuple[Float[np.ndarray, "v size size 3"], Float[np.ndarray, "v size size"] | None, Camera]:
-    """Photos, masks and cameras, each cut to a square (left, top, side), white beyond the photo,
-    and resized to `size` pixels.
+    """Returns photos, masks and cameras, each cut to the square (left, top, side) of its box and
+    resized to `size` pixels. Photos are white beyond their edges.
     """
 
     def cut(array, fill):
@@ -345,7 +356,7 @@ def _squares(
 def _window(
     image: Float[np.ndarray, "h w *c"], left: int, top: int, side: int, fill: float
 ) -> Float[np.ndarray, "side side *c"]:
-    """A square of an image, filled up where it reaches beyond."""
+    """Returns a square of an image; pixels beyond the image get the value `fill`."""
     height, width = image.shape[:2]
     window = np.full((side, side, *image.shape[2:]), fill, np.float32)
     rows = slice(max(top, 0), min(top + side, height))
@@ -357,8 +368,8 @@ def _window(
 
 
 def world_up(roots: Float[np.ndarray, "v 3"], cameras: Camera) -> str:
-    """The axis that points up in the world of some views: "x", "-z" and the like; "y" where that is
-    not certain.
+    """Returns the axis that points up in the world of some views, such as "x" or "-z"; "y" where
+    the axis is not certain.
 
     Captures are to have y up. One with z up is as consistent, but the network has seen no such
     world, and an avatar's light is that of a world with y up. Another axis is up only where the
@@ -378,7 +389,8 @@ def world_up(roots: Float[np.ndarray, "v 3"], cameras: Camera) -> str:
 def turned_world(
     poses: BodyPose, cameras: Camera, up: str, pelvis: Float[np.ndarray, "3"]
 ) -> tuple[BodyPose, Camera]:
-    """Poses and cameras in a world turned so that the axis `up` becomes +y; a warning says so.
+    """Returns poses and cameras in a world turned so that the axis `up` becomes +y. A warning
+    reports the turn.
 
     pelvis: the root joint in T-pose, metres.
     """
@@ -403,12 +415,12 @@ def to_network_views(
     crop: bool = False,
     displacement: Float[np.ndarray, "n 3"] | None = None,
 ) -> SubjectViews:
-    """A capture's photos as the network wants them: padded with white to a centred square and
-    resized to `size`.
+    """Returns a capture's photos in the form that the network takes: padded with white to a centred
+    square and resized to `size` pixels.
 
-    Intrinsics follow the pixels. Without masks only what the posed body covers will count as
-    foreground. crop: cut to the person where that is less than the photo, see `_crop_boxes`.
-    displacement: of the body that carries the Gaussians, see `SubjectViews`.
+    Camera matrices follow the pixels. Without masks only what the posed body covers will count as
+    foreground. crop: whether photos are cut to the person where that is less than the photo, see
+    `_crop_boxes`. displacement: that of the body that carries the Gaussians, see `SubjectViews`.
     """
     boxes = None
     if crop:

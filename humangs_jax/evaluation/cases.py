@@ -1,5 +1,5 @@
-"""Who is compared with what: people from captures or a `Source`, and the methods that predict their
-views, the simplest last.
+"""The people that an evaluation compares, from captures or a `Source`, and the methods that predict
+their views. The simplest method comes last.
 """
 
 import dataclasses
@@ -35,15 +35,15 @@ from humangs_jax.network.weights import load_weights
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 HELD_OUT = "held_out"
-"""A capture in this folder of another one has views that are no inputs; `humangs synth` writes
-them.
+"""The folder in a capture folder with a second capture, whose views are no inputs. `humangs synth`
+writes such folders.
 """
 DEFAULT_INPUTS = 4
 MOST_TARGETS = 2000
-"""Views of one person that are compared: they are in memory together."""
+"""The most views of one person that are compared, since all are in memory together."""
 Indices = Mapping[str, Mapping[str, Sequence[int]]]
-"""By person: "context", the views that are inputs, and "target", those to compare with, by their
-numbers in the capture.
+"""For each person the numbers of views in the capture: "context" are the inputs, "target" the views
+to compare with.
 """
 
 
@@ -60,12 +60,12 @@ class Case:
 
 
 class Choice(NamedTuple):
-    """Which views are inputs: see `find_people`."""
+    """The rule by which input views are chosen, see `find_people`."""
 
     inputs: int | None = None
     """How many photos are inputs; None: the usual number."""
     indices: Indices | None = None
-    """Which views are inputs and targets, by person; None: evenly spaced ones."""
+    """The numbers of the inputs and targets of each person; None: inputs are evenly spaced."""
     reconstructs: bool = True
     """Whether the method needs inputs."""
 
@@ -74,16 +74,16 @@ ANY = Choice()
 
 
 class People(NamedTuple):
-    """Cases by name, each loaded when it is asked for."""
+    """The people of an evaluation. Each case is loaded when it is asked for."""
 
     names: tuple[str, ...]
     """The names of the people."""
     load: Callable[[int], Case]
-    """Loads the case of a number."""
+    """Loads the case with a number, an index into `names`."""
 
 
 class Predicted(NamedTuple):
-    """What a method shows of a case's views."""
+    """The images that a method predicts for views of a case."""
 
     images: Float[np.ndarray, "v h w 3"]
     """The images of v of the views, (v, h, w, 3), in [0, 1]."""
@@ -96,7 +96,7 @@ class Predicted(NamedTuple):
 
 
 Method = Callable[[Case, float], Predicted]
-"""(case, grey of the background) -> what it predicts."""
+"""A method: called with a case and the grey value of the background, returns its predictions."""
 
 
 def find_people(
@@ -106,17 +106,18 @@ def find_people(
     body: BodyModel | str | Path | None = None,
     reconstructs: bool = True,
 ) -> People:
-    """The people of a source.
+    """Returns the people of a source.
 
     Arguments:
         source: a capture folder or a folder of them; a scene list or a data set of
             `data.formats.DATASETS`; a capture; cases; or a `Source`, whose examples give inputs and
             targets.
         body: the model that the parameters of data sets and sources belong to, or its file
-            (default: the one that comes with the package). Captures name theirs.
-        inputs: how many photos are inputs: evenly spaced around the person, of the first view's
-            frame. Default: 4, or all of them where a capture with a folder held_out has fewer.
-            indices: says it by person instead.
+            (default: the one that comes with the package). Captures name their own.
+        inputs: the number of photos that are inputs. They are evenly spaced around the person and
+            show the first view's frame. Default: 4, or all of them where a capture with a folder
+            held_out has fewer.
+        indices: the inputs and targets of each person, in place of `inputs`.
         reconstructs: whether the method needs inputs. One that does not, and is given neither
             `inputs` nor `indices`, is compared with every view of a capture that has nothing held
             out.
@@ -175,7 +176,7 @@ def _model(body: BodyModel | str | Path | None) -> BodyModel | None:
 
 
 def _find_in_data_set(path: Path, choice: Choice, body: BodyModel | str | Path | None) -> People:
-    """The people of a data set; photos are read when a case is loaded."""
+    """Returns the people of a data set. Photos are read when a case is loaded."""
     if isinstance(body, BodyModel):
         file_body = FileBody(body)
     else:
@@ -200,8 +201,8 @@ def _find_in_data_set(path: Path, choice: Choice, body: BodyModel | str | Path |
 
 
 def _short_names(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Shortens paths to their last parts, as many as are needed so that no two are equal: ActorsHQ
-    has a Sequence1 of every actor.
+    """Returns the last parts of paths, as many as are needed so that no two names are equal.
+    ActorsHQ, for example, has a Sequence1 of every actor.
     """
     for parts in range(1, 1 + max(len(path.parts) for path in paths)):
         names = tuple("_".join(path.parts[-parts:]) for path in paths)
@@ -211,7 +212,7 @@ def _short_names(paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def _split(name: str, capture: Capture, choice: Choice) -> Case:
-    """Inputs and targets of one capture."""
+    """Returns the case of a capture, whose views are split into inputs and targets."""
     chosen, targets = choose_views(
         name, capture.frames, np.asarray(capture.cameras.cam_from_world), choice
     )
@@ -225,7 +226,7 @@ def choose_views(
     cam_from_world: Float[np.ndarray, "v 4 4"],
     choice: Choice = ANY,
 ) -> tuple[list[int], list[int]]:
-    """The views of a person that are inputs, and those to compare with.
+    """Returns the numbers of the views that are inputs, and of the views to compare with.
 
     Raises: ValueError naming the person.
     """
@@ -252,8 +253,10 @@ def choose_views(
 def spread_views(
     name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int
 ) -> list[int]:
-    """Views of the first view's frame, that one among them, evenly spaced around the person; in
-    order. Raises: ValueError.
+    """Returns the numbers of `count` views that show the first view's frame and are evenly spaced
+    around the person, in ascending order. The first view is among them.
+
+    Raises: ValueError if too few views show this frame.
     """
     same = np.flatnonzero(np.asarray(frames) == frames[0])
     if not 1 <= count <= len(same):
@@ -279,7 +282,9 @@ def _from_source(
 
 
 def capture_of(views: SubjectViews, body: BodyModel) -> Capture:
-    """Views of a source as a capture: equal poses are one frame, names are numbers."""
+    """Returns views of a source as a capture. Views with equal poses show one frame, and the names
+    of the views are numbers.
+    """
     views = jax.tree.map(np.asarray, views)
     if views.view_count is None:
         count = len(views.images)
@@ -310,7 +315,7 @@ def capture_of(views: SubjectViews, body: BodyModel) -> Capture:
 
 
 def predict_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Predicted:
-    """An avatar in the poses and from the cameras of a capture."""
+    """Draws an avatar in the poses and from the cameras of a capture."""
     drawn = capture_renderings(avatar, views, from_host(np.full(3, background), np.float32))[1]
     images = np.stack([np.clip(np.asarray(rendering.rgb), 0, 1) for rendering in drawn])
     alpha = np.stack([np.asarray(rendering.alpha) for rendering in drawn])
@@ -318,7 +323,8 @@ def predict_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Pr
 
 
 def _avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
-    """One avatar, or a folder of them, PERSON.npz each; those that are not there are missing.
+    """Returns the method that draws one avatar, or the avatar PERSON.npz of a folder. People
+    without such a file are missing.
 
     Raises: ValueError for one avatar and several people; OSError.
     """
@@ -346,8 +352,8 @@ def _avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
 
 
 def _weights_method(variables: Variables, config: HumanGSConfig) -> Method:
-    """Reconstruction from the inputs of a case; networks with a driver are run again for every
-    view.
+    """Returns the method that reconstructs an avatar from the inputs of a case. A network with a
+    driver is run again for every view.
     """
 
     def method(case: Case, background: float) -> Predicted:
@@ -363,14 +369,15 @@ def _weights_method(variables: Variables, config: HumanGSConfig) -> Method:
 
 
 def predictions_method(folder: str | Path, people: int) -> Method:
-    """Images of another program: FOLDER/PERSON/VIEW.png, or FOLDER/VIEW.png of one person alone.
+    """Returns the method that reads the images of another program: FOLDER/PERSON/VIEW.png, or
+    FOLDER/VIEW.png if there is one person.
 
-    The suffix may be any of those of photos.
+    The suffix may be any suffix of photos.
 
     VIEW is the file name of the true photo without its suffix, or view_NNN as `humangs render`
-    numbers them. An alpha channel is the coverage, and the colors are put on the background;
-    without one the image is on the protocol's background already.
-    Raises: FileNotFoundError if the folder does not exist.
+    numbers them. An alpha channel is the coverage, and its image is put on the background. An image
+    without alpha is taken to be on the protocol's background already. Raises: FileNotFoundError if
+    the folder does not exist.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -402,8 +409,8 @@ def _predictions_of(case: Case, root: Path, people: int) -> Path:
 
 
 def prediction_files(root: Path, case: Case, people: int) -> dict[str, Path | None]:
-    """The image of each view of a case in a folder of predictions; None for those that are not
-    there.
+    """Returns the image file of each view of a case in a folder of predictions, by the name of the
+    view; None where there is no file.
     """
     place = _predictions_of(case, root, people)
     return {name: _prediction(place, name, i) for i, name in enumerate(case.truth.names)}
@@ -435,7 +442,7 @@ def _nothing(case: Case, missing: tuple[str, ...]) -> Predicted:
 
 @functools.cache
 def shipped_weights() -> tuple[Variables, HumanGSConfig]:
-    """The network that comes with the package."""
+    """Returns the network that comes with the package."""
     return load_weights()
 
 
@@ -446,9 +453,10 @@ def choose_method(
     predictions: str | Path | None = None,
     method: Method | None = None,
 ) -> tuple[str, Method]:
-    """What is asked for, by a name for reports; the shipped weights if nothing is.
+    """Returns the method that is asked for, and its name for reports. The shipped weights are used
+    if nothing is given.
 
-    Raises: ValueError for more than one.
+    Raises: ValueError if more than one is given.
     """
     given: dict[str, Any] = {
         "avatar": avatar,
@@ -476,7 +484,7 @@ def choose_method(
 
 
 def painted_body(inputs: Capture) -> Float[Array, "n 3"]:
-    """A color for each vertex of the body: the mean photo color over the views that see it, grey
+    """Returns a color for each vertex of the body: the mean color over the photos that see it, grey
     where none does.
     """
     body = inputs.body
@@ -496,7 +504,9 @@ _photo_colors = jax.jit(functools.partial(photo_colors, grid="half_pixel"))
 def _seen(
     body: BodyModel, rest: RestBody, pose: BodyPose, camera: Camera
 ) -> tuple[Float[Array, "n 2"], Bool[Array, " n"]]:
-    """Where a camera shows the vertices of a posed body, pixels, and which of them it sees."""
+    """Returns the pixels at which a camera shows the vertices of a posed body, and which of them it
+    sees.
+    """
     vertices = pose_body(body, rest, pose).vertices
     pixels, depths = project_vertices(camera, vertices)
     depth_map = rasterize_mesh(vertices, body.faces, camera).depth
@@ -505,7 +515,7 @@ def _seen(
 
 
 def calls_of_painted_body(inputs: Capture, views: Capture) -> Iterator[Call]:
-    """The programs of `painted_body` and `draw_painted_body`."""
+    """Yields the programs of `painted_body` and `draw_painted_body`."""
     body = inputs.body
     rest = shape_body(body, from_host(inputs.betas))
     first, drawn = inputs.pose(int(inputs.frames[0])), views.pose(int(views.frames[0]))
@@ -515,7 +525,9 @@ def calls_of_painted_body(inputs: Capture, views: Capture) -> Iterator[Call]:
 
 
 def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.ndarray, "v h w 3"]:
-    """The vertex-color baseline on white, in the poses and from the cameras of a capture."""
+    """Draws the body with a color for each vertex on white, in the poses and from the cameras of a
+    capture.
+    """
     body = views.body
     rest = shape_body(body, from_host(views.betas))
 

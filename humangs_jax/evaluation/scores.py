@@ -1,9 +1,9 @@
-"""How images are compared: protocols (background, crops, networks, windows, as the papers that
-report such numbers do it), and scores under them: pure jitted functions of one image, and the
-host's part around them.
+"""Scores of images under evaluation protocols. A protocol says which backgrounds, crops, networks
+and windows are used, as the papers that report such numbers do it.
 
-A protocol is data. Crops work on numpy arrays of one image and are the same for truth and
-prediction: they look at the true mask alone.
+A protocol is data. Crops work on numpy arrays of one image. They depend on the true mask alone, so
+that truth and prediction are cut alike. Scores are pure jitted functions of one image, with some
+work on the host around them.
 
 Images are padded below and right to few sizes (`buffers.round_up`) and their own size is passed
 along, so that an evaluation of photos and crops of any sizes compiles few programs. Padding changes
@@ -53,12 +53,13 @@ Image = Float[np.ndarray, "h w 3"]
 
 @runtime_checkable
 class Crop(Protocol):
-    """A part of an image, found by the true mask."""
+    """A rule that cuts a part out of an image by the true mask."""
 
     def cut(
         self, image: Image, mask: Float[np.ndarray, "h w"], background: float
     ) -> Float[np.ndarray, "y x 3"]:
-        """The part; `background` (0 or 1) fills what lies outside of the image.
+        """Returns the part of the image; `background` (0 or 1) fills what lies outside of the
+        image.
 
         The mask is not empty.
         """
@@ -67,7 +68,7 @@ class Crop(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class WholeFrame:
-    """The image as it is."""
+    """The whole image."""
 
     def cut(self, image: Image, mask: Float[np.ndarray, "h w"], background: float) -> Image:
         """See `Crop`."""
@@ -88,8 +89,9 @@ class MaskBox:
 
 @dataclasses.dataclass(frozen=True)
 class SquareBox:
-    """The bounding box of the pixels where the mask is not 0, with a margin where the image goes
-    on, made a square of background, and resampled (bilinear, without a filter).
+    """The bounding box of the pixels where the mask is not 0, with a margin as far as the image
+    reaches. It is padded to a square with the background, and resampled (bilinear, without a
+    filter).
 
     The box ends before the last row and column plus the margin, as in
     https://github.com/lizhe00/AnimatableGaussians/blob/master/eval/score.py.
@@ -121,10 +123,12 @@ class SquareBox:
 
 @dataclasses.dataclass(frozen=True)
 class CentredWindow:
-    """The image brought to one size, and of that a window: the bounding box of the pixels where the
-    mask is not 0 in its middle, moved into the image where it leaves it (metrics/compute_metrics.py
-    of https://github.com/humansensinglab/Generalizable-Human-Gaussians). A smaller image is taken
-    whole.
+    """A window of an image that was resampled to one size. The middle of the window is that of the
+    bounding box of the pixels where the mask is not 0; the window is moved into the image if it
+    leaves it. A smaller image is taken whole.
+
+    Source: metrics/compute_metrics.py of
+    https://github.com/humansensinglab/Generalizable-Human-Gaussians.
     """
 
     height: int = 1000
@@ -132,7 +136,7 @@ class CentredWindow:
     width: int = 500
     """The width of the window, pixels."""
     side: int = 1024
-    """The longer side that the image is brought to first, pixels."""
+    """The length to which the longer side of the image is resampled first, pixels."""
 
     def cut(
         self, image: Image, mask: Float[np.ndarray, "h w"], background: float
@@ -153,41 +157,46 @@ class CentredWindow:
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationProtocol:
-    """One way to compare."""
+    """A protocol: which parts of the images are compared, on which background, and by which
+    scores.
+    """
 
     background: Background = "white"
-    """What is behind the person, in truth and prediction. "dataset": the photos as they are;
-    renderings get white.
+    """The background of truth and prediction. "dataset": photos keep their own, and renderings get
+    white.
     """
     crop: Crop = WholeFrame()
-    """What PSNR and SSIM see."""
+    """The part of the image that PSNR and SSIM compare."""
     lpips_crop: Crop | None = None
-    """What LPIPS sees; None: the same."""
+    """The part of the image that LPIPS compares; None: that of `crop`."""
     masked: bool = False
-    """Whether predictions are cut out by the true mask first, which hides errors of the silhouette.
+    """Whether predictions are first cut out by the true mask, which hides errors of the
+    silhouette.
     """
     lpips: tuple[Net, ...] = ("vgg",)
-    """The networks under LPIPS."""
+    """The networks of LPIPS."""
     ssim: SsimWindow = GAUSSIAN
     """The window of SSIM."""
     published_side: int | None = None
-    """The side of the published images, pixels; others are compared as they are."""
+    """The side of the published images, pixels; None: there is no such size. Images of other sizes
+    are compared as they are.
+    """
 
     @property
     def behind(self) -> float:
-        """The grey that predictions stand before."""
+        """The grey value of the background of predictions, 0 or 1."""
         return 0.0 if self.background == "black" else 1.0
 
     @property
     def crops(self) -> tuple[Crop, ...]:
-        """What PSNR and SSIM see first, what LPIPS sees last."""
+        """The crops of the protocol: first that of PSNR and SSIM, last that of LPIPS."""
         if self.lpips_crop is None:
             return (self.crop,)
         return self.crop, self.lpips_crop
 
     @property
     def needs_masks(self) -> bool:
-        """Whether it is not defined without the true masks."""
+        """Whether the protocol is undefined without the true masks."""
         return (
             self.masked
             or self.background == "black"
@@ -210,8 +219,8 @@ PROTOCOLS: Presets[EvaluationProtocol] = Presets(
         "lvsm": EvaluationProtocol("dataset"),
     }
 )
-"""By the name of the system whose paper reports such numbers; docs/evaluation.md has them as a
-table.
+"""The protocols by the name of the system whose paper reports such numbers. docs/evaluation.md has
+them as a table.
 """
 
 
@@ -223,12 +232,12 @@ PATCH = 64
 STRIDE = 32
 """Distance between the patches, pixels."""
 LEAST_FOREGROUND = 0.5
-"""Share of a patch that must be foreground, exceeded."""
+"""Share of a patch that the foreground must exceed for the patch to count."""
 PATCHES_AT_ONCE = 16
-"""For LPIPS: as many pixels as one image of 256 x 256."""
+"""Patches whose LPIPS is computed at once: as many pixels as one image of 256 x 256."""
 
 Networks = Mapping[str, Lpips]
-"""LPIPS by the name of its net."""
+"""LPIPS networks by name."""
 
 
 @functools.partial(jax.jit, static_argnames="window")
@@ -238,7 +247,7 @@ def pair_scores(
     size: Int[Array, "2"],
     window: SsimWindow,
 ) -> dict[str, Scalar]:
-    """psnr (dB) and ssim of two images in [0, 1], of which the first size[0] rows and size[1]
+    """Returns psnr (dB) and ssim of two images in [0, 1]. The first size[0] rows and size[1]
     columns count.
     """
     rows, columns = (jnp.arange(side) < n for side, n in zip(truth.shape[:2], size, strict=True))
@@ -256,11 +265,11 @@ def person_scores(
     size: Int[Array, "2"],
     window: SsimWindow,
 ) -> tuple[dict[str, Scalar], Bool[Array, "y x"]]:
-    """psnr_fg, psnr_boundary (both dB), patch_psnr, patch_ssim, of images as in `pair_scores`; and
-    which patches count.
+    """Returns psnr_fg, psnr_boundary (both dB), patch_psnr and patch_ssim of images as in
+    `pair_scores`, and which patches count.
 
-    mask: coverage. band: 1 along its silhouette. Both 0 beyond the size. Without a patch that
-    counts their scores are NaN.
+    mask: the coverage by the person. band: 1 along the person's silhouette. Both are 0 beyond the
+    size. The scores of patches are NaN if no patch counts.
     """
     shares = _patch_means(mask, PATCH)
     within = [
@@ -282,13 +291,15 @@ def person_scores(
 
 
 def _patch_means(x: Float[Array, "h w"], side: int) -> Float[Array, "y x"]:
-    """The mean of every square of that side, `STRIDE` apart."""
+    """Returns the mean of every square of `side` pixels; squares are `STRIDE` pixels apart."""
     return lax.reduce_window(x, 0.0, lax.add, (side, side), (STRIDE, STRIDE), "VALID") / side**2
 
 
 @jax.jit
 def _alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict[str, Scalar]:
-    """iou and semi-transparent foreground of a rendering's coverage."""
+    """Returns the IoU and the semi-transparent foreground of a rendering's coverage, as iou and
+    semi_transparent.
+    """
     return {"iou": silhouette_iou(alpha, mask), "semi_transparent": semi_transparent(alpha, mask)}
 
 
@@ -311,10 +322,11 @@ def _score_image(
     protocol: EvaluationProtocol,
     networks: Networks,
 ) -> Row:
-    """All scores of one image by name; None for what is not defined here, see `missing_reasons`.
+    """Returns all scores of one image by name; None for scores that are not defined here, see
+    `missing_reasons`.
 
-    predicted, truth: in [0, 1], on the protocol's background. mask: the true one. alpha: the
-    prediction's coverage.
+    predicted, truth: in [0, 1], on the protocol's background. mask: the true mask. alpha: the
+    coverage of the prediction.
     """
     # scores of the person need somebody in the mask
     empty = mask is None or not (mask > 0.5).any()
@@ -359,7 +371,9 @@ def _score_image(
 
 
 def _padded(image: np.ndarray) -> Array:
-    """With zeros below and right, up to a size that many images share; on the device."""
+    """Returns an image on the device, padded with zeros below and right to a size that many images
+    share.
+    """
     missing = [(0, round_up(side) - side) for side in image.shape[:2]]
     return from_host(np.pad(image, missing + [(0, 0)] * (image.ndim - 2)), jnp.float32)
 
@@ -367,7 +381,9 @@ def _padded(image: np.ndarray) -> Array:
 def _patch_lpips(
     weights: Lpips, predicted: np.ndarray, truth: np.ndarray, corners: np.ndarray
 ) -> float:
-    """The mean over the patches with these upper left corners."""
+    """Returns the mean LPIPS of the patches whose upper left corners (row, column) are
+    `corners`.
+    """
     pairs = [
         np.stack([x[i : i + PATCH, j : j + PATCH] for i, j in corners]) for x in (predicted, truth)
     ]
@@ -383,7 +399,7 @@ def _patch_lpips(
 
 
 def score_names(protocol: EvaluationProtocol) -> tuple[str, ...]:
-    """The scores of an image, in the order in which tables show them."""
+    """Returns the names of the scores of an image, in the order in which tables show them."""
     nets = [f"lpips_{net}" for net in protocol.lpips]
     person = ("psnr_fg", "psnr_boundary", "iou", "semi_transparent", "foreground")
     return (
@@ -401,8 +417,8 @@ def score_names(protocol: EvaluationProtocol) -> tuple[str, ...]:
 def missing_reasons(
     protocol: EvaluationProtocol, networks: Networks, masks: bool, alpha: bool
 ) -> dict[str, str]:
-    """Why scores are missing, by name. masks, alpha: whether truths have masks and predictions have
-    alpha.
+    """Returns the reasons why scores are missing, by the name of the score. masks: whether the
+    truth has masks. alpha: whether predictions have alpha.
     """
     reasons = {}
     for name in score_names(protocol):
@@ -423,8 +439,8 @@ def score_views(
     alpha: Float[np.ndarray, "v h w"] | None = None,
     networks: Networks | None = None,
 ) -> Iterator[Row]:
-    """The scores of each view of a capture; see `_score_image`. predicted: on the protocol's
-    background.
+    """Yields the scores of each view of a capture, see `_score_image`. predicted: images on the
+    protocol's background.
 
     Raises: ValueError if the sizes differ, if a value is not finite, or if the protocol needs masks
     that the capture lacks.
@@ -456,7 +472,9 @@ def on_background(
     mask: Float[np.ndarray, "h w"] | None,
     protocol: EvaluationProtocol,
 ) -> Float[np.ndarray, "h w 3"]:
-    """A photo of a capture, which is on white where its mask is known, as a protocol wants it."""
+    """Returns a photo of a capture on the background of a protocol. The photo is on white where its
+    mask is known.
+    """
     if protocol.background != "black" or mask is None:
         return image
     return np.clip(image - (1 - mask[..., None]), 0, 1)
@@ -464,7 +482,7 @@ def on_background(
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """Means over views."""
+    """Mean scores over the views of a capture."""
 
     psnr: float
     """PSNR of the whole image, dB."""

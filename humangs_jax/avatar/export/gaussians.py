@@ -1,11 +1,11 @@
-"""Gaussians and avatars in the files of other programs: what all formats share. `EXPORTS` has a row
-for each format.
+"""The parts of reading and writing Gaussians and avatars that all file formats share. `EXPORTS` has
+a row for each format.
 
 Ours are metres with y up, the person faces +z, quaternions wxyz, linear scales, opacities and
 colors in [0, 1]. glTF's world is the same. Viewers of `.ply` and `.splat` take y for down:
-SuperSplat and PlayCanvas turn what they read by half a turn about z. `.spz` has axes to the right,
-up and back, half a turn about y from ours. So converters make the same of all of them. `export`
-turns avatars so; `load_gaussians` and `save_gaussians` do with `y_up`.
+SuperSplat and PlayCanvas turn what they read by half a turn about z. The axes of `.spz` point to
+the right, up and back, half a turn about y from ours. Converters assume the same. `export` turns
+avatars into these worlds; `load_gaussians` and `save_gaussians` do so with `y_up`.
 """
 
 import functools
@@ -54,7 +54,9 @@ logger = logging.getLogger(__name__)
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic Y00 = 1 / (2 sqrt(pi))."""
 SEEN = 0.5
-"""Gaussians of at least this opacity have feet to stand on."""
+"""Gaussians of at least this opacity are seen, and can be the lowest ones, which stand on the
+floor.
+"""
 BACKWARDS = (0.0, 0.0, 1.0, 0.0)
 """The rotation (quaternion, wxyz) of half a turn about y."""
 _HALF = float(np.sqrt(0.5))
@@ -66,9 +68,10 @@ _TURNS = {"y": (1.0, 0.0, 0.0, 0.0), "-y": (0.0, 0.0, 0.0, 1.0), "z": (_HALF, _H
 
 
 def up_turn(up: Up) -> tuple[float, float, float, float]:
-    """The rotation (quaternion, wxyz) that turns +y to the named axis: -y about z, z about x.
+    """Returns the rotation (quaternion, wxyz) that turns +y to the named axis: about z for -y,
+    about x for z.
 
-    Raises: ValueError.
+    Raises: ValueError for another axis.
     """
     if up not in _TURNS:
         raise ValueError(f"up: expected {', '.join(get_args(Up))}, got {up!r}")
@@ -76,12 +79,14 @@ def up_turn(up: Up) -> tuple[float, float, float, float]:
 
 
 def up_matrix(up: Up) -> Float[np.ndarray, "3 3"]:
-    """`up_turn` as a matrix: of points and normals."""
+    """Returns `up_turn` as a matrix, which turns points and normals."""
     return _matrix(up_turn(up))
 
 
 def world_matrix(form: ExportFormat) -> Float[np.ndarray, "3 3"]:
-    """The rotation to the world of a format from ours, which has y up and people who face +z."""
+    """Returns the rotation from our world, with y up and people who face +z, to the world of a
+    format.
+    """
     matrix = up_matrix(form.up)
     if form.backwards:
         return matrix @ _matrix(BACKWARDS)
@@ -89,15 +94,18 @@ def world_matrix(form: ExportFormat) -> Float[np.ndarray, "3 3"]:
 
 
 def turned(gaussians: Gaussians, up: Up) -> Gaussians:
-    """Gaussians of a world with y up in one where `up` is. Raises: ValueError for another axis.
+    """Turns Gaussians from a world with y up to one with `up` up.
 
-    -y: half a turn about z, (-x, -y, z). z: a quarter about x, (x, -z, y).
+    -y: half a turn about z, (-x, -y, z). z: a quarter of a turn about x, (x, -z, y). Raises:
+    ValueError for another axis.
     """
     return rotated(gaussians, up_turn(up))
 
 
 def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Gaussians:
-    """Gaussians turned about the origin by a quaternion (wxyz) of quarters of a turn."""
+    """Turns Gaussians about the origin. turn: a quaternion (wxyz) of a number of quarters of a
+    turn.
+    """
     return _rotated(gaussians, turn)
 
 
@@ -113,14 +121,16 @@ def _rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> G
 
 
 def _matrix(turn: tuple[float, float, float, float]) -> Float[np.ndarray, "3 3"]:
-    """The rotation as a matrix of 0 and +-1."""
+    """Returns the rotation of a quaternion (wxyz) of quarters of a turn as a matrix of 0, 1 and
+    -1.
+    """
     w, x, y, z = turn
     return Rotation.from_quat([x, y, z, w]).as_matrix().astype(np.float32).round()
 
 
 def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
-    """Moved along y so that the lowest centre of a Gaussian that is seen (opacity 0.5 and more)
-    lies on y = 0.
+    """Moves Gaussians along y so that the lowest centre of a seen Gaussian lies on y = 0. A
+    Gaussian is seen if its opacity is `SEEN` or more.
     """
     means, opacities = np.asarray(gaussians.means), np.asarray(gaussians.opacities)
     seen = opacities >= min(SEEN, opacities.max(initial=0.0))
@@ -130,8 +140,8 @@ def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
 
 
 def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
-    """Means, unit quaternions (wxyz), scales, opacities, colors and harmonics (k = 0 for none) in
-    float64, without deformations and without low-pass.
+    """Returns means, unit quaternions (wxyz), scales, opacities, colors and harmonics (k = 0 for
+    none) as float64 arrays, without deformations and low-pass.
 
     Viewers add `EPS2D` pixels^2, as 3DGS does, where our renderer adds less to scales that contain
     a low-pass (`Gaussians.pixel_footprint`). It is taken out, so that both draw the same in images
@@ -157,20 +167,20 @@ def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
 
 @jax.jit
 def _plain(gaussians: Gaussians) -> Gaussians:
-    """Without deformations and without low-pass."""
+    """Returns the Gaussians without deformations and without low-pass."""
     scales = widened(gaussians.scales, gaussians.pixel_footprint, -1)
     return factored(replace(gaussians, scales=scales, pixel_footprint=None))
 
 
 def sh_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
-    """Coefficients of the constant spherical harmonic: files of Gaussians hold rgb = 1/2 + Y00
-    f.
+    """Returns the coefficients f of the constant spherical harmonic, as files of Gaussians hold
+    them: rgb = 1/2 + Y00 f.
     """
     return (colors - 0.5) / SH_C0
 
 
 def linear_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
-    """Linear colors in [0, 1] of sRGB-encoded ones (IEC 61966-2-1)."""
+    """Returns sRGB-encoded colors as linear colors in [0, 1] (IEC 61966-2-1)."""
     encoded = np.clip(colors, 0, 1)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
@@ -267,7 +277,10 @@ def save_gaussians(
 
 
 def _check_version(path: object, form: ExportFormat, version: int | None) -> None:
-    """Raises: ValueError for a version that is not written."""
+    """Check that a version of a format can be written.
+
+    Raises: ValueError.
+    """
     if version is None or version in form.versions:
         return
     if not form.versions:
@@ -285,8 +298,8 @@ def _versioned(version: int | None) -> dict[str, int]:
 
 
 def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
-    """From a world with y up to the one that viewers of a format expect, or back: half turns are
-    their own inverse.
+    """Turns Gaussians from a world with y up to the world that viewers of a format expect, or back.
+    Both directions are the same turns, since half turns are their own inverse.
     """
     if form.backwards:
         gaussians = rotated(gaussians, BACKWARDS)
@@ -298,13 +311,13 @@ def _written() -> Formats[ExportFormat]:
 
 
 def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], said: list[str]) -> Gaussians:
-    """Gaussians of means, quaternions (wxyz), scales, opacities, colors and perhaps harmonics, each
-    named as in its file.
+    """Returns Gaussians made of the arrays of a file: means, quaternions (wxyz), scales, opacities,
+    colors and perhaps harmonics, in this order, each under its name in the file.
 
-    Those with a number that is not finite are left out, and `said` takes how many.
+    Gaussians with a number that is not finite are left out, and a line with their count is appended
+    to `said`.
 
-    Raises: InvalidFileError if there are no others, or for numbers that are not what they should
-    be.
+    Raises: InvalidFileError if no Gaussian is left, or for numbers out of range.
     """
     arrays = _finite(arrays, said)
     count = len(next(iter(arrays.values())))
@@ -319,7 +332,9 @@ def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], said: list[str]) ->
 
 
 def _finite(arrays: Mapping[str, np.ndarray], said: list[str]) -> Mapping[str, np.ndarray]:
-    """The rows that are finite in all arrays, in float32."""
+    """Returns the rows of the arrays that are finite in all of them, also when rounded to float32.
+    A line with the count of the others is appended to `said`.
+    """
     count = len(next(iter(arrays.values())))
     keep = np.ones(count, bool)
     bad = []
@@ -342,8 +357,8 @@ def _finite(arrays: Mapping[str, np.ndarray], said: list[str]) -> Mapping[str, n
 
 
 def with_largest(three: Float[np.ndarray, "g 3"], places: np.ndarray) -> Float[np.ndarray, "g 4"]:
-    """Unit quaternions of all components but one, which is not negative, and of its place among
-    them.
+    """Returns unit quaternions made of three components and the place of the fourth, the largest
+    one, which is not negative.
     """
     rest = np.sqrt(np.maximum(1 - np.square(three).sum(axis=1), 0))
     quats = np.empty((len(three), 4))
@@ -358,7 +373,7 @@ def colors_of(coefficients: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"
 
 
 def unit_quats(quats: Float[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
-    """The quaternions at length 1; the identity where they have no length."""
+    """Returns the quaternions scaled to length 1; the identity for those of length 0."""
     norms = np.linalg.norm(quats, axis=-1, keepdims=True)
     return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0])
 
@@ -368,11 +383,12 @@ def unit_quats(quats: Float[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
 
 
 DIGITS = 4
-"""Digits of the numbers in the names of a sequence."""
+"""Digits of the frame numbers in the file names of a sequence."""
 
 
 def frame_range(text: str, count: int) -> range:
-    """The frames that "a:b:step" names as Python does, of `count`; each part may be missing.
+    """Returns the frames that "a:b:step" selects of `count` frames, as Python slices do. Each part
+    may be missing.
 
     Raises: ValueError.
     """

@@ -47,23 +47,23 @@ from humangs_jax.rendering.mesh.atlas import fill_gaps, texels, unwrap
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 TEXTURE_SIZE = 1024
-"""Texels a side: some 2 mm on an adult. Gaussians are 5 to 10 mm apart."""
+"""Texels along a side, each about 2 mm on an adult. Gaussians are 5 to 10 mm apart."""
 NEIGHBOURS = 32
-"""Gaussians that are asked for the color of a point: those with the nearest means."""
+"""The number of Gaussians that color a point: those with the nearest means."""
 CHUNK = 16384
-"""Points at a time: some 100 MB."""
+"""Points that are colored at a time, in some 100 MB."""
 SMALLEST_SCALE = 1e-4
 """Metres; flat Gaussians are seen as if they were a tenth of a millimetre thick."""
 LEAST_WEIGHT = 1e-4
-"""The least weight of the nearest Gaussian, so that points that no Gaussian covers have a color."""
+"""The least weight of the nearest Gaussian. It gives a color to points that no Gaussian covers."""
 WEIGHTS = 4
-"""Joints of a vertex that all programs read."""
+"""The number of joints of a vertex that all programs read."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BodyMesh:
-    """A textured mesh in T-pose. A vertex of the body stands once for each chart of the texture
-    that it is in.
+    """A textured mesh in T-pose. A vertex of the body occurs once for each chart of the texture
+    that contains it.
     """
 
     vertices: Float[np.ndarray, "u 3"]
@@ -79,11 +79,11 @@ class BodyMesh:
     weights: Float[np.ndarray, "u j"]
     """Skinning weights, (u, j); rows sum to 1."""
     source: Int[np.ndarray, " u"]
-    """Which vertex of the body each one is, (u,)."""
+    """The vertex of the body that each vertex of the mesh stands for, (u,)."""
 
     def posed(self, avatar: Avatar, pose: BodyPose) -> "BodyMesh":
-        """The mesh in a pose of the avatar's joints; normals by the rotations of blended
-        transforms.
+        """Returns the mesh in a pose of the avatar's joints. Normals are turned by the rotations of
+        the blended transforms.
         """
         rest = RestBody(avatar.rest_vertices, avatar.rest_joints)
         still = jnp.asarray(self.vertices)
@@ -99,10 +99,10 @@ class BodyMesh:
 
 
 def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
-    """The body of an avatar in T-pose, with the colors of its Gaussians as a texture.
+    """Returns the body of an avatar in T-pose, with the colors of its Gaussians as a texture.
 
-    Raises: ValueError for an avatar without faces or Gaussians, or with numbers that files cannot
-    hold, or a size that is no multiple of 128.
+    Raises: ValueError for an avatar without faces or Gaussians, for numbers that files cannot hold,
+    or for a texture size that is no multiple of 128.
     """
     vertices = np.asarray(avatar.rest_vertices, np.float32)
     faces = np.asarray(avatar.faces, np.int32)
@@ -135,9 +135,10 @@ def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
 
 
 def vertex_weights(avatar: Avatar) -> Float[np.ndarray, "n j"]:
-    """Skinning weights of the body's vertices: the mean of each one's own Gaussians.
+    """Returns the skinning weights of the body's vertices: for each vertex the mean over its
+    Gaussians.
 
-    Where refinement has added Gaussians, these are the nearest ones.
+    Where refinement has added Gaussians, the nearest ones are taken.
     """
     weights = np.asarray(avatar.skinning_weights, np.float32)
     each = avatar.gaussians_per_vertex
@@ -153,8 +154,8 @@ def vertex_weights(avatar: Avatar) -> Float[np.ndarray, "n j"]:
 def skin_colors(
     avatar: Avatar, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, "p 3"]:
-    """What the Gaussians show at points of the skin to someone who looks along the normals, from
-    outside.
+    """Returns the colors that the Gaussians show at points of the skin to somebody who looks along
+    the normals from outside.
 
     On the line x(t) = p + t n, a Gaussian of precision A and mean m is densest at t = n.A(m - p) /
     n.A n and there has the alpha o exp(-q / 2) with q = (m - p).A(m - p) - t n.A(m - p).
@@ -193,8 +194,8 @@ def skin_colors(
 def write_animation(
     path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
 ) -> None:
-    """All of a motion in one `.glb`, see `write_mesh_glb`; with the expressions of a body that
-    is known.
+    """Write a whole motion into one `.glb`, see `write_mesh_glb`. Expressions are written if the
+    avatar's body is known.
     """
     avatar = faced(avatar)
     write_mesh_glb(path, avatar, body_mesh(avatar), motion, name, up)
@@ -255,8 +256,8 @@ def write_mesh_glb(
 def strongest(
     weights: Float[np.ndarray, "n j"],
 ) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 4"]]:
-    """The four joints of most weight of each row, strongest first, and their weights scaled to sum
-    1; joint 0 where that is 0.
+    """Returns the four joints of most weight of each row, strongest first, and their weights scaled
+    to sum 1. Where a weight is 0, its joint is 0.
     """
     weights = np.pad(weights, ((0, 0), (0, max(0, WEIGHTS - weights.shape[1]))))
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :WEIGHTS]
@@ -266,21 +267,24 @@ def strongest(
 
 
 def _standing(mesh: BodyMesh, up: Up) -> BodyMesh:
-    """The mesh as its skin shows it in T-pose: readers that know no skins show it so, too."""
+    """Returns the mesh as its skin shows it in T-pose, turned to `up` and standing on 0. Readers
+    that ignore skins show the same.
+    """
     turn = up_matrix(up)
     vertices = (mesh.vertices - _floor(mesh)) @ turn.T
     return dataclasses.replace(mesh, vertices=vertices, normals=mesh.normals @ turn.T)
 
 
 def _floor(mesh: BodyMesh) -> Float[np.ndarray, "3"]:
-    """What lies on 0 in T-pose: the height of the lowest vertex."""
+    """Returns (0, y, 0), where y is the height of the lowest vertex in T-pose, metres."""
     return np.asarray([0, mesh.vertices[:, 1].min(), 0], np.float32)
 
 
 def joint_nodes(avatar: Avatar, floor: Float[np.ndarray, "3"]) -> list[dict[str, Any]]:
-    """Every joint at its place relative to its parent's; the root so that T-pose stands on 0.
+    """Returns a glTF node for every joint, placed relative to its parent. The root is placed so
+    that the T-pose stands on 0.
 
-    floor: what lies on 0 then, metres.
+    floor: the point of the T-pose that lies on 0, (3,), metres.
     """
     joints = np.asarray(avatar.rest_joints, np.float64)
     nodes = []
@@ -300,8 +304,8 @@ def _armature(avatar: Avatar, up: Up) -> dict[str, Any]:
 
 
 def _mesh(writer: GlbWriter, avatar: Avatar, mesh: BodyMesh, up: Up) -> dict[str, Any]:
-    """The mesh; of an avatar with a face, its expressions are morph targets, named in `extras` as
-    all programs read them.
+    """Returns the glTF mesh. The expressions of an avatar with a face are morph targets, whose
+    names are in `extras`, where all programs read them.
     """
     primitive = _primitive(writer, mesh)
     if avatar.face is None:
@@ -338,7 +342,9 @@ def _primitive(writer: GlbWriter, mesh: BodyMesh) -> dict[str, Any]:
 
 
 def _skin(writer: GlbWriter, avatar: Avatar, mesh: BodyMesh, up: Up) -> dict[str, Any]:
-    """From the mesh as it stands, where `up` is, to each joint's own place in our world."""
+    """Returns the glTF skin, whose matrices take the mesh as it is written, with `up` up, to the
+    rest frame of each joint.
+    """
     matrices = np.tile(np.eye(4), (len(avatar.parents), 1, 1))
     matrices[:, :3, :3] = up_matrix(up)  # column by column, as glTF has them: the turn back
     matrices[:, 3, :3] = _floor(mesh) - np.asarray(avatar.rest_joints)
@@ -353,7 +359,9 @@ def _skin(writer: GlbWriter, avatar: Avatar, mesh: BodyMesh, up: Up) -> dict[str
 def _animation(
     writer: GlbWriter, avatar: Avatar, motion: Motion, name: str, mesh_node: int
 ) -> dict[str, Any]:
-    """Every joint that turns, where the root is, and the expressions of an avatar with a face."""
+    """Returns the glTF animation of a motion: the rotations of every joint that turns, the places
+    of the root, and the expressions of an avatar with a face.
+    """
     times = writer.array("SCALAR", np.arange(len(motion.translations)) / motion.fps, bounds=True)
     rotations = np.asarray(motion.rotations)
     quats = continuous(np.asarray(quaternion.from_axis_angle(motion.rotations)))
@@ -375,8 +383,8 @@ def _animation(
 def tracks_of(
     writer: GlbWriter, times: int, tracks: Sequence[tuple[int, str, str, np.ndarray]], name: str
 ) -> dict[str, Any]:
-    """An animation of (node, path, kind of array, values), all at the same times. times: their
-    accessor.
+    """Returns a glTF animation. tracks: (node, path, kind of array, values) of each track. times:
+    the accessor of the times of all tracks.
     """
     samplers = [
         {"input": times, "output": writer.array(kind, values), "interpolation": "LINEAR"}
@@ -390,8 +398,8 @@ def tracks_of(
 
 
 def continuous(quats: Float[np.ndarray, "m j 4"]) -> Float[np.ndarray, "m j 4"]:
-    """Quaternions (m, j, 4) of unit length, each on the side of the one before: some players
-    interpolate numbers.
+    """Returns unit quaternions with signs such that each is on the side of the one before, since
+    some players interpolate the numbers.
     """
     quats = quats / np.linalg.norm(quats, axis=-1, keepdims=True)
     jumps = (quats[1:] * quats[:-1]).sum(axis=-1, keepdims=True) < 0
@@ -404,11 +412,11 @@ def continuous(quats: Float[np.ndarray, "m j 4"]) -> Float[np.ndarray, "m j 4"]:
 
 
 WRITTEN = "# written by humangs_jax"
-"""How an `.obj` and its `.mtl` begin."""
+"""The first words of an `.obj` and of its `.mtl`."""
 
 
 def _is_ours(file: Path) -> bool:
-    """Whether a texture or a material was written here."""
+    """Returns whether a texture or a material was written by this package."""
     if file.suffix == ".png":
         return is_own_picture(file)
     with open_file(file) as opened:
@@ -416,7 +424,7 @@ def _is_ours(file: Path) -> bool:
 
 
 def check_beside(path: Path) -> None:
-    """Whether the texture and the material of an `.obj` replace no file of others.
+    """Check that the texture and the material of an `.obj` replace no files that others wrote.
 
     Raises: ValueError.
     """
@@ -429,8 +437,8 @@ def check_beside(path: Path) -> None:
 def write_poses(
     path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
 ) -> None:
-    """An `.obj` for each pose of a motion, or of the T-pose with its feet on 0; all share the
-    texture beside `path`.
+    """Write an `.obj` for each pose of a motion, or one of the T-pose with its feet on 0. All share
+    the material and the texture beside `path`.
     """
     check_beside(path)
     mesh = body_mesh(avatar)
@@ -445,7 +453,7 @@ def write_poses(
 
 
 def write_material(path: Path, mesh: BodyMesh) -> Path:
-    """Write the `.mtl` and the `.png` that an `.obj` of this path names; several poses share them.
+    """Write the `.mtl` and the `.png` that the `.obj` of this path names. Several poses share them.
 
     Returns the `.mtl`'s path.
     """

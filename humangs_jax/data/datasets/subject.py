@@ -1,5 +1,4 @@
-"""One person of a data set, and the body of the data set: its model file, parameters, what a pose
-makes of it.
+"""One person of a data set, and the body model of the data set with its file and parameters.
 
 A view is one photo: a camera at one frame. Opening a subject lists folders and reads calibration
 and body parameters, so that a sequence of 5,000 frames opens in well under a second. Photos come on
@@ -31,9 +30,13 @@ from humangs_jax.io import arrays as array_files
 from humangs_jax.io.images import resized, to_uint8
 
 LARGEST_ANGLE = 4 * np.pi
-"""Radians of a rotation vector; fits wander beyond 2 pi now and then, degrees are far above."""
+"""The largest angle of a rotation vector, radians. Fits go beyond 2 pi now and then; degrees are
+far above.
+"""
 FARTHEST = 100.0
-"""Metres of a translation or of a camera from the origin; millimetres are far above."""
+"""The largest distance of a translation or a camera from the origin, metres. Millimetres are far
+above.
+"""
 LARGEST_COEFFICIENT = 30.0
 """The largest coefficient of shape and expression, standard deviations; usually below 5."""
 
@@ -41,10 +44,10 @@ open_arrays = functools.partial(array_files.ArrayFile.open, error=CaptureError)
 checked_numbers = functools.partial(file_numbers, some=True)
 
 FIRST_HAND_JOINT = 25
-"""In the order of SMPL-X: 30 finger joints follow."""
+"""The first finger joint in the order of SMPL-X; 30 finger joints begin there."""
 RECOVERED_TOLERANCE = 3e-3
-"""Metres, root mean square over vertices, up to which arrays of a scene list are those of a body
-model.
+"""Metres, root mean square over vertices. Arrays of a scene list that are nearer to a body model
+count as made with it.
 """
 
 
@@ -61,12 +64,15 @@ class FileBody:
 
     @classmethod
     def load(cls, file: str | Path | None = None) -> "FileBody":
-        """A model file, or (None) the body that comes with the package. Raises: as `load_body`."""
+        """Read a model file; None: the body that comes with the package.
+
+        Raises: as `load_body`.
+        """
         return cls(load_body(file), DEFAULT_BODY if file is None else str(file))
 
     @functools.cached_property
     def hands(self) -> HandBasis:
-        """Mean and components of its hand poses.
+        """Returns the mean and the components of the model's hand poses.
 
         Raises: CaptureError for the package's own body, which has none.
         """
@@ -82,7 +88,7 @@ class FileBody:
     def arrays(
         self,
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 s"], Float[np.ndarray, "j n"]]:
-        """Template, shape directions and joint regressor, float64."""
+        """The template, the shape directions and the joint regressor, float64."""
         model = self.model
         template = model.template
         directions = model.shape_directions
@@ -93,7 +99,7 @@ class FileBody:
         return template, directions, regressor
 
     def rest_joints(self, betas: Float[np.ndarray, " s"]) -> Float[np.ndarray, "j 3"]:
-        """Where the joints of a person are in the T-pose, metres."""
+        """Returns the places of a person's joints in the T-pose, (j, 3), metres."""
         template, directions, regressor = self.arrays
         return regressor @ (template + directions[..., : len(betas)] @ betas)
 
@@ -109,14 +115,14 @@ class BodyParameters(NamedTuple):
     """The translation of each pose, (m, 3), metres."""
 
     def poses(self, rows: Sequence[int]) -> "BodyParameters":
-        """The shape with these poses alone."""
+        """Returns the parameters with the poses of these rows alone."""
         index = np.asarray(rows, int)
         return BodyParameters(self.betas, self.rotations[index], self.translations[index])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosedPerson:
-    """What a pose makes of a person."""
+    """The body of a person in one pose."""
 
     rest: Float[np.ndarray, "n 3"]
     """The vertices in the T-pose, (n, 3), metres."""
@@ -139,7 +145,7 @@ def _posed(
 def posed_people(
     body: BodyModel, parameters: BodyParameters, scale: float = 1.0
 ) -> Iterator[PosedPerson]:
-    """A person in one pose after the other, all lengths times `scale`."""
+    """Yields the body of a person in each pose, with all lengths times `scale`."""
     for rotations, translation in zip(parameters.rotations, parameters.translations, strict=True):
         rest, posed = _posed(
             body, *(jnp.asarray(x, jnp.float32) for x in (parameters.betas, rotations, translation))
@@ -158,11 +164,11 @@ def coefficients(
     expression: Float[np.ndarray, " e"],
     file: object,
 ) -> Float[np.ndarray, " all"]:
-    """Coefficients of all of the body's directions: shape, then expression. Those that a file has
-    not are 0.
+    """Returns coefficients for all directions of the body: shape, then expression. Coefficients
+    that the file does not have are 0.
 
-    Raises: CaptureError for more numbers than the body has directions, unless they are 0; and for a
-    body whose directions mean something else than SMPL-X's.
+    Raises: CaptureError for more numbers than the body has directions, unless they are 0, and for a
+    body whose directions are not those of SMPL-X.
     """
     if not any(name.startswith("shape_") for name in body.shape_names):
         problem = (
@@ -182,9 +188,10 @@ def coefficients(
 def turned(
     parameters: BodyParameters, matrix: Float[np.ndarray, "4 4"], pelvis: Float[np.ndarray, "3"]
 ) -> BodyParameters:
-    """The same poses in a world that a rigid transform moved.
+    """Returns the parameters of the same poses in a world that a rigid transform moved.
 
-    pelvis: (3,) its place in the T-pose of the person.
+    matrix: the transform, (4, 4), metres. pelvis: the place of the pelvis in the person's T-pose,
+    (3,), metres.
     """
     from scipy.spatial.transform import Rotation
 
@@ -199,10 +206,10 @@ def turned(
 def recover_shape(
     body: FileBody, rest: Float[np.ndarray, "n 3"], file: object
 ) -> tuple[float, Float[np.ndarray, " s"]]:
-    """Scale and shape coefficients of a T-pose `v_cano`, by least squares: rest = scale (template +
-    directions betas).
+    """Returns the scale and the shape coefficients of a T-pose `v_cano`, by least squares: rest =
+    scale (template + directions betas).
 
-    Where all vertices do not fit, the hands are left out, which the release bends by accident.
+    If the fit of all vertices fails, the hands are left out, which the release bends by accident.
     Raises: CaptureError if the arrays are not of this body.
     """
     template = body.arrays[0]
@@ -232,9 +239,10 @@ def _shape_solvers(
 ) -> tuple[
     tuple[Float[np.ndarray, "_u _r"], Float[np.ndarray, "_r _u"], Bool[np.ndarray, " n"]], ...
 ]:
-    """Prepares the least-squares problem of `recover_shape`: of all vertices, then without hands.
+    """Prepares the least-squares problems of `recover_shape`: the first with all vertices, the
+    second without hands.
 
-    Each is (pseudo-inverse, columns, which vertices).
+    Each is a tuple of the pseudo-inverse, the columns, and the vertices that are used.
     """
     columns = np.concatenate([body.arrays[0][..., None], body.arrays[1]], axis=-1)
     of_hands = np.asarray(body.model.skinning_weights)[:, FIRST_HAND_JOINT:].sum(axis=1) > 1e-6
@@ -252,10 +260,10 @@ def recover_pose(
     transforms: Float[np.ndarray, "j 4 4"],
     file: object,
 ) -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "3"]]:
-    """Rotations and translation (metres) of a person from `joint_transforms`, which take the scaled
-    T-pose to the pose.
+    """Returns the rotations (radians) and the translation (metres) of a person from
+    `joint_transforms`, which take the scaled T-pose to the pose.
 
-    Raises: CaptureError if one of them is no rotation.
+    Raises: CaptureError if the linear part of a transform is no rotation.
     """
     from scipy.spatial.transform import Rotation
 
@@ -274,17 +282,18 @@ def recover_pose(
 # --------------------------------------------------------------------------------------------------
 
 STORED_SIZE = 512
-"""Pixels a side of the squares that photos of data sets become; 256 and 128 are box averages of it.
+"""Side of the squares that photos of data sets become, pixels. Sides of 256 and 128 are box
+averages of it.
 """
 Photo = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]
 """An image on white and its mask."""
 THREADS = os.cpu_count() or 1
-"""That decode the photos of one request: JPEG decoding releases the interpreter's lock."""
+"""Threads that decode the photos of one request. JPEG decoding releases the interpreter's lock."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Subject:
-    """One person, see the module."""
+    """One person of a data set. Opening it reads no photo; `read` does."""
 
     name: str
     """The name in errors and manifests."""
@@ -299,22 +308,24 @@ class Subject:
     frame_count: int
     """The number of poses."""
     view_name: Callable[[int], str]
-    """Gives a view a name such as "cam03_00000120"."""
+    """Returns the name of a view, such as "cam03_00000120"."""
     read: Callable[[int], tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]]
-    """Reads a view: the image on white (h, w, 3) and the mask (h, w), both in [0, 1]."""
+    """Reads a view: returns the image on white (h, w, 3) and the mask (h, w), both in [0, 1]."""
     parameters: Callable[[Sequence[int]], BodyParameters]
-    """Gives the shape, and the poses of these frames."""
+    """Returns the shape, and the poses of the frames in its argument."""
     missing: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """How many photos are left out, by the reason."""
+    """The number of photos that are left out, by the reason."""
 
     def __len__(self) -> int:
-        """Number of views."""
+        """Returns the number of views."""
         return len(self.frames)
 
     def squared_K(
         self, views: Sequence[int] | Int[np.ndarray, " any"], size: int
     ) -> Float[np.ndarray, "any 3 3"]:
-        """Intrinsics of these views padded to squares and resized to `size` pixels."""
+        """Returns the camera matrices of views that are padded to squares and resized to `size`
+        pixels.
+        """
         width, height = self.sizes[views].T
         side = self.sizes[views].max(axis=1)
         K = self.K[views].copy()
@@ -324,7 +335,8 @@ class Subject:
         return K
 
     def photo(self, view: int, size: int) -> Photo:
-        """Image on white and mask of one view, padded to a centred square and resized.
+        """Read one view. Returns the image on white and the mask, padded to a centred square and
+        resized to `size` pixels.
 
         Raises: ValueError naming the file.
         """
@@ -345,7 +357,9 @@ class Subject:
     def tried(
         self, views: Sequence[int] | Int[np.ndarray, " any"], size: int
     ) -> list[Photo | Exception]:
-        """Several of these, decoded in parallel; in place of those that cannot be read, why."""
+        """Read several views in parallel, see `photo`. A view that cannot be read gives its error
+        in place of a photo.
+        """
 
         def photo(view: int) -> Photo | Exception:
             try:
@@ -359,7 +373,10 @@ class Subject:
     def photos(
         self, views: Sequence[int] | Int[np.ndarray, " any"], size: int
     ) -> tuple[UInt8[np.ndarray, "any size size 3"], UInt8[np.ndarray, "any size size"]]:
-        """Several of these, decoded in parallel. Raises: as `photo`."""
+        """Read several views in parallel, see `photo`. Returns their images and masks, stacked.
+
+        Raises: as `photo`.
+        """
         images, masks = [], []
         for photo in self.tried(views, size):
             if isinstance(photo, Exception):
@@ -374,8 +391,8 @@ class Subject:
         body: FileBody,
         size: int = STORED_SIZE,
     ) -> Capture:
-        """These views as a `Capture`, to reconstruct and to animate; its poses are those of the
-        frames that are seen.
+        """Returns some views as a `Capture`, which can be reconstructed and animated. Its poses are
+        those of the frames that the views show.
 
         Raises: ValueError naming file and field.
         """
@@ -403,11 +420,8 @@ class Subject:
 
 @dataclasses.dataclass(eq=False)
 class Person:
-    """A subject that is opened when it is first asked for, as `loading.captures.PeopleCache` wants
-    it.
-
-    name: of the subject. open: makes the `Subject`, and raises ValueError if it cannot be used.
-    size: of the stored squares.
+    """A subject that is opened when it is first asked for. It is a
+    `loading.captures.StoredPerson`.
     """
 
     name: str
@@ -419,11 +433,14 @@ class Person:
 
     @functools.cached_property
     def subject(self) -> Subject:
-        """The subject. Raises: ValueError, naming file and field."""
+        """The subject, opened at the first use.
+
+        Raises: ValueError, naming file and field.
+        """
         return self.open()
 
     def summary(self) -> StoredSubject:
-        """All of it but pixels and poses."""
+        """Returns all of the subject but its pixels and poses."""
         subject, every = self.subject, np.arange(len(self.subject))
         betas, *poses = subject.parameters([])
         K = subject.squared_K(every, self.size)
@@ -434,11 +451,11 @@ class Person:
     def decode(
         self, views: Sequence[int]
     ) -> tuple[UInt8[np.ndarray, "any h w 3"], UInt8[np.ndarray, "any h w"]]:
-        """Images and masks of these views."""
+        """Returns the images and masks of some views."""
         return self.subject.photos(views, self.size)
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
-        """These views with the poses that they show alone.
+        """Returns the subject with the poses that its views show, renumbered from 0.
 
         Raises: ValueError naming file and field.
         """
@@ -451,12 +468,11 @@ class Person:
 
 
 def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tuple[Person, ...]:
-    """The people of a data set of any layout that has photos (`data.formats.DATASETS`); each is
-    opened when it is asked for.
+    """Returns the people of a data set that has photos, in any layout of `data.formats.DATASETS`.
+    Each person is opened when it is first asked for.
 
-    Arguments: size: pixels a side of the stored squares; None: that of the images of a scene list,
-    else `STORED_SIZE`.
-    Raises: CaptureError if the folder has none of the layouts.
+    Arguments: size: the side of the stored squares, pixels. None: the size of the images of a scene
+    list, else `STORED_SIZE`. Raises: CaptureError if the folder has none of the layouts.
     """
     path = Path(path)
     for name, data_set in DATASETS.items():

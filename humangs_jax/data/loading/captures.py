@@ -1,5 +1,5 @@
-"""People on disk as a source: images are kept decoded as bytes; who cannot be used is left out, and
-reported.
+"""A source of examples from people on disk. Decoded images are kept as bytes. People that cannot be
+used are left out and reported.
 """
 
 import dataclasses
@@ -38,8 +38,8 @@ logger = logging.getLogger("humangs_jax.data.loading")
 
 
 def find_captures(root: str | Path) -> tuple[Path, ...]:
-    """The capture folders directly inside a folder, sorted by name; the folder itself if it is a
-    capture.
+    """Returns the capture folders directly inside a folder, sorted by name; the folder itself if it
+    is a capture.
 
     Raises: ValueError if there is none.
     """
@@ -57,15 +57,15 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
 def read_summary(
     path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY
 ) -> StoredSubject:
-    """All of a capture but its pixels: parameters that belong to `body`, images and masks of no
-    views but of the right size.
+    """Returns all of a capture but its pixels. Its parameters belong to `body`; its images and
+    masks have the right size, but hold no views.
 
-    Images are opened and their sizes compared; PNG files are checked by their checksums, others by
+    Images are opened and their sizes compared. PNG files are checked by their checksums, others by
     decoding them.
 
-    Arguments: body_file: where `body` comes from, see `Capture`.
-    Raises: ValueError naming file and field; without masks a capture cannot be learned from, and
-    shape and poses of another body mean nothing to this one.
+    Arguments: body_file: the file that `body` comes from, see `Capture`. Raises: ValueError naming
+    file and field. Captures without masks cannot be learned from, and parameters of another body do
+    not fit this one.
     """
     folder = Path(path)
     file = folder / "capture.json"
@@ -113,7 +113,9 @@ def read_summary(
 
 
 def _same_body(name: str, folder: Path, body_file: str | Path) -> bool:
-    """Whether a capture in `folder` that calls its body `name` has the one of `body_file`."""
+    """Returns whether `name`, by which a capture in `folder` calls its body, means the body of
+    `body_file`.
+    """
     if DEFAULT_BODY in (name, str(body_file)):
         return name == str(body_file)
     return (folder / name).resolve() == Path(body_file).resolve()
@@ -121,15 +123,15 @@ def _same_body(name: str, folder: Path, body_file: str | Path) -> bool:
 
 @runtime_checkable
 class StoredPerson(Protocol):
-    """One person on disk, of a capture folder or of a data set (`datasets.subject.Person`)."""
+    """One person on disk, from a capture folder or a data set (`datasets.subject.Person`)."""
 
     @property
     def name(self) -> Path | str:
-        """What the log and `broken` call it."""
+        """The name of the person in the log and in `broken`."""
         ...
 
     def summary(self) -> StoredSubject:
-        """All of it but pixels, perhaps without poses.
+        """Returns all of the person but pixels, perhaps without poses.
 
         Raises: ValueError or OSError if it cannot be used.
         """
@@ -138,11 +140,15 @@ class StoredPerson(Protocol):
     def decode(
         self, views: Sequence[int]
     ) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
-        """Images and masks of these views. Raises: as `summary`."""
+        """Returns the images and masks of some views.
+
+        Raises: as `summary`.
+        """
         ...
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
-        """Some views of the summary, with at least the poses that they show.
+        """Returns the subject, some views of the summary, with at least the poses that these views
+        show.
 
         Raises: as `summary`.
         """
@@ -161,13 +167,13 @@ class CaptureFolder:
     """The file that the body model was read from."""
 
     def summary(self) -> StoredSubject:
-        """See `read_summary`."""
+        """Returns all of the capture but its pixels, see `read_summary`."""
         return read_summary(self.name, self.body, self.body_file)
 
     def decode(
         self, views: Sequence[int]
     ) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
-        """See `StoredPerson`."""
+        """Returns the images and masks of some views."""
         capture = load_capture(self.name, body=self.body, views=views)
         if capture.masks is None:
             raise CaptureError(
@@ -176,16 +182,16 @@ class CaptureFolder:
         return to_uint8(capture.images), to_uint8(capture.masks)
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
-        """The same: the summary has all poses."""
+        """Returns the subject as it is, since the summary has all poses."""
         return subject
 
 
 class PeopleCache:
-    """People on disk: each is checked when first asked for; images are decoded when needed, and
-    kept as bytes up to a limit.
+    """The people of a source on disk. Each is checked when it is first asked for. Images are
+    decoded when they are needed, and kept as bytes up to a limit.
 
-    Several threads may ask at once. broken: name -> what is wrong with it, in the order in which it
-    was found.
+    Several threads may ask at once. broken: what is wrong with people, by name, in the order in
+    which it was found.
     """
 
     def __init__(self, people: Sequence[StoredPerson], limit_bytes: int = 4 << 30):
@@ -202,12 +208,12 @@ class PeopleCache:
         return len(self.people)
 
     def name(self, index: int) -> Path | str:
-        """What errors call person `index`."""
+        """Returns the name of person `index` in errors."""
         return self.people[index].name
 
     def summary(self, index: int) -> StoredSubject | None:
-        """Person `index` without images, see `StoredPerson`; None if it is broken, which is
-        reported once.
+        """Returns person `index` without images, see `StoredPerson`; None if the person is broken,
+        which is reported once.
         """
         name = self.name(index)
         with self._lock:
@@ -222,7 +228,7 @@ class PeopleCache:
             return self._summaries.setdefault(name, summary)
 
     def some_views(self, index: int, views: Sequence[int]) -> StoredSubject:
-        """Person `index` with these views alone, in this order.
+        """Returns person `index` with these views alone, in this order.
 
         Raises: ValueError naming file and field.
         """
@@ -250,8 +256,8 @@ class PeopleCache:
         return person.posed(summary._replace(images=images, masks=masks, **of_views))
 
     def note(self, index: int, problem: str) -> None:
-        """Record person `index` as broken, and log it the first time; other views of it are still
-        used.
+        """Record person `index` as broken, and log the first problem. Other views of the person are
+        still used.
         """
         name = self.name(index)
         with self._lock:
@@ -264,7 +270,7 @@ class PeopleCache:
             )
 
     def report(self, index: int, problem: str) -> None:
-        """Leave person `index` out from now on. The reason must depend on the files alone, so that
+        """Leave person `index` out from now on. The problem must depend on the files alone, so that
         the order stays reproducible.
 
         Raises: ValueError, naming the last problem, once everybody is left out.
@@ -299,7 +305,7 @@ class PeopleCache:
 class CaptureCache(PeopleCache):
     """The people of capture folders.
 
-    body_file: where `body` comes from; captures that name another one are broken.
+    body_file: the file that `body` comes from. Captures that name another body are broken.
     """
 
     def __init__(
@@ -338,7 +344,7 @@ class CaptureSource:
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """People left out so far: name -> what is wrong with it."""
+        """The people left out so far: what is wrong with each, by name."""
         return {str(name): problem for name, problem in self.cache.broken.items()}
 
     def __len__(self) -> int:
@@ -353,7 +359,7 @@ class CaptureSource:
         return str(self._found(seed, index, input_count)[0])
 
     def unusable(self) -> dict[str, str]:
-        """Names the people that no example can be made of: name -> what is wrong.
+        """Returns the people that no example can be made of: what is wrong with each, by name.
 
         Their files may be wrong, or they lack views or sizes. No photo is decoded.
         """
@@ -371,9 +377,9 @@ class CaptureSource:
     def _drawn(
         self, generator: np.random.Generator, summary: StoredSubject, input_count: int
     ) -> tuple[list[int], list[int]]:
-        """Input and target views of one person.
+        """Returns the numbers of the input and target views of one person.
 
-        Raises: ValueError where there are too few, or too small ones.
+        Raises: ValueError if there are too few views, or their photos are too small.
         """
         views = sample_views(generator, summary, input_count, self.sampling)
         for size in (self.input_size, self.target_size):
