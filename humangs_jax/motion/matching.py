@@ -1,8 +1,8 @@
-"""Which joint of a file's skeleton is which of ours: by names that are known, else by the tree.
+"""Finds our joints in a file's skeleton: by known names, or else by the tree of the joints.
 
-By the tree: two limbs of like bones below a joint are legs, two others above it are arms; what
-hangs between the arms ends in the head. A knee or elbow is where the two longest consecutive bones
-of a limb meet. Names or places tell left from right.
+In the tree, two limbs with similar bones below one joint are the legs, and two others above it are
+the arms. What hangs between the arms ends in the head. A knee or elbow is where the two longest
+consecutive bones of a limb meet. Names or places tell left from right.
 """
 
 import re
@@ -27,7 +27,7 @@ from humangs_jax.motion.rules import (
 )
 
 _SHOWN = 12
-"""Names of joints in an error."""
+"""Largest number of joints' names in an error."""
 _Places = Float[np.ndarray, "s 3"]
 _Pair = tuple[list[int], list[int]]
 
@@ -35,10 +35,12 @@ _Pair = tuple[list[int], list[int]]
 def matched(
     names: Sequence[str], parents: Sequence[int], rest: _Places, posed: _Places
 ) -> dict[str, int]:
-    """Index of the file's joint for each of ours that it has. rest, posed: places in the rest pose
-    and in the first frame.
+    """Returns, for each of our joints that the file has, the index of the file's joint.
 
-    Raises: InvalidFileError if neither names nor the tree tell where those are that are needed.
+    names, parents: of the file's joints. rest, posed: their places in the rest pose and in the
+    first frame, (s, 3).
+
+    Raises: InvalidFileError if neither names nor the tree show all joints that are needed.
     """
     # by names first
     plain = _plain(names)
@@ -79,8 +81,9 @@ def matched(
 
 
 def _plain(names: Sequence[str]) -> list[str]:
-    """Lower-case letters and digits, without the prefixes that all or many names share:
-    "Model:Bip01_L_Thigh" is "lthigh".
+    """Simplifies names to lower-case letters and digits: "Model:Bip01_L_Thigh" is "lthigh".
+
+    Words that say nothing about the joint are removed, and a beginning that all names share.
     """
     words = [re.findall(r"[a-z0-9]+", re.sub(r"^.*[:|]", "", name).lower()) for name in names]
     words = [[word for word in each if word not in NOISE] for each in words]
@@ -93,7 +96,7 @@ def _plain(names: Sequence[str]) -> list[str]:
 
 
 def _named(plain: Sequence[str]) -> dict[str, int]:
-    """Our joints by known names; a joint of the file is taken once, by the first that wants it."""
+    """Finds our joints by known names. Each joint of the file is taken once, by the first match."""
     source: dict[str, int] = {}
 
     def find(ours: str, theirs: Sequence[str]) -> None:
@@ -116,7 +119,7 @@ def _named(plain: Sequence[str]) -> dict[str, int]:
 
 
 def _ancestors(parents: Sequence[int], joint: int) -> list[int]:
-    """The joint and those above it, from below."""
+    """Returns a joint and all joints above it, from the joint to the root."""
     found = []
     while joint >= 0 and len(found) <= len(parents):
         found.append(joint)
@@ -125,7 +128,7 @@ def _ancestors(parents: Sequence[int], joint: int) -> list[int]:
 
 
 def _place_pelvis(source: dict[str, int], parents: Sequence[int], hips: Sequence[int]) -> None:
-    """Where both hips hang, unless the joint of that name is above them."""
+    """Sets the pelvis to the joint that both hips hang on, unless the named one is above them."""
     above = [_ancestors(parents, hip)[1:] for hip in hips]
     common = [joint for joint in above[0] if joint in above[1]]
     if common and source.get("pelvis") not in common:
@@ -133,7 +136,7 @@ def _place_pelvis(source: dict[str, int], parents: Sequence[int], hips: Sequence
 
 
 def _descends(source: dict[str, int], parents: Sequence[int]) -> bool:
-    """Whether limbs hang below each other."""
+    """Whether the joints of limbs hang below each other as they should, see UNDER."""
     pairs = [(f"{side}_{a}", f"{side}_{b}") for a, b in UNDER for side in SIDES]
     return all(
         source[a] in _ancestors(parents, source[b])[1:]
@@ -156,8 +159,9 @@ def _path(joint: int, children: list[list[int]], reach: np.ndarray) -> list[int]
 def _limbs(
     plain: Sequence[str], parents: Sequence[int], lengths: np.ndarray, posed: _Places
 ) -> dict[str, int] | None:
-    """The joints of arms, legs, pelvis and head by the tree; None where it is not one of a
-    person.
+    """Finds the joints of arms, legs and pelvis by the tree; None if it is not that of a person.
+
+    lengths: of the bone above each joint. posed: places in the first frame, (s, 3).
     """
     children: list[list[int]] = [[] for _ in parents]
     for i, p in enumerate(parents):
@@ -169,7 +173,7 @@ def _limbs(
         reach[i] += max((reach[child] for child in children[i]), default=0.0)
 
     def pair_below(joint: int) -> _Pair | None:
-        """Gives the bending joints of the two longest limbs below a joint with matching bones."""
+        """Returns `_bends` of the two longest limbs below a joint that have similar bones."""
         paths = [_path(child, children, reach) for child in children[joint]]
         limbs = [limb for limb in (_bends(path, lengths) for path in paths) if limb]
 
@@ -204,8 +208,9 @@ def _limbs(
 
 
 def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
-    """Of the joints of a limb: where its two longest bones in a row begin, meet and end, and the
-    next.
+    """Returns the joints where the two longest consecutive bones of a limb begin, meet and end.
+
+    The next joint follows them if there is one. None: the limb has fewer than two bones.
     """
     bones = lengths[path[1:]]
     if len(bones) < 2:
@@ -225,7 +230,7 @@ def _sided(
     chest: int,
     arms: _Pair,
 ) -> dict[str, int]:
-    """Limbs as our joints: left and right by their names, else by where they are in space."""
+    """Returns the joints of limbs by our names; names or places tell left from right."""
     up = unit(posed[chest] - posed[pelvis])
     toes = [posed[leg[3]] - posed[leg[2]] for leg in legs if len(leg) > 3]
     forward = np.sum(toes, axis=0) if toes else np.array([0.0, 0, 1])
@@ -251,7 +256,7 @@ def _sided(
 
 
 def _side(plain: Sequence[str], limb: Sequence[int]) -> str:
-    """Left or right, if all names of a limb begin or end so."""
+    """Returns "left" or "right" if the names of a limb all begin or end so, else ""."""
     for side in SIDES:
         if all(
             plain[j].startswith((side, side[0])) or plain[j].endswith((side, side[0]))
@@ -266,7 +271,7 @@ def _side(plain: Sequence[str], limb: Sequence[int]) -> str:
 
 
 def _match_toes(source: dict[str, int], parents: Sequence[int], rest: _Places) -> None:
-    """Where the toes have no known name: what is furthest from the ankle below it."""
+    """Adds toes that have no known name: the joint below the ankle that is furthest from it."""
     for side in SIDES:
         ankle = source[f"{side}_ankle"]
         below = [
@@ -281,8 +286,9 @@ def _match_toes(source: dict[str, int], parents: Sequence[int], rest: _Places) -
 
 
 def _match_head(source: dict[str, int], plain: Sequence[str], parents: Sequence[int]) -> None:
-    """What hangs between the arms: the first joint is the neck, the last the head, but for ends of
-    bones.
+    """Adds neck and head, if neither is known, from the longest chain that hangs between the arms.
+
+    The first joint is the neck, and the last one that is not the end of a bone is the head.
     """
     if "neck" in source or "head" in source:
         return
@@ -308,8 +314,9 @@ def _match_head(source: dict[str, int], plain: Sequence[str], parents: Sequence[
 
 
 def _match_spine(source: dict[str, int], parents: Sequence[int]) -> None:
-    """Spines have one to five joints, called differently everywhere: ours are the first, middle and
-    last of the file's.
+    """Adds the spine: our three joints are the first, the middle and the last of the file's.
+
+    Spines of files have one to five joints, with different names in every program.
     """
     chain = []
     if "neck" in source:

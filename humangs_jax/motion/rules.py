@@ -1,8 +1,7 @@
-"""What the readers of motions know beside `data.formats`, as tables: names of joints, axes, limits
-of decisions; and which way is up in the world of a motion.
+"""Tables that the readers of motions share, and the choice of the axis that is up in a motion.
 
-The page reads motions too. `page_rules` is put into it when it is assembled (viewer/page.py); it
-has no other tables.
+The tables hold names of joints and limits of decisions. The page reads motions too, and gets all
+its tables from `page_rules` when it is assembled (viewer/page.py).
 """
 
 import dataclasses
@@ -37,10 +36,10 @@ COLUMNS = {
     72: "SMPL",
     BODY_NUMBERS: "the body",
 }
-"""Numbers of a pose, by whose joints they are."""
+"""How many numbers a pose has, and the body model that has this many."""
 MILLIMETRES = 1000.0
 ORTHONORMAL = 0.05
-"""R R^T of a rotation matrix in a file is this near to 1."""
+"""Largest difference of R R^T from the identity at which a matrix in a file is a rotation."""
 NO_RATE = "the file says no frames per second: taken for {:g}"
 NO_PLACES = "the file has no positions ({}): people stay in place"
 
@@ -49,8 +48,9 @@ NO_PLACES = "the file has no positions ({}): people stay in place"
 
 
 def _finger(finger: str, i: int) -> tuple[str, ...]:
-    """Names of the i-th joint of a finger, from 1 at the palm; Biped counts fingers from the
-    thumb.
+    """Returns the known names of joint i of a finger, counted from 1 at the palm.
+
+    Names of Biped have the number of the finger, counted from 0 at the thumb.
     """
     number = ("thumb", "index", "middle", "ring", "pinky").index(finger)
     words = (finger, "little") if finger == "pinky" else (finger,)
@@ -87,10 +87,11 @@ SIDED = {
     "eye": ("eye",),
     **{f"{finger}{i}": _finger(finger, i) for finger in FINGERS for i in (1, 2, 3)},
 }
-"""Joints with a side by the names of others, without it, lower case, letters and digits alone: CMU
-(cgspeed), Mixamo, LaFAN, MotionBuilder, Biovision, Biped, SMPL, Unreal, Unity, VRM, Bandai-Namco,
-Xsens, SOMA, Rigify, Daz, Advanced Skeleton. A joint of the file is taken once, by the first that
-wants it: "shoulder" is the upper arm where there is no other, else the collar."""
+"""For each of our joints that has a side, its names in other programs: CMU (cgspeed), Mixamo,
+LaFAN, MotionBuilder, Biovision, Biped, SMPL, Unreal, Unity, VRM, Bandai-Namco, Xsens, SOMA, Rigify,
+Daz, Advanced Skeleton. Names are without the side, and have lower-case letters and digits only. A
+joint of the file is taken once, by the first match: "shoulder" is the upper arm if no other name
+is, else the collar."""
 MIDDLE = {
     "pelvis": ("hips", "hip", "pelvis"),
     "neck": ("neck", "neck1", "neck01", "necklower"),
@@ -118,9 +119,9 @@ NOISE = (
     ),
     *("ctrl", "rig", "armature", "character", "valvebiped", "avatar"),
 )
-"""Words in names that say nothing of the joint."""
+"""Words in names that say nothing about the joint."""
 ENDS = ("end", "nub", "top", "tip", "site")
-"""How names of the ends of bones end."""
+"""Endings of the names that ends of bones have."""
 UNDER = (
     ("hip", "knee"),
     ("knee", "ankle"),
@@ -128,9 +129,9 @@ UNDER = (
     ("shoulder", "elbow"),
     ("elbow", "wrist"),
 )
-"""Which joints hang below which."""
+"""Pairs of joints of which the second must hang below the first."""
 LIKE = 0.15
-"""Share by which the bones of two limbs may differ."""
+"""Largest difference between bones of two limbs of a pair, as a share of the longest bone."""
 SIDES = ("left", "right")
 _CHAINS = (
     ("pelvis", "spine1", "spine2", "spine3", "neck", "head"),
@@ -144,9 +145,9 @@ _CHAINS = (
         )
     ),
 )
-"""Bones: each joint points to the next of its last chain that the file has.
+"""Chains of joints: a bone goes from a joint to the next joint of its chain that the file has.
 
-Others are moved as their parents are.
+For a joint in several chains the last one counts. Other joints move as their parents do.
 """
 NEXT = {name: chain[i + 1 :] for chain in _CHAINS for i, name in enumerate(chain)}
 NEEDED = (
@@ -154,51 +155,51 @@ NEEDED = (
     *(f"{s}_{n}" for n in ("hip", "knee", "ankle", "shoulder", "elbow") for s in SIDES),
 )
 TOPS = ("spine3", "neck", "left_shoulder")
-"""Where the trunk ends: the first that the file has."""
+"""Joints where the trunk may end; the first one that the file has is used."""
 FEET = tuple(tuple(f"{side}_{name}" for side in SIDES) for name in ("ankle", "foot"))
-"""Joints that may touch the floor, of both sides by kind."""
+"""Joints that may touch the floor: one pair (left, right) for each kind of joint."""
 EXPECTED_NAMES = (
     "expected the names of CMU, Mixamo, Unity or another known program, or two legs and two arms of"
     " a person"
 )
 FEW = 5
-"""Joints that have to share the beginning of their names for it to be no part of them."""
+"""Least number of names at which a beginning that all of them share is removed."""
 
 # Decisions
 # --------------------------------------------------------------------------------------------------
 
 STANDING = -0.5
-"""Cosine between legs and spine below which a person can stand in a rest pose."""
+"""A rest pose is one to stand in if the cosine between legs and spine is less than this."""
 BETTER_TILT = np.radians(10)
-"""How much better the joints that carry the hips must agree with the trunk than the pelvis's own,
-on average, to stand for it.
+"""Radians. The joints that carry the hips give the rotation of the pelvis if their mean angle to
+the trunk is smaller by this much than that of the pelvis's joint.
 """
 LARGEST_BEND = np.radians(60)
-"""Between pelvis and lowest spine, on average over the frames: beyond it the pelvis's rotation is
-not that of a pelvis.
+"""Largest mean angle between pelvis and lowest spine over the frames, radians. If it is larger, the
+rotation of the pelvis's joint is not that of a pelvis.
 """
 RATE_ROUNDING = 1e-4
-"""Relative error of a frame rate: BVH files have as few as four digits of the time of a frame."""
+"""Relative error of a frame rate. Some BVH files give the time of a frame in only four digits."""
 
 FLOOR_BAND = 0.05
-"""Metres from the usual height of the lowest joint within which that joint is on the floor."""
+"""The lowest joint is on the floor if it is within this distance of its usual height, metres."""
 STILL = (0.1, 0.3)
-"""A joint rests on the floor if it moves by less than this many metres a second, or than this share
-of the joints' mean speed.
+"""A joint rests on the floor if it is slower than the first number, in metres per second, or than
+the second number times the mean speed of all joints.
 """
 ON_THE_FLOOR = 0.5
-"""Share of the frames with a joint on the floor from which on an axis has a floor; another axis has
-none at less than half of that axis's share."""
+"""An axis has a floor if a joint rests on it in at least this share of the frames. Another axis has
+none if its share is at most half of that."""
 TREADMILL = 0.8
-"""Share of the frames with the lowest joint at one height from which on another axis has a floor
-where nothing rests.
+"""Where nothing rests on a floor, an unusual axis has a floor if the lowest joint is at one height
+in at least this share of the frames.
 """
 MOST_FRAMES = 1000
-"""Of a motion, evenly spread, that are asked for a floor."""
+"""Largest number of frames, evenly spread, in which a floor is looked for."""
 HANDS = tuple(
     i for i, name in enumerate(JOINT_NAMES) if any(x in name for x in ("elbow", "wrist", *FINGERS))
 )
-"""Joints that carry a person who is upside down."""
+"""Indices of the joints that carry a person who is upside down."""
 
 
 # Which way is up
@@ -206,8 +207,9 @@ HANDS = tuple(
 
 
 def sampled_frames(count: int) -> np.ndarray:
-    """Frames that are asked for a floor, evenly spread, each followed by its next: 0, 1, 40, 41,
-    ...
+    """Returns indices of frames in which a floor is looked for: 0, 1, 40, 41, ...
+
+    They are evenly spread pairs of a frame and the next one.
     """
     first = np.unique(
         np.linspace(0, max(count - 2, 0), min(max(count - 1, 1), MOST_FRAMES)).astype(int)
@@ -222,17 +224,16 @@ def up_axis(
     fps: float,
     also: tuple[str, ...] = (),
 ) -> tuple[str, str]:
-    """Gives the axis that is up, and a note about it ("": none).
+    """Returns the axis that is up, and a note about it, "" for none.
 
-    It is the usual one of the format. Another has to be the one along which the person stands, and
-    the floor must agree: things rest on a floor, so that the lowest joint stays at one height and
-    still. Lying, crawling and upside-down people stand along other axes, but rest on no floor
-    there.
+    It is the usual axis of the format, unless the person stands along another axis and there is a
+    floor below: the lowest joint stays at one height and rests there. Lying, crawling and
+    upside-down people also stand along other axes, but rest on no floor below.
 
-    Arguments: points: joints in space, metres, pairs of frames as `sampled_frames` has them.
-    stands: the axis along which the person stands on average, if any. usual: the format's. also:
-    axes that are up in other files of the format; they are believed unless the floor contradicts.
-    Someone who is upside down on the hands stands on them.
+    points: joints in space, metres, in the frames of `sampled_frames`. stands: the axis along which
+    the person stands on average; None: there is none. usual: the axis of the format. also: axes
+    that are up in some files of the format. If the person stands along one of them, it is up unless
+    the floor contradicts, or unless the person is upside down on the hands.
     """
     if stands is None or stands == usual:
         return usual, ""
@@ -257,8 +258,10 @@ def up_axis(
 def _floors(
     points: Float[np.ndarray, "pairs s 3"], axes: Sequence[str], fps: float | int
 ) -> list[float]:
-    """Share of the frames in which something is on the floor, for the usual axis and for another,
-    which has to be surer.
+    """Returns, for the usual axis and another one, the share of frames with a joint on a floor.
+
+    The joint has to rest there. If that is rare for both axes, as on a treadmill, it only has to be
+    at one height, and the other axis needs a share of at least TREADMILL.
     """
     moves = np.linalg.norm(points[1::2] - points[::2], axis=-1) * fps
     limit = max(STILL[0], STILL[1] * float(moves.mean()))
@@ -280,7 +283,7 @@ def joint_places(
     rotations: Float[np.ndarray, "m j 3"],
     translations: Float[np.ndarray, "m 3"],
 ) -> Float[np.ndarray, "m j 3"]:
-    """Joints in space of a body of SMPL-X's joints."""
+    """Returns the joints in space (m, j, 3) of a moving body of SMPL-X's joints, metres."""
     turns = Rotation.from_rotvec(rotations.reshape(-1, 3)).as_matrix()
     turns = turns.reshape(*rotations.shape, 3)
     bones = np.broadcast_to(bones_of(joints, PARENTS), rotations.shape)
@@ -288,7 +291,7 @@ def joint_places(
 
 
 def page_rules() -> dict[str, Any]:
-    """All of it as JSON has it, for the page."""
+    """Returns the tables of this module, and those of formats, as the page gets them in JSON."""
     names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE NOISE ENDS UNDER LIKE SIDES NEXT
     NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING
     FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS ORTHONORMAL NO_RATE NO_PLACES"""

@@ -1,4 +1,4 @@
-"""Skeletons of other programs in motion, brought to our joints: BVH and glTF.
+"""Converts moving skeletons of other programs, from BVH and glTF files, to our joints.
 
 Bones point where the file's bones point. Every joint of ours has a rotation A_j from our rest frame
 to the file's. It turns our bone into the file's bone of the rest pose, and is the smallest such
@@ -67,13 +67,14 @@ class Clip:
 
 
 def bytes_of_clip(frames: int, joints: int) -> int:
-    """Memory that a clip takes."""
+    """Returns about how many bytes a clip of so many frames and joints takes."""
     return 96 * frames * joints
 
 
 def whole_rate(fps: float) -> float:
-    """Frames per second, a whole number where they are one up to the rounding of the file: BVH has
-    0.0083333 for 120.
+    """Rounds frames per second to a whole number where only the rounding of the file is between.
+
+    A BVH file has 0.0083333 seconds per frame for 120 frames per second.
     """
     if abs(fps - round(fps)) < rules.RATE_ROUNDING * fps:
         return float(round(fps))
@@ -82,7 +83,7 @@ def whole_rate(fps: float) -> float:
 
 @functools.cache
 def shipped_joints() -> Float[np.ndarray, "j 3"]:
-    """Joints of the shipped body in T-pose, mean shape, metres."""
+    """Returns the joints (j, 3) of the shipped body in T-pose and mean shape, metres."""
     with resources.as_file(resources.files("humangs_jax") / "assets" / "makehuman.npz") as file:
         body = read_body(file)
     return np.asarray(body.joint_regressor, np.float64) @ np.asarray(body.template, np.float64)
@@ -91,12 +92,15 @@ def shipped_joints() -> Float[np.ndarray, "j 3"]:
 def retargeted(
     clip: Clip, joints: Float[np.ndarray, "j 3"], up: str = "auto"
 ) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], str]:
-    """Rotations (axis-angle) and translations of a body of SMPL-X's joints that moves as the clip,
-    and what to say about up.
+    """Makes a body of SMPL-X's joints move as a clip.
 
-    Arguments: joints: of the body in T-pose, metres. up: as in `load_motion`.
-    Raises: InvalidFileError if joints of the clip that are needed have no name we know, or the body
-    is no body of SMPL-X's joints.
+    joints: of the body in T-pose, metres. up: as in `load_motion`.
+
+    Returns: rotations (m, j, 3), axis-angle, radians; translations (m, 3), metres; and a note about
+    the axis that is up, "" for none.
+
+    Raises: InvalidFileError if joints of the clip that are needed cannot be found, or if the body
+    does not have SMPL-X's joints.
     """
     if joints.shape != (len(JOINT_NAMES), 3):
         raise InvalidFileError(
@@ -132,7 +136,7 @@ def retargeted(
 
 
 _Source = Mapping[str, int]
-"""Our names of joints -> indices of the file's."""
+"""For our names of joints, the index of the file's joint."""
 
 
 def _up_of(clip: Clip, source: _Source, scale: float, standing: bool) -> tuple[str, str]:
@@ -177,7 +181,11 @@ def _body_turns(
     places: Float[np.ndarray, "m s 3"],
     by_motion: bool,
 ) -> list[Float[np.ndarray, "m 3 3"]]:
-    """G_j (m, 3, 3) of our joints in the world."""
+    """Returns the rotations G_j (m, 3, 3) of our joints in the world, see the head of this module.
+
+    turns, places: of the clip's joints, turned upright. by_motion: whether twists about bones are
+    found from the motion, because nobody can stand in the rest pose.
+    """
     frames_of, world = [], []
     for j, (name, parent) in enumerate(zip(JOINT_NAMES, PARENTS, strict=True)):
         if parent < 0:
@@ -221,7 +229,7 @@ def _pelvis_turns(
     turns: Float[np.ndarray, "m s 3 3"],
     places: Float[np.ndarray, "m s 3"],
 ) -> Float[np.ndarray, "m 3 3"]:
-    """Rotations of the pelvis from the rest pose to the frames, (m, 3, 3).
+    """Returns the rotations of the pelvis from the rest pose to the frames, (m, 3, 3).
 
     They are those of the pelvis's joint, or of the joints that carry the hips if these agree better
     with the trunk. They are then turned so that the line of the hips is the file's.
@@ -298,7 +306,7 @@ def _mean(turns: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "3 3"]:
 def _untwist(
     turns: Float[np.ndarray, "m 3 3"], bone: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """The rotation about a bone that removes the mean twist about it from rotations (m, 3, 3).
+    """Returns the rotation about a bone that removes the mean twist of rotations about that bone.
 
     The twist of a quaternion (w, v) about b is 2 arg(w + i v.b). Its square does not depend on the
     quaternion's sign, and rotations that swing far weigh less in the mean of the squares.

@@ -1,6 +1,7 @@
-"""What is worn on top and on the feet: hoods, scarves, hats, glasses, bags, necklaces, shoes.
+"""Builds accessories and shoes: hoods, scarves, hats, glasses, bags, necklaces, shoes.
 
-Swept tubes, sheets, boxes and silhouettes that follow one joint or the nearest skin.
+Their surfaces are swept tubes, sheets, boxes and stacks of silhouettes. Each follows one joint or
+the nearest skin.
 """
 
 import functools
@@ -27,9 +28,9 @@ from humangs_jax.synthetic.surfaces import (
 )
 
 _RING = 40
-"""Points of a ring around neck or head."""
+"""Number of points of a ring around neck or head."""
 _COLUMNS = 32
-"""Points of a ring of a shoe."""
+"""Number of points of a ring of a shoe."""
 _AZIMUTH = circle(_RING)
 """Azimuths of the points of a ring, radians."""
 _SIDEWAYS, _UP, _FORWARD = np.eye(3)
@@ -38,8 +39,9 @@ _SIDEWAYS, _UP, _FORWARD = np.eye(3)
 def build(
     rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float
 ) -> list[tuple[Surface, Material]]:
-    """Surfaces and materials of an accessory. ease: distance of the outermost layer from the trunk,
-    metres.
+    """Builds the surfaces of an accessory, each with its material.
+
+    ease: distance of the outermost layer of clothes from the trunk, metres.
     """
     kind, sizes, fabric = garment.kind, garment.sizes, garment.fabric
     hat = functools.partial(hair.scalp_shell, rng, anatomy, hat=True)
@@ -79,25 +81,25 @@ def _painted(dye: Vector, sheen: float) -> Material:
 
 
 def _panelled(fabric: Fabric, s: Spots) -> Points:
-    """Six panels of a cap, sewn together."""
+    """Returns the colors (n, 3) of a cap of six panels, which are sewn together."""
     angle, colors = np.arctan2(s.template[:, 0], s.template[:, 2] - 0.02), fabric.colors(s)
     seam = np.abs((angle / (np.pi / 3) + 0.5) % 1 - 0.5) * (np.pi / 3) * 0.08
     return mix(colors, colors * 0.6, band(seam, -1, 0.0016) * (s.template[:, 1] > 0.34))
 
 
 def _ribboned(fabric: Fabric, s: Spots) -> Points:
-    """A ribbon around the crown of a hat."""
+    """Returns the colors (n, 3) of a hat with a ribbon around the crown."""
     above = hair.above_line(s.template, hair.CAP_LINE)
     on_crown = np.hypot(s.template[:, 0], s.template[:, 2] - 0.02) < 0.118
     return mix(fabric.colors(s), fabric.other, band(above, 0.002, 0.026, 0.002) * on_crown)
 
 
 _Ring = tuple[Float[np.ndarray, "ring 3"], Float[np.ndarray, "ring 3"]]
-"""`_RING` rest points from front over left, and outward directions."""
+"""`_RING` points at rest, from the front over the left side, and horizontal directions outwards."""
 
 
 def _neck_ring(anatomy: Anatomy, lift: float) -> _Ring:
-    """Around the neck at a lift above the crew neckline."""
+    """Returns the ring around the neck that is `lift` metres above a crew neckline."""
     return _ring(
         anatomy,
         np.abs(tailoring.neckline(anatomy.skin.template, "crew", 0.0) + lift) < 0.02,
@@ -106,8 +108,10 @@ def _neck_ring(anatomy: Anatomy, lift: float) -> _Ring:
 
 
 def _ring(anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float) -> _Ring:
-    """Means of the chosen skin vertices by azimuth around x = 0, z = middle, on a smooth closed
-    line.
+    """Returns a smooth ring through the skin near chosen vertices.
+
+    Each of its points is a mean of these vertices, weighted by how close their azimuth is. Azimuths
+    are about the axis x = 0, z = middle. near: whether a vertex is chosen, (n,).
     """
     x, _, z = anatomy.skin.template[near].T
     points, azimuths = anatomy.skin.vertices[near], np.arctan2(x, z - middle)
@@ -127,8 +131,10 @@ def _followed(
     columns: int,
     closed: bool = True,
 ) -> Surface:
-    """A swept tube that moves with the skin nearest to it; its template coordinates are its own,
-    around its middle.
+    """Sweeps a tube along a path; it moves with the nearest skin.
+
+    Its template and cloth coordinates are positions relative to the neck. Other arguments are those
+    of `surfaces.sweep`.
     """
     (x, y, _) = anatomy.skin.template.T
     (vertices, faces) = sweep(path, across, widths, columns, closed)
@@ -141,7 +147,7 @@ def _followed(
 
 
 def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
-    """A hood: over the head, or lying in folds around the neck and on the upper back."""
+    """Builds a hood: over the head (`up`), or in folds around the neck and on the upper back."""
     if up:
         return hair.falling_tube(
             rng, anatomy, 0.034, 0.1, _face_opening(0.31, 1.05, 0.096), wave=0.004, ends=0.1
@@ -159,7 +165,7 @@ def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
 def _face_opening(
     middle: float, half_width: float, half_height: float
 ) -> Callable[[Field, Field], Field]:
-    """Azimuths and heights -> positive outside of an oval around the face."""
+    """Returns a function of azimuths and heights, positive outside of an oval for the face."""
     return lambda sides, height: (
         ((sides / half_width) ** 2 + ((height - middle) / half_height) ** 2 - 1) * 0.05
     )
@@ -168,7 +174,10 @@ def _face_opening(
 def _scarf(
     rng: np.random.Generator, anatomy: Anatomy, thickness: float, tails: float, ease: float
 ) -> Surface:
-    """Two turns around the neck; tails: metres that its ends hang down in front, 0 for none."""
+    """Builds a scarf that goes twice around the neck.
+
+    tails: length of the ends that hang down in front, metres; 0 for none. ease: as in `build`.
+    """
     parts = []
     for turn, lift in enumerate((-0.004, 0.022)):
         ring, outwards = _neck_ring(anatomy, lift)
@@ -193,7 +202,7 @@ def _tail(
     thickness: float,
     ease: float,
 ) -> Surface:
-    """An end of a scarf that hangs down in front, on the chest."""
+    """Builds an end of a scarf that hangs down on the chest. side: 1 for left, -1 for right."""
     rows = max(5, int(length / 0.03))
     y = np.linspace(start[1] + 0.01, start[1] - length, rows)
     x = side * (0.028 + 0.012 * np.linspace(0, 1, rows)) + 0.006 * np.sin(np.linspace(0, 3, rows))
@@ -213,9 +222,7 @@ def _on_head(anatomy: Anatomy, vertices: Points, faces: Faces, template: Points)
 
 
 def _hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Surface:
-    """The brim of a hat, wider in front, or the peak of a cap: a sheet from the edge of the hat
-    outwards.
-    """
+    """Builds the brim of a hat or the peak of a cap: a sheet from the edge of the hat outwards."""
     template = anatomy.skin.template
     size = garment.sizes["brim"]
     closed = garment.kind == "brim_hat"
@@ -250,7 +257,7 @@ def _hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> S
 
 
 def _glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]]:
-    """Two rims, a bridge and temples to the ears; dark lenses for the sun."""
+    """Builds glasses: two rims, a bridge, temples to the ears; sunglasses also have dark lenses."""
     size, squareness, wire = (garment.sizes[name] for name in ("size", "squareness", "wire"))
     dark = garment.kind == "sunglasses"
     eyes = anatomy.joints[[Joint.LEFT_EYE, Joint.RIGHT_EYE]]
@@ -310,7 +317,7 @@ def _glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material
 
 
 def _necklace(anatomy: Anatomy, length: float) -> Surface:
-    """A chain around the neck that hangs lower in front."""
+    """Builds a chain around the neck that hangs down in front by `length` metres."""
     ring, outwards = _neck_ring(anatomy, 0.01)
     front = np.clip(np.cos(_AZIMUTH), 0, 1) ** 2
     path = ring + outwards * 0.003
@@ -320,8 +327,10 @@ def _necklace(anatomy: Anatomy, length: float) -> Surface:
 
 
 def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
-    """A rounded box on the back, or a flat one at the hip, that moves as the skin near it does on
-    average.
+    """Builds a bag: a rounded box on the back, or a flat one at the hip.
+
+    All of it moves as the skin near it does on average. ease: distance of clothes from the skin
+    there, metres.
     """
     x, y, z = anatomy.skin.template.T
     size = garment.sizes["size"]
@@ -355,14 +364,16 @@ def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
 
 
 def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> Surface:
-    """Both shoes. height: of the shaft above the floor; sole: its thickness; ease: metres between
-    foot and leather.
+    """Builds both shoes.
+
+    height: of the shaft above the floor. sole: its thickness. ease: distance between foot and
+    leather. All are in metres.
     """
     return join([_shoe(anatomy, side, height, sole, ease) for side in (0, 1)])
 
 
 def _shoe(anatomy: Anatomy, side: int, height: float, sole: float, ease: float) -> Surface:
-    """One shoe: rings around the foot, and around the shin above it."""
+    """Builds one shoe of rings around the foot and the shin. side: 0 for left, 1 for right."""
     x, y, _ = anatomy.skin.template.T
     own = np.flatnonzero((x * (1 - 2 * side) > 0) & (y < FLOOR + height + 0.06))
     points = anatomy.skin.vertices[own]

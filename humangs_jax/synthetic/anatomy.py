@@ -1,10 +1,13 @@
-"""Joints, their limits, rotations as numpy arrays (float64), kinematics forward, and of legs
-inverse; the body under clothes.
+"""Kinematics of the body for poses, and measures of the body for clothes.
 
-Joints in SMPL-X order, T-pose at rest, the person faces +z with the left side at +x. Angles in
-radians, about the axes of the parent joint at rest. Cuts (hems, necklines, hairlines) and paint are
-given in TEMPLATE coordinates: the T-pose of the mean body, metres. A vertex keeps them for every
-shape of the person, so one number fits all people. Draping uses the person's rest vertices.
+For poses there are joints and their limits, rotations as numpy arrays (float64), forward kinematics
+of the body, and inverse kinematics of the legs. Joints are in the order of SMPL-X. At rest the
+person is in T-pose and faces +z, with the left side at +x. Angles are in radians, about the axes of
+the parent joint at rest.
+
+Cuts (hems, necklines, hairlines) and paint are given in TEMPLATE coordinates: places on the mean
+body in T-pose, metres. A vertex has the same template coordinates for every shape of the body, so
+that one number fits all people. Draping uses the vertices of the person at rest.
 """
 
 import dataclasses
@@ -27,13 +30,13 @@ from humangs_jax.synthetic.surfaces import (
 )
 
 Rotations = Float[np.ndarray, "j 3"]
-"""Rotation vectors of all joints, relative to their parents."""
+"""Rotation vectors of all joints relative to their parents, (j, 3), radians."""
 Vector = Float[np.ndarray, "3"]
 Matrix = Float[np.ndarray, "3 3"]
 
 
 class Joint:
-    """Numbers of SMPL-X's joints."""
+    """Indices of SMPL-X's joints."""
 
     PELVIS, LEFT_HIP, RIGHT_HIP, SPINE1, LEFT_KNEE, RIGHT_KNEE = range(6)
     SPINE2, LEFT_ANKLE, RIGHT_ANKLE, SPINE3, LEFT_FOOT, RIGHT_FOOT = range(6, 12)
@@ -41,25 +44,25 @@ class Joint:
     LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST = range(18, 22)
     LEFT_EYE, RIGHT_EYE = 23, 24
     LEFT_HAND, RIGHT_HAND = 25, 40
-    """First joints of the hands, 15 each."""
+    """First joint of each hand; a hand has 15 joints."""
 
 
 JOINTS = 55
-"""How many joints there are."""
+"""Number of joints."""
 FINGER_LIMIT = 1.5
 """Largest rotation angle of a joint of a finger in the prior, radians."""
 LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9,
                      0.9, 0.5, 0.35, 0.35, 0.5, 2.3, 2.3, 2.4, 2.4, 0.8, 0.8,
                      0, 0, 0, *[FINGER_LIMIT] * 30])  # fmt: skip
-"""Largest rotation angle of each joint in the prior; jaw and eyes stay at rest."""
+"""Largest rotation angle of each joint in the prior, radians; jaw and eyes stay at rest."""
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
-"""The rotation vector of the mirrored rotation (left and right exchanged)."""
+"""Factors that make a rotation vector that of the rotation with left and right exchanged."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Build:
-    """A body as the pose prior needs it."""
+    """The joints and the thickness of a clothed body, as the pose prior needs them."""
 
     joints: Rotations
     """Joints at rest, (j, 3), metres."""
@@ -87,34 +90,34 @@ class Build:
 
     @property
     def sole(self) -> float:
-        """Height of the sole in T-pose."""
+        """Height (y) of the soles in T-pose, metres."""
         balls = self.joints[[Joint.LEFT_FOOT, Joint.RIGHT_FOOT], 1].mean()
         return float(balls - 0.0112 * self.leg)  # that high above the sole, in the shipped body
 
 
 def rotation_matrix(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """The rotations of rotation vectors (..., 3)."""
+    """Converts rotation vectors (..., 3) to rotation matrices (..., 3, 3)."""
     return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
 
 
 def rotation_vector(matrix: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3"]:
-    """The rotation vector, no longer than pi, of (..., 3, 3) rotations."""
+    """Converts rotation matrices (..., 3, 3) to rotation vectors (..., 3), no longer than pi."""
     return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-1])
 
 
 def between(
     a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"], t: float
 ) -> Float[np.ndarray, "*n 3"]:
-    """Rotation vectors on the way from a to b, the shortest one, t in [0, 1]."""
+    """Interpolates rotation vectors along the shortest way from a (t = 0) to b (t = 1)."""
     first = rotation_matrix(a)
     step = rotation_vector(np.swapaxes(first, -1, -2) @ rotation_matrix(b))
     return rotation_vector(first @ rotation_matrix(t * step))
 
 
 def turned(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Matrix:
-    """The rotation about (x, y, z) by its length.
+    """Returns the matrix of the rotation vector (x, y, z), radians.
 
-    About x: legs and feet swing backwards, heels up; about y: to the left.
+    A positive x swings legs and feet backwards, heels up. A positive y turns to the left.
     """
     return rotation_matrix(np.asarray([x, y, z], float))
 
@@ -122,34 +125,40 @@ def turned(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Matrix:
 def joint_positions(
     build: Build, rotations: Rotations
 ) -> tuple[Float[np.ndarray, "j 3 3"], Rotations]:
-    """World rotations (j, 3, 3) and positions (j, 3) of all joints for rotation vectors (j, 3)."""
+    """Returns the rotations (j, 3, 3) and positions (j, 3) of all joints in a pose, in the world.
+
+    The root joint stays where it is at rest.
+    """
     bones = bones_of(np.asarray(build.joints, np.float64), build.parents)
     return posed_tree(rotation_matrix(rotations), bones, build.parents)
 
 
 def limited(rotations: Rotations) -> Rotations:
-    """Rotation vectors (j, 3) shortened to the limits of their joints."""
+    """Shortens rotation vectors (j, 3) to the limits of their joints."""
     angle = np.linalg.norm(rotations, axis=1)
     return rotations * np.minimum(1, LIMITS / np.maximum(angle, 1e-9))[:, None]
 
 
 def excess(rotations: Rotations, joints: tuple[int, ...]) -> float:
-    """By how much (radians) the worst of some joints exceeds its limit; negative if none does."""
+    """Returns the largest angle by which one of some joints exceeds its limit, radians.
+
+    Negative if none does.
+    """
     return float(np.max(np.linalg.norm(rotations[list(joints)], axis=1) - LIMITS[list(joints)]))
 
 
 @dataclasses.dataclass(frozen=True)
 class Foot:
-    """Position of a foot, given by the point that a flat sole would touch."""
+    """Place and turn of a foot on the ground."""
 
     x: float
-    """The point below the ball of the foot, along x, metres."""
+    """x of the point on the ground below the ball of the foot, metres."""
     z: float
-    """The same point along z, metres."""
+    """z of that point, metres."""
     yaw: float = 0.0
     """Heading of the foot, radians about y."""
     pitch: float = 0.0
-    """Roll of the foot, radians: positive onto the toes, which stay flat where they are, negative
+    """Roll of the foot, radians. Positive: onto the toes, which stay flat on the ground. Negative:
     onto the heel.
     """
     lift: float = 0.0
@@ -157,7 +166,7 @@ class Foot:
 
 
 Feet = tuple[Foot, ...]
-"""The left and the right one."""
+"""The left and the right foot."""
 LEGS = (
     (Joint.LEFT_HIP, Joint.LEFT_KNEE, Joint.LEFT_ANKLE, Joint.LEFT_FOOT),
     (Joint.RIGHT_HIP, Joint.RIGHT_KNEE, Joint.RIGHT_ANKLE, Joint.RIGHT_FOOT),
@@ -165,9 +174,9 @@ LEGS = (
 
 
 def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
-    """Position of the ankle, the ground at y = 0, and orientation of the foot.
+    """Returns the position of the ankle (3,), metres, and the rotation of the foot (3, 3).
 
-    side: 0 left, 1 right.
+    The ground is at y = 0. side: 0 for left, 1 for right.
     """
     _, _, ankle, ball = LEGS[side]
     a, b = build.joints[ankle], build.joints[ball]
@@ -184,11 +193,11 @@ def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
 def highest_pelvis(
     build: Build, turn: Matrix, x: float, z: float, feet: Feet, reach: float = 0.998
 ) -> float:
-    """The greatest height of the pelvis, turned by `turn`, above x, z, at which both legs reach
-    their feet.
+    """Returns the greatest height of the pelvis at which both legs reach their feet, metres.
 
-    reach: largest stretch of a leg as a share of its length: a straight leg leaves the knee's
-    direction undefined.
+    turn: rotation of the pelvis. x, z: place of the pelvis. reach: largest distance from hip to
+    ankle as a share of the leg's length. It is less than 1, because a straight leg leaves the
+    direction of the knee undefined.
     """
     heights = []
     for side, foot in enumerate(feet):
@@ -200,11 +209,12 @@ def highest_pelvis(
 
 
 def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -> float:
-    """Set hips, knees, ankles and toes (in place) so that the feet are at their targets; the
-    pelvis's rotation stays.
+    """Sets hips, knees, ankles and toes in `rotations`, so that the feet are at their places.
 
-    pelvis: where the pelvis joint is, the ground at y = 0. Returns how far (metres) the worse ankle
-    is from its place, which is 0 unless a leg is too short.
+    The rotation of the pelvis stays. pelvis: position of the pelvis joint (3,), metres; the ground
+    is at y = 0.
+
+    Returns: the larger distance of an ankle from its place, metres; 0 unless a leg cannot reach.
     """
     turn = rotation_matrix(rotations[Joint.PELVIS])
     missed = []
@@ -230,7 +240,10 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -
 
 
 def _knee_angle(thigh: Vector, shin: Vector, distance: float) -> float:
-    """The knee's angle at which hip and ankle are at the given distance."""
+    """Returns the angle of the knee, radians, at which hip and ankle have a given distance.
+
+    thigh, shin: offsets of knee and ankle from the joint above, at rest.
+    """
     wanted = 0.5 * (distance**2 - thigh @ thigh - shin @ shin) - thigh[0] * shin[0]
     cosine, sine = thigh[1] * shin[1] + thigh[2] * shin[2], thigh[2] * shin[1] - thigh[1] * shin[2]
     return float(
@@ -239,8 +252,9 @@ def _knee_angle(thigh: Vector, shin: Vector, distance: float) -> float:
 
 
 def _frame(direction: Vector, across: Vector) -> Matrix:
-    """Orthonormal columns: the direction, what of `across` is orthogonal to it, and their
-    product.
+    """Returns a rotation matrix whose first column has the direction `direction`.
+
+    The second column is the part of `across` that is orthogonal to the first one.
     """
     u = direction / np.linalg.norm(direction)
     s = across - (across @ u) * u
@@ -257,25 +271,25 @@ BODY = ("makehuman", 13380)
 WAIST = -0.2
 """Height (y) of the waist, template coordinates."""
 CROTCH = -0.425
-"""Height of the crotch."""
+"""Height of the crotch, template coordinates."""
 ANKLE = -1.159
-"""Height of the ankles."""
+"""Height of the ankles, template coordinates."""
 FLOOR = -1.2285
-"""Height of the soles."""
+"""Height of the soles, template coordinates."""
 ARM_HEIGHT = 0.096
-"""Height of the arms."""
+"""Height of the arms, template coordinates."""
 SHOULDER = 0.171
 """Distance of the shoulders from the middle (|x|), template coordinates."""
 WRIST = 0.651
-"""Distance of the wrists from the middle."""
+"""Distance of the wrists from the middle (|x|), template coordinates."""
 ARMHOLE = 0.185
-"""Distance from the middle at which sleeves are sewn on."""
+"""Distance from the middle (|x|) at which sleeves are sewn on, template coordinates."""
 TRUNK_GIRTH = 0.16
 """Radius that turns angles around the trunk into metres of cloth."""
 _LEG_GIRTH = 0.08
-"""The same for legs."""
+"""Radius that turns angles around a leg into metres of cloth."""
 ARM_GIRTH = 0.06
-"""The same for arms."""
+"""Radius that turns angles around an arm into metres of cloth."""
 SAME_GIRTH = 1e-4
 """Tolerance for comparing girths."""
 
@@ -290,11 +304,11 @@ class Anatomy:
     joints: np.ndarray
     """Joints at rest, (j, 3), metres."""
     parents: tuple[int, ...]
-    """Parent of each joint."""
+    """Index of each joint's parent."""
     arm: np.ndarray
-    """Membership of each vertex in the arms, (n,), 0 to 1."""
+    """How much each vertex belongs to an arm, (n,), 0 to 1."""
     leg: np.ndarray
-    """Membership of each vertex in the legs, (n,), 0 to 1."""
+    """How much each vertex belongs to a leg, (n,), 0 to 1."""
     trunk: Boundaries
     """Silhouettes of trunk and upper thighs, in slices across y."""
     hips_and_legs: Boundaries
@@ -306,22 +320,24 @@ class Anatomy:
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    """0 at `low`, 1 at `high`, smooth between, constant beyond (either may be the larger one)."""
+    """Returns 0 at `low` and 1 at `high`, smooth between them and constant beyond.
+
+    Either of `low` and `high` may be the larger one.
+    """
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 
 
 def _leg_membership(template: np.ndarray) -> np.ndarray:
-    """(n,) 1 on the legs, 0 on the trunk, smooth across the hip."""
+    """Returns 1 on the legs and 0 on the trunk (n,), smooth across the hips."""
     return smoothstep(-CROTCH - 0.1, -CROTCH + 0.05, -template[:, 1])
 
 
 def cloth_coordinates(template: np.ndarray) -> np.ndarray:
-    """(n, 4) x, y, z around the axis of trunk or leg, and the girth radius that turns angles into
-    metres.
+    """Returns cloth coordinates (n, 4): x, y, z relative to the axis of trunk or leg, a radius.
 
-    The angle atan2(x, z) is 0 in front. Arms go on as the trunk does; `sewn_coordinates` gives them
-    their own.
+    The angle atan2(x, z) is 0 in front; times the radius, it is metres around the body. Arms have
+    the coordinates of the trunk; `sewn_coordinates` gives them other ones.
     """
     x, y, z = template.T
     trunk = np.stack([x, y, z - 0.02, np.full_like(x, TRUNK_GIRTH)], -1)
@@ -330,8 +346,9 @@ def cloth_coordinates(template: np.ndarray) -> np.ndarray:
 
 
 def leg_coordinates(template: np.ndarray) -> np.ndarray:
-    """(n, 4) cloth coordinates around the axis of the nearer leg, from the waist down: trousers,
-    sewn along the middle.
+    """Returns the cloth coordinates (n, 4) of trousers, which are sewn along the middle.
+
+    They are relative to the axis of the nearer leg, from the waist down.
     """
     x, y, z = template.T
     knee = np.interp(-y, [0.358, 0.764, 1.159], [0.101, 0.130, 0.137])
@@ -342,12 +359,11 @@ def leg_coordinates(template: np.ndarray) -> np.ndarray:
 
 
 def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
-    """Cloth coordinates (n, 4) with those of arms and legs replaced by coordinates around the limb
-    that the point is on.
+    """Replaces the cloth coordinates (n, 4) of points on arms and legs.
 
-    They are sharp at seams (armholes; the middle of trousers). Arms are turned down, so that y runs
-    along every limb. Only cloth with the trunk's girth has sleeves, only cloth with the legs' girth
-    has legs.
+    The new ones are relative to the axis of the limb, and change abruptly at seams: at armholes and
+    in the middle of trousers. Arms are turned down, so that y runs along every limb. Points on arms
+    are replaced if they have the girth of the trunk, points on legs if they have that of legs.
     """
     x, y, girth = template[:, 0], template[:, 1], cloth[:, 3]
     on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(girth - TRUNK_GIRTH) < SAME_GIRTH)
@@ -364,7 +380,7 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=1)
 def _fixed(template_bytes: bytes) -> tuple[Points, Float[np.ndarray, "n 4"], Field, Field]:
-    """Template, coordinates of cloth, membership of arms and legs of the mean body."""
+    """Returns what all bodies share: template, cloth coordinates, shares in arms and legs."""
     template = np.frombuffer(template_bytes, np.float32).reshape(-1, 3)
     # 1 on the arms, 0 on the trunk, smooth across the shoulder seam
     arm = smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])
@@ -379,7 +395,7 @@ def measure(
     weights: np.ndarray,
     parents: tuple,
 ) -> Anatomy:
-    """The `Anatomy` of a shaped body from its rest vertices (n, 3) and joints (j, 3)."""
+    """Measures a shaped body. vertices, joints: of the body at rest, metres."""
     template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
     vertices = np.asarray(vertices, np.float32)
     attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}

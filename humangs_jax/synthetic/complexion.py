@@ -1,5 +1,6 @@
-"""Skin, face, eyes and hair colors, painted in template coordinates so that they sit on the
-features of every shape.
+"""Colors of skin, face, eyes and hair.
+
+They are painted in template coordinates, so that they fit the features of every shape of body.
 """
 
 import dataclasses
@@ -15,9 +16,9 @@ from humangs_jax.synthetic.surfaces import Field, Points, Ripples, lattice
 _EYE_X = 0.029
 """Distance of the eyes from the middle, template coordinates."""
 _EYE_Y = 0.330
-"""Height of the eyes."""
+"""Height of the eyes, template coordinates."""
 _MOUTH_Y = 0.2629
-"""Height of the mouth."""
+"""Height of the mouth, template coordinates."""
 _HAIR = {
     "black": (0.07, 0.3, (0.05, 0.12)),
     "brown": ((0.05, 0.09), (0.5, 0.7), (0.15, 0.4)),
@@ -28,7 +29,8 @@ _HAIR = {
 }
 """Hue, saturation and value of hair, or their ranges."""
 _Face = tuple[Field, Field, Field, Points]
-"""Distances from the middle, heights, how far in front they are in [0, 1], and the points."""
+"""Points of the face: distances |x| from the middle (n,), heights (n,), 0 behind to 1 in front
+(n,), and template coordinates (n, 3)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Complexion:
 
 
 def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Complexion:
-    """Random coloring; fair skin goes with any hair, dark skin with dark hair, age with grey."""
+    """Draws colors. Fair skin goes with any hair, dark skin with dark hair, age with grey hair."""
     darkness = rng.beta(1.05, 1.15)
     fair = np.asarray([0.86, 0.67, 0.57])
     mid = np.asarray([0.70, 0.49, 0.36])
@@ -122,15 +124,16 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
 
 
 def _liner(rng: np.random.Generator, made_up: bool, male: bool) -> float:
-    """How dark the edges of the eyelids are."""
+    """Draws how dark the edges of the eyelids are, 0 to 1."""
     if made_up:
         return rng.uniform(0.4, 0.9)
     return 0.0 if male else rng.uniform(0.0, 0.25)
 
 
 def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut) -> Material:
-    """Skin with lips, cheeks, brows, lids, nostrils, stubble, knuckles, freckles, and tones that
-    vary over the body.
+    """Makes the material of the skin, whose tones vary over the body.
+
+    It has lips, cheeks, brows, lids, nostrils, stubble, knuckles and freckles.
     """
     cloud, blotches = Ripples(rng, 0.07), Ripples(rng, 0.25)
     # what is painted on the face: metres, or factors around 1
@@ -146,7 +149,7 @@ def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut)
     seed = int(rng.integers(1 << 20))
 
     def albedo(s: Spots):
-        """Skin, tanned arms, palms, knees and elbows; then the face."""
+        """Returns colors: first skin, tanned arms, palms, knees and elbows, then the face."""
         x, y, z = np.abs(s.template[:, 0]), s.template[:, 1], s.template[:, 2]
         result = tones.skin * (1 + 0.035 * cloud(s.template) + 0.03 * blotches(s.template))[:, None]
         result = result * (1 - tones.tan * np.clip((x - 0.2) / 0.3, 0, 1) * (y > -0.1))[:, None]
@@ -166,7 +169,10 @@ def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut)
 
 
 def _bell(*axes: tuple[Field, Field | float | int, float]) -> Field:
-    """(n,) 1 at a place, running out around it; axes: (coordinate (n,), place, width) of each."""
+    """Returns 1 at a place, and less the further points are from it, (n,).
+
+    axes: for each axis (coordinates of the points (n,), coordinate of the place, width).
+    """
     return np.exp(-sum(((x - place) / width) ** 2 for x, place, width in axes))
 
 
@@ -175,7 +181,7 @@ def _tinted(colors: Points, tint: tuple[float, float, float], amount: Field) -> 
 
 
 def _hand(tones: Complexion, result: Points, x: Field, y: Field) -> Points:
-    """Palms are paler, knuckles and finger tips redder."""
+    """Paints hands: paler palms, redder knuckles and finger tips. x: |x|, y: height."""
     palm = np.clip((0.085 - y) / 0.012, 0, 1) * np.clip((x - 0.66) / 0.03, 0, 1)
     pale = 0.35 * tones.skin + 0.65 * np.asarray([0.82, 0.62, 0.53], np.float32)
     tip, knuckle = np.clip((x - 0.79) / 0.03, 0, 1), _bell((x, 0.745, 0.008)) * (1 - palm)
@@ -187,7 +193,7 @@ def _hand(tones: Complexion, result: Points, x: Field, y: Field) -> Points:
 def _cheeks_and_eyes(
     tones: Complexion, features: Mapping[str, float], result: Points, face: _Face, seed: int
 ) -> Points:
-    """Cheeks, nose and ears; freckles; sockets, make-up, lashes."""
+    """Paints cheeks, nose, ears and freckles, then sockets, make-up and lashes."""
     x, y, front, template = face
     # cheeks, nose and ears are redder, with or without make-up
     cheeks = _bell((x, 0.043, 0.02), (y, 0.292, 0.018))
@@ -224,7 +230,7 @@ def _cheeks_and_eyes(
 
 
 def _aged(tones: Complexion, result: Points, face: _Face) -> Points:
-    """Folds beside nose and mouth, lines on the forehead, bags and crow's feet."""
+    """Paints signs of age: folds at nose and mouth, lines on the forehead, bags, crow's feet."""
     if tones.wrinkles <= 0:
         return result
     x, y, front, _ = face
@@ -252,8 +258,9 @@ def _mouth_and_brows(
     face: _Face,
     seed: int,
 ) -> Points:
-    """Lips, nostrils, brows; roots of hair and beard, which also soften the edges of what grows
-    there.
+    """Paints lips, nostrils and brows, then the roots of hair and beard.
+
+    The roots also soften the edges of the hair and the beard.
     """
     x, y, front, template = face
     # lips: the upper one is bowed, the lower one fuller, a dark line parts them
@@ -310,7 +317,7 @@ def _mouth_and_brows(
 
 
 def eye_material(tones: Complexion) -> Material:
-    """White, iris, pupil and a highlight painted on the surface."""
+    """Makes the material of eyeballs: white, iris, pupil and a painted highlight."""
     white, black, bright = (
         np.asarray(dye, np.float32) for dye in ([0.84, 0.82, 0.80], [0.02] * 3, [0.85] * 3)
     )
@@ -328,8 +335,9 @@ def eye_material(tones: Complexion) -> Material:
 
 
 def hair_material(rng: np.random.Generator, base: np.ndarray, haircut: Haircut) -> Material:
-    """Strands that run down from the crown: fine and coarse streaks, a bright ring, darker
-    roots.
+    """Makes the material of hair: fine and coarse streaks that run down from the crown.
+
+    Hair that is not curly has a bright ring around the head. base: color of the hair (3,).
     """
     seed = int(rng.integers(1 << 20))
     tips = base * rng.uniform(0.75, 1.35)

@@ -1,9 +1,9 @@
-"""Fabrics and materials: colors of points on a surface.
+"""Fabrics and materials, which give points on a surface their colors.
 
-A material maps `Spots` (points on a surface) to albedo in [0, ALBEDO_LIMIT]. It is evaluated per
-pixel or texel, so it is crisp at any resolution. A `Fabric` is a choice (pattern, dyes, seed). What
-else is random about it is drawn anew from its seed whenever it is asked for colors. Periods of
-patterns are metres on the cloth; the finest is a few millimetres.
+A material maps `Spots` (points on a surface) to albedo. It is evaluated at each pixel or texel, so
+that it is crisp at any resolution. A `Fabric` is a pattern, two dyes and a seed. All other random
+numbers of a fabric are drawn from the seed again whenever colors are computed. Periods of patterns
+are metres on the cloth; the finest is a few millimetres.
 """
 
 import colorsys
@@ -20,21 +20,19 @@ from humangs_jax.synthetic.surfaces import Field, Points, Ripples, choice, hashe
 _SHOULDER_RIDGE = -0.02
 """Template z of the line from neck to shoulder on which front and back are sewn together."""
 ALBEDO_LIMIT = 0.88
-"""Largest albedo: white clothes stay darker than the white background."""
+"""Largest albedo. White clothes stay darker than the white background."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Spots:
-    """Points on a surface.
+    """Points on a surface, as materials take them.
 
-    Coordinates of sleeves and trouser legs are recomputed, so that they are sharp at seams, where
-    patterns meet.
+    Cloth coordinates on sleeves and trouser legs are recomputed, so that they change abruptly at
+    seams, where patterns meet.
     """
 
     cloth: Float[np.ndarray, "n 4"]
-    """Coordinates around the limb or the trunk and its girth, (n, 4), metres, see
-    `anatomy.cloth_coordinates`.
-    """
+    """Cloth coordinates, (n, 4), metres, see `anatomy.cloth_coordinates`."""
     template: Points
     """Template coordinates, (n, 3)."""
 
@@ -43,8 +41,9 @@ class Spots:
 
     @property
     def around(self) -> Field:
-        """(n,) metres around the trunk or limb, 0 in front; on the shoulders metres from the
-        middle, back and front apart.
+        """Metres around the trunk or limb, (n,), 0 in front.
+
+        On the shoulders they are metres from the middle, with different values in front and behind.
         """
         girth = self.cloth[:, 3]
         turned = np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * girth
@@ -57,15 +56,16 @@ class Spots:
 
     @property
     def along(self) -> Field:
-        """(n,) metres along the trunk or limb: height, but towards the shoulders the way up to
-        their ridge.
+        """Metres along the trunk or limb, (n,): the height.
+
+        Towards the shoulders the distance from their ridge is subtracted.
         """
         rising = np.clip((self.template[:, 1] + 0.25) / 0.35, 0, 1) * self._on_trunk
         return self.cloth[:, 1] - rising * np.abs(self.template[:, 2] - _SHOULDER_RIDGE)
 
     @property
     def _on_trunk(self) -> Bool[np.ndarray, " n"]:
-        """(n,) whether this is cloth of a trunk, inside of the armholes."""
+        """Whether each point is on the cloth of the trunk, between the armholes, (n,)."""
         return (np.abs(self.cloth[:, 3] - TRUNK_GIRTH) < SAME_GIRTH) & (
             np.abs(self.template[:, 0]) <= ARMHOLE
         )
@@ -73,10 +73,10 @@ class Spots:
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """How a surface looks."""
+    """The colors, folds and gloss of a surface."""
 
     albedo: Callable[[Spots], np.ndarray]
-    """Gives the colors (n, 3) at `Spots`."""
+    """A function that returns the colors (n, 3) at `Spots`."""
     wrinkles: float = 0.0
     """Strength of the folds that are painted into the normals; 0 for none."""
     sheen: float = 0.0
@@ -86,7 +86,7 @@ class Material:
 
 
 def color(hue: float, saturation: float, value: float) -> Vector:
-    """(3,) linear-as-given RGB."""
+    """Converts hue, saturation and value to RGB (3,). Hue may be any number; others are clipped."""
     return np.asarray(
         colorsys.hsv_to_rgb(hue % 1, np.clip(saturation, 0, 1), np.clip(value, 0, 1)), np.float32
     )
@@ -99,8 +99,8 @@ _DYES = {
     "earth": (0.11, (0.05, 0.12), (0.3, 0.7), (0.2, 0.7)),
     "navy": (0.11, (0.56, 0.66), (0.4, 0.8), (0.12, 0.45)),
 }
-"""Kinds of dyes: odds; hue, saturation and value, each a range or a choice of more than two
-numbers.
+"""Kinds of dyes. Each has its probability, then hue, saturation and value: two numbers are a range,
+more are a choice.
 """
 
 
@@ -113,13 +113,13 @@ def _color_of(rng: np.random.Generator, ranges: Iterable[Sequence[float | int]])
 
 
 def random_color(rng: np.random.Generator) -> Vector:
-    """A dye: neutral, muted, vivid, an earth color or navy."""
+    """Draws a dye (3,): neutral, muted, vivid, an earth color or navy."""
     kind = rng.choice(list(_DYES), p=[odds for odds, *_ in _DYES.values()])
     return _color_of(rng, _DYES[kind][1:])
 
 
 def accent(rng: np.random.Generator, base: Vector) -> Vector:
-    """A second dye that stands out from the first."""
+    """Draws a dye (3,) that stands out from a first one."""
     for _ in range(8):
         other = random_color(rng)
         if np.abs(other - base).sum() > 0.6:
@@ -128,8 +128,9 @@ def accent(rng: np.random.Generator, base: Vector) -> Vector:
 
 
 def mix(a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], amount: Field) -> Points:
-    """Colors, of points (n, 3) or one for all (3,): `a` where amount (n,) is 0, `b` where it is
-    1.
+    """Mixes colors: returns `a` where amount is 0 and `b` where it is 1, (n, 3).
+
+    a, b: colors of the points (n, 3), or one for all points (3,). amount: (n,).
     """
     return a + (b - a) * amount[:, None]
 
@@ -137,13 +138,13 @@ def mix(a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], amount: Fi
 def band(
     x: Field, low: float | int | Field, high: float | int | Field, soft: float = 0.0015
 ) -> Field:
-    """1 between low and high (metres), with soft edges."""
+    """Returns 1 where x is between low and high, else 0, with edges of width `soft`."""
     return np.clip((x - low) / soft + 0.5, 0, 1) * np.clip((high - x) / soft + 0.5, 0, 1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Fabric:
-    """What a garment is made of."""
+    """The cloth of a garment: a pattern in two dyes."""
 
     pattern: str
     """Name of the pattern, a key of PATTERNS."""
@@ -152,14 +153,14 @@ class Fabric:
     other: Vector
     """The dye of the pattern, (3,), 0 to 1."""
     seed: int
-    """Seed of everything else about it: periods, prints, buttons."""
+    """Seed of all other random numbers of the fabric and of its prints and trimmings."""
 
     def rng(self, stream: int) -> np.random.Generator:
-        """Random numbers of the fabric's own; one stream for each feature."""
+        """Returns a new generator of the fabric. Each kind of feature uses another stream."""
         return np.random.default_rng([self.seed, stream])
 
     def colors(self, s: Spots) -> Points:
-        """(n, 3) the colors of points."""
+        """Returns the colors of points, (n, 3)."""
         return PATTERNS[self.pattern][1](s, self.rng(0), self.base, self.other)
 
 
@@ -170,7 +171,7 @@ _USUAL = {
     "leather": ((0.05, 0.09), (0.2, 0.7), (0.06, 0.4)),
     "suit": ((0.58, 0.68), (0.05, 0.35), (0.06, 0.4)),
 }
-"""Hue, saturation and value of usual cloths."""
+"""Ranges of hue, saturation and value of the usual dyes of cloths."""
 _CLOTHS = {
     "jeans": ("denim", 0.85),
     "denim_jacket": ("denim", 0.9),
@@ -192,13 +193,14 @@ _CLOTHS = {
     "leggings": ("suit", 0.6),
     "wide": ("cotton", 0.4),
 }
-"""Usual cloth of a kind of garment, and how often it is of that color."""
+"""For kinds of garments, the usual cloth, and the probability of a dye of that cloth."""
 _COLORS = (
     (("shirt", "socks", "sneakers"), 0.45, ((0, 1), (0, 0.05), (0.72, 0.87))),
     (("sneakers", "leggings", "coat", "puffer", "slim"), 0.4, ((0, 1), (0, 0.1), (0.06, 0.16))),
     (("sneakers", *_LEATHER_SHOES), 0.6, ((0.03, 0.12), (0.0, 0.5), (0.1, 0.7))),
 )
-"""Kinds of garments, how often they are (if of no color so far) of these colors; otherwise any dye.
+"""Rows of: kinds of garments, a probability, and ranges of hue, saturation and value. Rows are
+tried in order until one gives the dye; if none does, the dye is a random one.
 """
 _PATTERN_RULES = (
     (("jeans", "denim_jacket"), "denim", 1, ()),
@@ -207,14 +209,15 @@ _PATTERN_RULES = (
     (("cap", "brim_hat"), "plain", 1, ("camouflage", "melange", "checks", "herringbone")),
     (("sneakers", *_LEATHER_SHOES, "belt", "watch", "necklace", "glasses"), "plain", 1, ()),
 )
-"""Kinds of garments, the pattern that they get instead of a random one, how often, and patterns
-that they keep.
+"""Rows of: kinds of garments, the pattern that replaces a random one, the probability of that, and
+patterns that are not replaced.
 """
 
 
 def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabric:
-    """A fabric that suits a kind of garment; with probability `plainness` in one dye or nearly
-    so.
+    """Draws a fabric that suits a kind of garment.
+
+    plainness: probability of a plain pattern, which has one dye or two similar ones.
     """
     plain_ones = {"plain": 0.66, "melange": 0.2, "tweed": 0.14}
     odds = {name: share for name, (share, _) in PATTERNS.items() if share}
@@ -229,7 +232,7 @@ def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabr
 
 
 def _dye(rng: np.random.Generator, kind: str) -> Vector:
-    """A usual color of a kind of garment, or any."""
+    """Draws a dye (3,): one that is usual for a kind of garment, or a random one."""
     cloth, odds = _CLOTHS.get(kind, ("cotton", 0.0))
     for kinds, share, ranges in (((kind,), odds, _USUAL[cloth]), *_COLORS):
         if kind in kinds and rng.random() < share:
@@ -238,12 +241,15 @@ def _dye(rng: np.random.Generator, kind: str) -> Vector:
 
 
 def _lines(x: Field, period: float, width: float, shift: float = 0.0) -> Field:
-    """(n,) 1 on lines of a width that are a period apart, metres; shift: in periods."""
+    """Returns 1 on lines and 0 between them (n,).
+
+    x, period, width: metres. shift: of the lines, in periods.
+    """
     return band((x / period + shift) % 1 * period, 0, width)
 
 
 def _grain(s: Spots, around: float, along: float, seed: int) -> Field:
-    """(n,) lattice noise in cells of around x along metres."""
+    """Returns lattice noise (n,) on the cloth, in cells of `around` by `along` metres."""
     return lattice(np.stack([s.around / around, s.along / along], -1), seed)
 
 
@@ -252,20 +258,20 @@ def _seed(rng: np.random.Generator) -> int:
 
 
 def _plain(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
-    """One dye, slightly uneven."""
+    """Colors cloth in one dye, slightly uneven."""
     return base * (1 + 0.03 * Ripples(rng, 0.12)(s.cloth[:, :3]))[:, None]
 
 
 def _stripes(
     s: Spots, rng: np.random.Generator, base: Vector, other: Vector, upright: bool = False
 ) -> Points:
-    """Stripes around (or, upright, along) the limb."""
+    """Colors stripes around the trunk or limb, or along it if `upright`."""
     period, share = rng.choice([0.014, 0.02, 0.035, 0.055, 0.09]), rng.uniform(0.25, 0.6)
     return mix(base, other, _lines(s.around if upright else s.along, period, share * period))
 
 
 def _checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Gingham, or tartan with thin lines of a third dye."""
+    """Colors gingham, or tartan, which has thin lines of a third dye."""
     period, third, tartan = rng.choice([0.03, 0.05, 0.08]), accent(rng, base), rng.random() < 0.6
     result = mix(
         base,
@@ -279,7 +285,7 @@ def _checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> 
 
 
 def _dots(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Polka dots in a triangular grid."""
+    """Colors polka dots in a triangular grid."""
     period, size = rng.choice([0.03, 0.045, 0.07]), rng.uniform(0.2, 0.34)
     row = np.floor(s.along / period)
     x = ((s.around / period + 0.5 * (row % 2)) % 1 - 0.5) * period
@@ -288,7 +294,7 @@ def _dots(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Po
 
 
 def _flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Scattered blossoms of five petals in two dyes."""
+    """Colors scattered blossoms of five petals, in two dyes."""
     period, seed, third = rng.choice([0.05, 0.075]), _seed(rng), accent(rng, base)
     plane = np.stack([s.around, s.along], -1) / period
     cell = np.floor(plane).astype(np.int64)
@@ -305,7 +311,7 @@ def _flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) ->
 
 
 def _mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Camouflage, batik, tie-dye: thresholded or soft noise."""
+    """Colors noise with sharp or soft edges, like batik or tie-dye."""
     scale, seed = rng.choice([0.03, 0.06, 0.1]), _seed(rng)
     width = 0.02 if rng.random() < 0.5 else 0.2
     third = accent(rng, other)
@@ -317,13 +323,13 @@ def _mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) ->
 
 
 def _melange(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Knit: fine grain."""
+    """Colors knitted cloth with a fine grain."""
     seed, share = _seed(rng), rng.uniform(0.2, 0.5)
     return mix(base, other, share * _grain(s, 0.006, 0.009, seed))
 
 
 def _denim(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
-    """Faded on the front of the thighs and at creases, grained along the thread."""
+    """Colors denim: faded on the front of thighs and at creases, with a grain along the thread."""
     cloud, seed = Ripples(rng, 0.15), _seed(rng)
     fade, holes = rng.uniform(0.1, 0.6), rng.random() < 0.12
     front = (
@@ -360,11 +366,11 @@ _CAMOUFLAGES = np.asarray(
     ],
     np.float32,
 )
-"""Four colors each: earth, sand, town, sea."""
+"""Four colors of each kind of camouflage, (4, 4, 3): earth, sand, town, sea."""
 
 
 def _camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vector) -> Points:
-    """Torn blots of four colors, larger ones below smaller ones."""
+    """Colors camouflage: torn blots of four colors, large ones below small ones."""
     dyes = _CAMOUFLAGES[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])]
     scale, seed = rng.uniform(0.045, 0.09), _seed(rng)
     p = s.cloth[:, :3] / scale * np.asarray([0.8, 1.4, 0.8], np.float32)
@@ -377,7 +383,7 @@ def _camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vecto
 
 
 def _herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Zigzags of slanted threads."""
+    """Colors zigzags of slanted threads."""
     period = rng.choice([0.03, 0.045])
     pitch = rng.choice([0.008, 0.012])
     share = rng.uniform(0.35, 0.7)
@@ -386,7 +392,7 @@ def _herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector
 
 
 def _argyle(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Diamonds with thin lines across."""
+    """Colors diamonds with thin lines across."""
     period, third = rng.choice([0.06, 0.09]), accent(rng, other)
     x, y = s.around / period, s.along / (1.6 * period)
     u, v = (x + y) % 1, (x - y) % 1
@@ -396,7 +402,7 @@ def _argyle(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> 
 
 
 def _dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """One dye runs into another along the garment, or in rings around a middle (tie-dye)."""
+    """Colors one dye that runs into another, along the garment or in rings (tie-dye)."""
     rings, level, wide = rng.random() < 0.5, rng.uniform(-0.35, 0.0), rng.uniform(0.05, 0.25)
     wobble, third = lattice(s.cloth[:, :3] / 0.05, _seed(rng)) - 0.5, accent(rng, other)
     if not rings:
@@ -411,7 +417,7 @@ def _dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) ->
 
 
 def _tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Woven in two threads of nearly one color."""
+    """Colors cloth woven in two threads, of which the second shows little."""
     seed, share = _seed(rng), rng.uniform(0.08, 0.25)
     return mix(
         base, other, share * _grain(s, 0.004, 0.02, seed) * _grain(s, 0.02, 0.004, seed + 1) * 2
@@ -419,7 +425,7 @@ def _tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> P
 
 
 def _cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
-    """Plaits of thick yarn: light and dark, no second dye."""
+    """Colors plaits of thick yarn, light and dark, in one dye."""
     period = rng.choice([0.05, 0.07])
     x, y = (s.around / period) % 1 - 0.5, s.along / 0.045
     strand = np.sin(2 * np.pi * (y + 0.8 * np.abs(x))) * np.sign(x)
@@ -429,7 +435,7 @@ def _cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector
 
 
 def _color_blocks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """A chest (or thigh) in another dye, with a line between."""
+    """Colors the upper part in another dye, with a line in a third one below it."""
     level, wide, third = rng.uniform(-0.15, 0.06), rng.uniform(0.01, 0.03), accent(rng, other)
     return mix(
         mix(base, other, band(s.along, level, 9.0)), third, band(s.along, level - wide, level)
@@ -454,4 +460,4 @@ PATTERNS: dict[str, tuple[float, Callable]] = {
     "tweed": (0.0, _tweed),
     "denim": (0.0, _denim),
 }
-"""Odds among fabrics that are not plain, and the pattern."""
+"""Patterns by name: odds among fabrics that are not plain, and the function that colors points."""

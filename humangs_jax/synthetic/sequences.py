@@ -1,10 +1,10 @@
-"""Smooth motions: walking along curves, turning on the spot, reaching for things. Soles on the
-ground stay where they are.
+"""Makes smooth motions: walking along curves, turning on the spot, reaching for things.
 
-Walks and turns are footprints along a path; feet roll from heel to toe on each and swing to the
-next, the pelvis goes along and as high as the legs let it, legs are solved for
-(`anatomy.place_feet`). Reaches keep both feet planted and move from pose to pose. World as
-everywhere: y up, metres, the ground at y = 0 where the soles are those of the bare body.
+Soles on the ground stay where they are. Walks and turns follow footprints along a path. A foot
+rolls from heel to toe on each footprint and swings to the next. The pelvis follows the path, as
+high as the legs allow, and `anatomy.place_feet` solves for the legs. In a reach both feet stay on
+the ground while the body moves from pose to pose. In the world y is up, lengths are in metres, and
+the ground is at y = 0, where the soles of the bare body stand.
 """
 
 import dataclasses
@@ -30,31 +30,32 @@ from humangs_jax.synthetic.poses import (
 from humangs_jax.synthetic.surfaces import choice
 
 FPS = 30.0
-"""Frames a second."""
+"""Frames per second."""
 _LONG_STEP = 0.75
-"""A long step, in lengths of a leg."""
+"""Length of a long step, in lengths of a leg."""
 _STANCE_SHARE = 0.62
 """Share of a stride during which a foot is on the ground."""
 _FLAT_FROM = 0.15
-"""Share of that from which on the sole is flat."""
+"""Share of the time on the ground after which the sole is flat."""
 _FLAT_UNTIL = 0.55
-"""Share of that until which the sole is flat."""
+"""Share of the time on the ground until which the sole is flat."""
 _SMOOTHING = 4
-"""Frames to both sides over which the pelvis's height is smoothed."""
+"""Number of frames on each side over which the height of the pelvis is smoothed."""
 _SPARE = 0.995
-"""Share of the legs' reach that the pelvis's height uses."""
+"""Largest stretch of a leg that the pelvis's height asks for, as a share of the length."""
 _TRIES = 12
-"""Goals tried for an arm until the way to one is clear."""
+"""Largest number of goals that are tried for an arm until one is clear of the body."""
 
 
 _Heading = Callable[[float | np.ndarray], float | np.ndarray]
-"""Gives the angle about y at a phase in strides."""
+"""A function of the phase (strides) that returns the heading: the angle about y, radians."""
 _Track = Callable[[float], kin.Vector]
-"""Gives the body's place on its path at a phase."""
+"""A function of the phase (strides) that returns the body's place on its path (3,), metres."""
 _Moves = tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], Bool[np.ndarray, "m 2"]]
-"""Rotations, positions of the pelvis, feet that are planted."""
+"""Rotations of the joints, positions of the pelvis, and whether each foot is on the ground."""
 _KeyPose = tuple[kin.Rotations, kin.Vector, float]
-"""Rotations, place of the pelvis on the ground plane, how much lower it is than it could be."""
+"""A pose: rotations, the place of the pelvis on the ground (3,), and how far the pelvis is below
+the highest place that the legs allow, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,9 +77,11 @@ class Sequence:
 def sample_sequence(
     rng: np.random.Generator, build: kin.Build, frames: int = 60, kind: str | None = None
 ) -> Sequence:
-    """A motion of `frames` frames at 30 a second. kind: "walk", "turn" or "reach"; None draws one.
+    """Makes a motion of a person at 30 frames per second.
 
-    Raises: ValueError if there is no such kind, or no frame.
+    kind: "walk", "turn" or "reach". None: a random one.
+
+    Raises: ValueError if there is no such kind, or if `frames` is less than 1.
     """
     if frames < 1:
         raise ValueError(f"frames: expected at least 1, got {frames}")
@@ -97,21 +100,21 @@ class _Gait:
     cadence: float
     """Strides per second; a stride is two steps."""
     step: float
-    """Way forward per step, metres."""
+    """Length of a step, metres."""
     bend: float
-    """Turn per step, radians."""
+    """Angle by which the heading changes with each step, radians."""
     width: float
-    """Distance of a foot from the line that is walked, metres."""
+    """Distance of a foot from the path, metres."""
     lift: float
     """Height to which a swinging foot is raised, metres."""
     turn_out: float
-    """Turn of the feet outwards, radians."""
+    """Angle by which the feet are turned outwards, radians."""
     swing: float
-    """Swing of the arms, radians."""
+    """Largest angle by which the arms swing, radians."""
 
 
 def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
-    """Walking, straight or along a curve."""
+    """Makes a walk, straight or along a curve."""
     step, curved = rng.uniform(0.3, _LONG_STEP) * build.leg, rng.random() < 0.6
     cadence = rng.uniform(0.75, 1.05)
     bend = rng.normal(0, 0.16) if curved else 0.0
@@ -123,7 +126,7 @@ def _walk(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
 
 
 def _turn(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
-    """Turning on the spot."""
+    """Makes a turn on the spot."""
     cadence, step = rng.uniform(0.6, 0.9), rng.uniform(-0.02, 0.06)
     bend = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5)
     width = build.hip_width * rng.uniform(0.95, 1.3)
@@ -132,7 +135,7 @@ def _turn(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
 
 
 def _step_along(rng: np.random.Generator, build: kin.Build, frames: int, gait: _Gait) -> _Moves:
-    """Steps along a path, or on the spot: first the footprints, then the trunk, legs and arms."""
+    """Makes steps along a path or on the spot: first footprints, then trunk, legs and arms."""
     start = rng.uniform(0, 1)
     if abs(gait.step) < 0.1 * build.leg:
         begin_heading = rng.uniform(-np.pi, np.pi)
@@ -169,9 +172,10 @@ def _carry_trunk(
     gait: _Gait,
     heading: _Heading,
 ) -> Float[np.ndarray, "m 3 3"]:
-    """Set pelvis, spine and head in `rotations`: the pelvis turns and rolls with the steps, the
-    spine turns against it, and the head looks to where the path leads. Returns the pelvis's
-    rotations as matrices.
+    """Sets pelvis, spine and head in `rotations`; returns the pelvis's rotations (m, 3, 3).
+
+    The pelvis turns and rolls with the steps, the spine turns against the pelvis, and the head
+    looks where the path leads.
     """
     lean = rng.normal(0.02, 0.02) + 0.12 * max(gait.step, 0) / build.leg
     twist = 0.14 * gait.step / build.leg / 0.6
@@ -192,8 +196,10 @@ def _carry_trunk(
 
 
 def _path(heading: _Heading, stride: float, first: float, last: float) -> _Track:
-    """A function from the phase to the body's position (3,) on its path: the integral of the
-    heading.
+    """Returns the path that follows a heading: a function of the phase, see `_Track`.
+
+    stride: metres per stride. first, last: phases between which the path is needed;
+    its place at `first` is 0.
     """
     grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
     direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)
@@ -209,8 +215,10 @@ def _path(heading: _Heading, stride: float, first: float, last: float) -> _Track
 def _foot_at(
     build: kin.Build, gait: _Gait, heading: _Heading, track: _Track, side: int, phase: float
 ) -> kin.Foot:
-    """The foot of a side at a phase (strides); the left one comes down at whole phases, the right
-    one half a stride later.
+    """Returns where one foot is at a phase (strides).
+
+    The left foot comes down at whole phases, the right foot half a stride later. side: 0 for left,
+    1 for right.
     """
     number, share = divmod(phase + 0.5 * side, 1.0)
     down = number - 0.5 * side
@@ -244,8 +252,9 @@ def _foot_at(
 def _footprint(
     build: kin.Build, gait: _Gait, heading: _Heading, track: _Track, side: int, down: float
 ) -> kin.Foot:
-    """Position of the foot that comes down at a phase: beside the path, ahead of the pelvis in
-    mid-stance.
+    """Returns the footprint of a foot that comes down at phase `down` (strides).
+
+    It is beside the place where the pelvis is in the middle of the foot's time on the ground.
     """
     middle = down + 0.5 * _STANCE_SHARE
     yaw, sign = float(heading(middle)), 1 - 2 * side
@@ -263,8 +272,9 @@ def _swing_arms(
     phase: Float[np.ndarray, " m"],
     gait: _Gait,
 ) -> None:
-    """Arms hang and swing against the legs; a hanging pose found once, its swing about the axis of
-    the shoulders.
+    """Sets arms and hands in `rotations`: arms hang, and swing against the legs.
+
+    One hanging pose is drawn for all frames, and swings about the x axis.
     """
     # arms hang beside straight legs
     stood = rotations[0].copy()
@@ -295,7 +305,7 @@ def _swing_arms(
 
 
 def _reach(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
-    """From pose to pose on planted feet: the hands reach for targets, trunk and knees follow."""
+    """Makes a motion from pose to pose: hands reach for targets, feet stay on the ground."""
     name = rng.choice(["stand", "contrapposto", "wide", "stride"], p=[0.4, 0.2, 0.2, 0.2])
     heading = rng.uniform(-0.7, 0.7)
     stance = STANCES[name][1](rng, build.hip_width / build.leg)
@@ -330,8 +340,9 @@ def _key_pose(
     feet: kin.Feet,
     before: _KeyPose | None,
 ) -> _KeyPose:
-    """(rotations, place of the pelvis on the ground plane, how much lower it is than it could
-    be).
+    """Draws a pose in which the hands are at targets and the feet at their places.
+
+    before: the pose before this one; the way from there should be clear too. None: there is none.
     """
     # the trunk: the deeper the knees are bent, the further it leans
     rotations = np.zeros((kin.JOINTS, 3))
@@ -372,8 +383,10 @@ def _key_pose(
 
 
 def _clear_of(build: kin.Build, rotations: kin.Rotations, side: int) -> float:
-    """Gives `arm_clearance` of an arm; for the left one (side 0), which is placed first, the right
-    one is held out of the way.
+    """Returns the `arm_clearance` of a pose, metres, when the arm of a side is being placed.
+
+    The left arm (side 0) is placed first. For it the right arm is straightened in T-pose, out of
+    the way.
     """
     if side == 0:
         rotations = rotations.copy()
@@ -388,8 +401,10 @@ def _ride(
     feet: list[kin.Feet],
     sinks: Float[np.ndarray, " m"] | None = None,
 ) -> Float[np.ndarray, "m 3"]:
-    """Positions of the pelvis (m, 3) above the centers: smooth heights that the legs allow, minus
-    `sinks`.
+    """Returns positions of the pelvis (m, 3) above the centers, metres.
+
+    The heights are smooth, and the legs can reach the feet. sinks: metres by which the pelvis is
+    lowered (m,). None: not at all.
     """
     heights = np.asarray([
         kin.highest_pelvis(build, turn, center[0], center[2], both, _SPARE)
@@ -397,7 +412,7 @@ def _ride(
     ])  # fmt: skip
 
     def window(values):
-        """The frames around each frame."""
+        """Returns the values of the frames around each frame, (m, 2 _SMOOTHING + 1)."""
         padded = np.pad(values, _SMOOTHING, mode="edge")
         return np.lib.stride_tricks.sliding_window_view(padded, 2 * _SMOOTHING + 1)
 
@@ -409,7 +424,7 @@ def _ride(
 
 
 def _ease(t: float) -> float:
-    """From 0 to 1 with rest at both ends (speed and acceleration)."""
+    """Maps t in [0, 1] smoothly to [0, 1]; speed and acceleration are 0 at both ends."""
     t = np.clip(t, 0.0, 1.0)
     return t**3 * (10 - 15 * t + 6 * t**2)
 
@@ -417,4 +432,5 @@ def _ease(t: float) -> float:
 KINDS: dict[str, tuple[float, Callable[[np.random.Generator, kin.Build, int], _Moves]]] = {
     "walk": (0.5, _walk), "turn": (0.2, _turn), "reach": (0.3, _reach),
 }  # fmt: skip
-"""Name -> probability, and a function of a generator, a build and a length."""
+"""Kinds of motion by name: the probability, and the function that makes one. It takes a generator,
+a build and the number of frames."""

@@ -1,4 +1,4 @@
-"""Synthetic people as the examples of a training run. `training.sources` reaches this by name."""
+"""Makes sources of synthetic people for training runs. `training.sources` imports it by name."""
 
 import dataclasses
 import logging
@@ -19,8 +19,9 @@ logger = logging.getLogger(__name__)
 
 
 def people_of_run(people: int, out: Path, body: BodyModel) -> SourceFactory:
-    """People of the training seeds, rendered for every step; their bank is kept in the run's
-    folder.
+    """Makes a source of the first people of the training split, rendered anew for every step.
+
+    people: their number. out: folder of the run, which keeps their bank.
     """
     return on_the_fly_people(_bank(people, out, body))
 
@@ -28,10 +29,10 @@ def people_of_run(people: int, out: Path, body: BodyModel) -> SourceFactory:
 def people_of_split(
     people: int, body: BodyModel, split: str, size: int, each_once: bool = False
 ) -> SourceFactory:
-    """The first people of a split, rendered for every step.
+    """Makes a source of the first people of a split, rendered anew for every step.
 
-    Arguments: size: of the images, pixels: textures are as fine as these need. each_once: see
-    `on_the_fly_people`.
+    people: their number. size: of the images, pixels; textures are as fine as these need.
+    each_once: see `on_the_fly_people`.
     """
     texture = 1024
     if size <= 64:
@@ -45,10 +46,11 @@ def people_of_split(
 def on_the_fly_people(
     bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, each_once: bool = False
 ) -> SourceFactory:
-    """People of a bank, rendered for every step on the device that trains; sizes and views are
-    those of the run.
+    """Makes a source of the people of a bank, rendered for every step on the device that trains.
 
-    each_once: each person once, in order, as a validation wants them; otherwise they are drawn at
+    Image sizes and views are those of the run's configuration.
+
+    each_once: whether each person is shown once, in order, for validation; otherwise people are
     random.
     """
 
@@ -78,7 +80,7 @@ def on_the_fly_people(
 
 
 def _bank(people: int, out: Path, body: BodyModel) -> PeopleBank:
-    """The bank in out/people.npz, which one process makes unless it is there."""
+    """Returns the bank in out/people.npz. One process makes it if it is missing or another one."""
     path, seeds, bank = out / "people.npz", SPLITS["train"][:people], None
     if jax.process_index() == 0:
         bank = load_bank(path) if path.is_file() else None

@@ -1,9 +1,9 @@
-"""How clothes are cut and draped: cuts, shells of cloth around the body, tubes (skirts) around hips
-and legs.
+"""Cuts and drapes clothes: shells of cloth around the body, and tubes (skirts) around the legs.
 
-A cut is a field over template coordinates (n, 3), see `anatomy`, positive where there is cloth. A
-shell starts on the skin, is smoothed (cloth does not follow navels), moved outwards to the convex
-silhouettes of trunk and limbs, and never comes nearer to the skin than its ease.
+A cut is a function of template coordinates (n, 3), see `anatomy`. It returns a field (n,) that is
+positive where there is cloth. A shell starts as the skin inside of the cuts. It is smoothed,
+because cloth does not follow navels, and moved outwards to the convex silhouettes of trunk and
+limbs. It keeps a least distance from the skin.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ from humangs_jax.synthetic.surfaces import (
 )
 
 TRUNK_HALF_WIDTH = 0.25
-"""In T-pose everything further out than this is an arm."""
+"""In T-pose everything with a larger |x| than this is an arm, template coordinates."""
 NECKLINES = {
     "crew": (0.0, 0.085),
     "vee": (0.0, 0.085),
@@ -42,15 +42,18 @@ NECKLINES = {
     "high": (0.052, 0.085),
     "collar": (0.012, 0.085),
 }
-"""Lift of the neckline's plane, and distance from the neck's axis beyond which the shoulder is
-always covered.
+"""Necklines by name: how far the plane of the neckline is raised, and the distance from the axis of
+the neck beyond which the shoulder is always covered; metres.
 """
 HEM_MARGIN = 0.012
-"""Skin is removed below cloth from this far inside the hem (metres of template coordinates)."""
+"""How far inside of a hem the skin below cloth is removed, metres of template coordinates."""
 
 
 def neckline(template: Points, style: str, depth: float) -> Field:
-    """Positive below the neckline. depth: of a vee or scoop, metres."""
+    """Returns a field (n,) that is positive below a neckline.
+
+    style: one of NECKLINES. depth: of a vee or a scoop, metres.
+    """
     x, y, z = template.T
     radial = np.sqrt(x * x + (z + 0.005) ** 2)
     lift, wide = NECKLINES[style]
@@ -68,8 +71,9 @@ def neckline(template: Points, style: str, depth: float) -> Field:
 
 
 def sleeves(template: Points, end: float) -> Field:
-    """Positive inside of |x| = end; for sleeveless tops (end < 0.2) an armhole down to the
-    armpit.
+    """Returns a field (n,) that is positive on trunk and arms up to |x| = end.
+
+    With end < 0.2 the top is sleeveless, and its armholes widen down to the armpits.
     """
     x, y = np.abs(template[:, 0]), template[:, 1]
     if end < 0.2:
@@ -78,19 +82,21 @@ def sleeves(template: Points, end: float) -> Field:
 
 
 def above(template: Points, level: float) -> Field:
-    """Positive above a height of the trunk or the legs."""
+    """Returns a field (n,) that is positive above a height."""
     return template[:, 1] - level
 
 
 def trousers(template: Points, top: float, end: float) -> Field:
-    """Positive on hips and legs between two heights."""
+    """Returns a field (n,) that is positive on hips and legs between two heights."""
     x, y, _ = template.T
     return np.minimum.reduce([top - y, y - end, TRUNK_HALF_WIDTH - np.abs(x)])
 
 
 def front_opening(template: Points, gap: float, spread: float) -> Field:
-    """Positive outside of a gap in front, |x| < gap at the chest, wider by `spread` (m/m) downwards
-    and at the neck.
+    """Returns a field (n,) that is positive everywhere but in an opening down the front.
+
+    gap: half of the opening's width at the chest, metres. spread: metres per metre by which half of
+    the width grows downwards. The opening is also wider at the neck.
     """
     x, y, z = template.T
     wide = gap + spread * np.maximum(-0.05 - y, 0) + 0.25 * np.maximum(y - 0.04, 0) * (y < 0.25)
@@ -98,8 +104,10 @@ def front_opening(template: Points, gap: float, spread: float) -> Field:
 
 
 def collar(template: Points, low: float, high: float, gap: float = 0.012) -> Field:
-    """Positive on a band around the neck between two heights (of the neckline's plane), open in
-    front.
+    """Returns a field (n,) that is positive on a band around the neck, open in front.
+
+    low, high: heights of the lower and upper edge, which are tilted as a neckline is. gap: half of
+    the width of the opening, metres.
     """
     x, y, z = template.T
     radial, plane = np.sqrt(x * x + (z + 0.005) ** 2), y + 0.42 * z
@@ -109,7 +117,11 @@ def collar(template: Points, low: float, high: float, gap: float = 0.012) -> Fie
 
 
 def lapel(template: Points, gap: float, spread: float, bottom: float) -> Field:
-    """Positive on two tapering strips beside a front opening, from the collar down to `bottom`."""
+    """Returns a field (n,) that is positive on two tapering strips beside an opening in front.
+
+    They go from the collar down to height `bottom`. gap, spread: of the opening, see
+    `front_opening`.
+    """
     x, y, z = template.T
     width = np.clip((y - bottom) * 0.42, 0, 0.075) * np.clip((0.2 - y) / 0.05, 0, 1)
     inner = front_opening(template, gap, spread)
@@ -119,28 +131,34 @@ def lapel(template: Points, gap: float, spread: float, bottom: float) -> Field:
 
 
 def hips_and_legs(template: Points, top: float, bottom: float) -> Field:
-    """Positive on what a tube around hips and legs hides, down to two hands above its hem: they may
-    be seen from below.
+    """Returns a field (n,) that is positive on what a tube around hips and legs hides.
+
+    top, bottom: heights of the tube. Legs are not hidden up to 16 cm above the hem, because they
+    may be seen from below.
     """
     x, y, _ = template.T
     return np.minimum.reduce([top - 0.03 - y, y - bottom - 0.16, TRUNK_HALF_WIDTH - np.abs(x)])
 
 
 def shaft(template: Points, height: float) -> Field:
-    """Positive on feet and legs below a height over the floor."""
+    """Returns a field (n,) that is positive on feet and legs below a height over the floor."""
     return FLOOR + height - template[:, 1]
 
 
 def straps(template: Points, low_front: float, low_back: float) -> Field:
-    """Positive on two strips over the shoulders, like a backpack's."""
+    """Returns a field (n,) that is positive on two straps over the shoulders.
+
+    low_front, low_back: heights where they end.
+    """
     x, y, z = template.T
     low = np.where(z > -0.01, low_front, low_back)
     return np.minimum.reduce([0.021 - np.abs(np.abs(x) - 0.092), y - low, 0.2 - y])
 
 
 def sash(template: Points, shoulder: float, hip: float, half_width: float) -> Field:
-    """Positive on a strip across the trunk from one shoulder (x = shoulder, at the top) to the
-    other hip (x = hip).
+    """Returns a field (n,) that is positive on a strip across the trunk.
+
+    The strip goes from x = shoulder at the top to x = hip on the other side. half_width: metres.
     """
     x, y, _ = template.T
     along = np.asarray([hip - shoulder, -0.30 - 0.17])
@@ -154,8 +172,9 @@ def sash(template: Points, shoulder: float, hip: float, half_width: float) -> Fi
 
 
 def necktie(template: Points, length: float, width: float) -> Field:
-    """Positive on a strip down the chest that widens downwards and ends in a point; a knot on
-    top.
+    """Returns a field (n,) that is positive on a tie: a strip down the chest with a knot on top.
+
+    The strip widens downwards and ends in a point. width: half of its largest width, metres.
     """
     x, y, z = template.T
     top, bottom = 0.137 - 0.42 * z, 0.1 - length
@@ -165,13 +184,16 @@ def necktie(template: Points, length: float, width: float) -> Field:
 
 
 def bracelet(template: Points, side: float, low: float, high: float) -> Field:
-    """Positive on one arm between two distances from the middle."""
+    """Returns a field (n,) that is positive on one arm between two distances |x| from the middle.
+
+    side: +1 for left, -1 for right.
+    """
     x, y, _ = template.T
     return np.where(y > -0.1, np.minimum(side * x - low, high - side * x), -1.0)
 
 
 def sandal_straps(template: Points) -> tuple[Field, Field]:
-    """Positive on a strap across the toes, and on one around the ankle."""
+    """Returns two fields (n,), positive on a strap across the toes and on one around the ankle."""
     y, z = template[:, 1] - FLOOR, template[:, 2]
     over_toes = np.minimum.reduce([0.02 - np.abs(z - 0.09 + 0.3 * y), 0.075 - y, y - 0.004])
     return over_toes, 0.009 - np.abs(y - 0.088 - 0.25 * z)
@@ -179,37 +201,38 @@ def sandal_straps(template: Points) -> tuple[Field, Field]:
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """How a shell hangs. Lengths in metres."""
+    """How a shell hangs on the body. Lengths are in metres."""
 
     ease: float
-    """Distance from the skin (at least) and from its silhouettes."""
+    """Distance of the cloth from the smoothed skin and from the silhouettes."""
     hang: float = 3.0
     """Slope by which hanging cloth may narrow downwards, metres per metre; large values cling."""
     sleeve: float = 0.0
-    """Width added at the end of the sleeve."""
+    """Distance from the arm that is added at the end of the sleeve."""
     leg: float = 0.0
-    """Width added at the end of the trouser leg."""
+    """Distance from the leg that is added at the end of the trouser leg."""
     leg_hang: float = 3.0
-    """As `hang`, of the cloth of each leg."""
+    """The same slope for the cloth of each leg."""
     fold: float = 0.004
     """Height of the folds; 0 for none."""
     hem: float = 0.008
     """Depth of the hem that is turned in."""
     quilt: float = 0.0
-    """Period of padded rings; 0 for none."""
+    """Distance between padded rings; 0 for none."""
     inner: float = 0.0
-    """Distance from the skin below which nothing comes: what is worn below."""
+    """Least distance from the skin, because of the clothes below."""
     calm: float = 9.0
     """Height above which there are no folds."""
     skirted: bool = False
-    """Whether it goes around both legs below the hips (tops), not around each."""
+    """Whether the shell goes around both legs together, as tops do, and not around each."""
 
 
 def shell(
     rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], fit: Fit
 ) -> Surface:
-    """A garment that covers the skin where all fields (n,) over the body's vertices are
-    positive.
+    """Makes a garment that covers the skin where all fields are positive.
+
+    fields: each has a number for each vertex of the body (n,).
     """
     skin = anatomy.skin
     surface = skin.with_attributes(
@@ -224,8 +247,10 @@ def shell(
 
 
 def finished(surface: Surface, iterations: int, hem: float) -> Surface:
-    """A surface with smoothed weights, hems turned in by a depth (metres), and no attributes but
-    `template` and `cloth`.
+    """Finishes a surface: smooths its skinning weights, and turns in its hems.
+
+    Only the attributes `template` and `cloth` are kept. iterations: of smoothing. hem: depth that
+    is turned in, metres.
     """
     weights = smooth_weights(surface.weights, surface.faces, iterations)
     kept = {name: surface.attributes[name] for name in ("template", "cloth")}
@@ -233,7 +258,7 @@ def finished(surface: Surface, iterations: int, hem: float) -> Surface:
 
 
 def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> np.ndarray:
-    """Skinning weights (n, j) smoothed over a surface; rows sum to 1."""
+    """Returns skinning weights (n, j) smoothed over a surface; rows sum to 1."""
     used = weights.max(0) > 0
     smoothed = np.zeros_like(weights)
     smoothed[:, used] = smooth(weights[:, used], faces, iterations)
@@ -241,7 +266,7 @@ def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> n
 
 
 def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fit) -> Surface:
-    """The skin of a garment moved to where its cloth hangs."""
+    """Moves a surface that is cut out of the skin to where its cloth hangs."""
     # a smooth surface at the distance of the ease
     below, arm, leg = (surface.attributes[name] for name in ("skin_point", "arm", "leg"))
     normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 2))
@@ -298,8 +323,10 @@ def _drape(rng: np.random.Generator, anatomy: Anatomy, surface: Surface, fit: Fi
 def _fold_heights(
     rng: np.random.Generator, cloth: Float[np.ndarray, "n 4"], arm: Field, leg: Field, fit: Fit
 ) -> Field:
-    """(n,) metres outwards: soft waves, drapes that fall from chest and hips, rings where joints
-    and cuffs gather cloth.
+    """Returns how far folds move the cloth outwards (n,), metres.
+
+    There are soft waves, drapes that fall from chest and hips, and rings where joints and cuffs
+    gather cloth.
     """
     along, around = cloth[:, 1], np.arctan2(cloth[:, 0], cloth[:, 2]) * cloth[:, 3]
     heights = fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11)
@@ -314,7 +341,7 @@ def _fold_heights(
     )
 
     def bend(height, wide):
-        """A bump of that width at a height."""
+        """Returns a bump of a width around `height` metres below along = 0."""
         return np.exp(-(((along + height) / wide) ** 2))
 
     elbows = arm * (bend(0.14, 0.07) + 0.8 * bend(0.34, 0.06))
@@ -335,8 +362,10 @@ def _push(
     ease: float,
     extra: Field,
 ) -> Points:
-    """Points moved away from an axis to `ease + extra` metres outside of a silhouette; along: (n,)
-    on it; across: other axes.
+    """Moves points away from an axis to at least `ease + extra` metres outside of silhouettes.
+
+    across: the two axes across the axis. along: positions of the points on the axis (n,). amount:
+    share of the move for each point (n,), 0 to 1.
     """
     center, axes = boundary.center(along), list(across)
     angle, radius = polar(points[:, axes], center)
@@ -358,12 +387,13 @@ def skirt(
     spread: float = 0.0,
     cling: float = 0.0,
 ) -> Surface:
-    """A tube around the hips and both legs between two template heights (top, bottom), `ease`
-    metres wider than they are.
+    """Makes a skirt: a tube around the hips and both legs.
 
-    flare: metres added per metre further down. pleats: number, depth. gap: half width of an opening
-    in front, metres, negative for none; it widens by `spread` metres per metre downwards. cling:
-    metres from the top over which it does not flare.
+    heights: template heights of the top and the bottom. ease: distance from hips and legs, metres.
+    flare: metres by which the radius grows per metre downwards. pleats: their number, and their
+    depth in metres. gap: half of the width of an opening in front, metres; negative for none.
+    spread: metres by which half of that width grows per metre downwards. cling: metres from the top
+    over which the skirt does not flare.
     """
     top, bottom = heights
     # rows are at most 35 mm high
@@ -391,7 +421,7 @@ def skirt(
 
 
 def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
-    """Rest heights of the person's skin for template heights on trunk and legs."""
+    """Converts template heights on trunk and legs to heights of the person at rest, metres."""
     x, y, _ = anatomy.skin.template.T
     own = (np.abs(x) < 0.2) & (y < 0.14) & (y > ANKLE)
     bins = np.floor((y[own] - ANKLE) / 0.03).astype(int)
@@ -407,8 +437,10 @@ def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
 def _skirt_weights(
     anatomy: Anatomy, vertices: Points, template_y: Field
 ) -> Float[np.ndarray, "n j"]:
-    """Weights of the trunk at the waist, blending into those of thighs and shins of the vertex's
-    side further down.
+    """Returns the skinning weights (n, j) of a skirt.
+
+    They are those of the trunk at the waist. Further down they are blended into the weights of the
+    thigh and the shin on the vertex's side. template_y: template heights of the vertices (n,).
     """
     x, y, _ = anatomy.skin.template.T
     near = np.flatnonzero((np.abs(x) < 0.2) & (y < 0.0) & (y > -0.4))[::2]
@@ -426,8 +458,9 @@ def _skirt_weights(
 
 
 def nearest_weights(anatomy: Anatomy, points: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """(n, j) mean skinning weights of the body vertices nearest to each point, among candidate
-    vertex indices.
+    """Returns the mean skinning weights (n, j) of the six body vertices nearest to each point.
+
+    candidates: indices of the body's vertices that are considered.
     """
     body = anatomy.skin.vertices[candidates]
     squared = np.sum(points**2, -1)[:, None] - 2 * points @ body.T + np.sum(body**2, -1)[None]

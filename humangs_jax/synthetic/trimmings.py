@@ -1,9 +1,9 @@
-"""What is sewn on or printed on a fabric: prints, buttons, zips, seams, pockets, ribs, bands,
-stripes, laces.
+"""Paints what is sewn on or printed on cloth: prints, buttons, zips, seams, pockets, ribs, laces.
 
-`sewn` is the fabric of a garment with all of that, by the table `_SEWN_ON`. Its trimmings take
-colors (n, 3) at points, the points, random numbers and the garment, and return other colors. Words
-are set in a 5 x 7 alphabet of the package's own.
+`sewn` makes the fabric of a garment with all of these; the table `_SEWN_ON` says which garments
+have which. A trimming is a function that takes the colors (n, 3) of points, the points, a generator
+and the garment, and returns the colors with the trimming. Words are set in an alphabet of 5 x 7
+cells a letter, which is part of this module.
 """
 
 from collections.abc import Callable
@@ -22,9 +22,9 @@ PADDED = ("puffer", "vest")
 """Kinds of garments that are quilted."""
 
 _ROWS = 7
-"""Rows of cells of a letter."""
+"""Number of rows of cells of a letter."""
 _ADVANCE = 6
-"""Columns of cells from one letter to the next."""
+"""Number of columns of cells from one letter to the next."""
 
 _ALPHABET = {
     "A": "0E11111F111111", "B": "1E11111E11111E", "C": "0E11101010110E",
@@ -43,14 +43,14 @@ _ALPHABET = {
     "7": "1F010204080808", "8": "0E11110E11110E",
     "9": "0E11110F01020C",
 }  # fmt: skip
-"""Seven rows of five bits each, in hexadecimal."""
+"""Letters as seven rows of five bits each, in hexadecimal; the highest bit is on the left."""
 
 EMBLEMS = ("disc", "star", "heart", "peaks", "sun", "diamond", "bolt", "ring")
-"""Shapes that are printed."""
+"""Names of the shapes that are printed, see `emblem`."""
 
 
 def bitmap(text: str) -> Bool[np.ndarray, "7 w"]:
-    """(7, 6 n) cells of a word of n letters; unknown letters are blanks."""
+    """Returns the cells (7, 6 n) of n letters, true where ink is. Unknown letters are blank."""
     cells = np.zeros((_ROWS, _ADVANCE * len(text)), bool)
     for i, letter in enumerate(text):
         code = bytes.fromhex(_ALPHABET.get(letter, "00" * _ROWS))
@@ -60,7 +60,7 @@ def bitmap(text: str) -> Bool[np.ndarray, "7 w"]:
 
 
 def _random_text(rng: np.random.Generator) -> str:
-    """A word, a number, a year or a made-up name."""
+    """Draws a word, a number, a year or a made-up name."""
     kind = rng.random()
     if kind < 0.4:
         words = "OCEAN NORTH WILD NOVA CITY PEAK LOOP SUNNY TEAM RIVER ZERO MAGIC HELLO FOX"
@@ -76,8 +76,10 @@ def _random_text(rng: np.random.Generator) -> str:
 
 
 def written(cells: Bool[np.ndarray, "7 w"], x: Field, y: Field) -> Field:
-    """(n,) ink of a word at points given in cells from its lower left corner, x to the right, y up;
-    edges are rounded.
+    """Returns how much ink of a word is at each point (n,), 0 to 1. Edges are rounded.
+
+    cells: as `bitmap` returns them. x, y: points to the right of and above the lower left corner of
+    the word, in cells, (n,).
     """
     padded = np.pad(cells.astype(np.float32), 1)
     column = np.clip(x + 0.5, 0, padded.shape[1] - 1.001)
@@ -90,9 +92,10 @@ def written(cells: Bool[np.ndarray, "7 w"], x: Field, y: Field) -> Field:
 
 
 def emblem(kind: str, x: Field, y: Field, points: int = 5) -> Field:
-    """(n,) how far inside of an emblem of radius 1 or so: positive inside, in units of x and y.
+    """Returns how far points are inside of an emblem (n,), negative outside.
 
-    `points`: of a star.
+    The emblem has a radius of about 1 around x = y = 0. kind: one of EMBLEMS. points: number of
+    points of a star.
     """
     r, a = np.sqrt(x * x + y * y), np.arctan2(x, y)
     if kind == "disc":
@@ -121,12 +124,12 @@ def emblem(kind: str, x: Field, y: Field, points: int = 5) -> Field:
 
 
 def _trunk(s: Spots) -> Field:
-    """(n,) 1 on the trunk, 0 on limbs."""
+    """Returns 1 for points on the trunk and 0 for points on limbs, (n,)."""
     return band(s.cloth[:, 3], 0.13, 1.0, 0.01)
 
 
 def _from_the_side(s: Spots) -> Field:
-    """(n,) metres around the trunk or limb from its sides."""
+    """Returns the distance of points from the nearer side of trunk or limb (n,), metres."""
     return np.abs(np.abs(s.around) - 0.5 * np.pi * s.cloth[:, 3])
 
 
@@ -135,7 +138,7 @@ def _darker(colors: Points, share: float | Float[np.ndarray, "n 1"], where: Fiel
 
 
 def _seamed(colors: Points, s: Spots) -> Points:
-    """Seams down the sides of trunk and limbs and around the armholes."""
+    """Adds seams down the sides of trunk and limbs, and around the armholes."""
     armhole = np.where(s.template[:, 1] > -0.02, np.abs(np.abs(s.template[:, 0]) - ARMHOLE), 1.0)
     return _darker(
         colors, 0.8, np.maximum(band(_from_the_side(s), -1, 0.0022), band(armhole, -1, 0.0024))
@@ -143,7 +146,10 @@ def _seamed(colors: Points, s: Spots) -> Points:
 
 
 def _hemmed(colors: Points, s: Spots, hem: float, sleeve: float | None) -> Points:
-    """Stitching beside the hem at height y of trunk or legs, and at |x| = sleeve of the arms."""
+    """Adds stitches at height y = hem on trunk or legs, and at |x| = sleeve on arms.
+
+    sleeve: None for no stitches on arms.
+    """
     x, y, _ = s.template.T
     on_arm = np.abs(x) > 0.2
     line = band(np.abs(y - hem), 0.0, 0.002) * ~on_arm
@@ -153,8 +159,9 @@ def _hemmed(colors: Points, s: Spots, hem: float, sleeve: float | None) -> Point
 
 
 def _printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
-    """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a
-    scene.
+    """Adds a print on the chest, and sometimes on the back.
+
+    The print is a number, words, an emblem, words and an emblem, a small logo or a picture.
     """
     # everything is drawn first, so that front and back show the same print
     number, base = "number" in garment.details, garment.fabric.base
@@ -180,7 +187,7 @@ def _printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garmen
 
     # paint the print once, around its own middle
     def motif(result, x, y, where):
-        """The print on colors, at places in metres from its middle."""
+        """Adds the print to colors. x, y: points in metres from its middle. where: share of it."""
         if kind in ("words", "number"):
             if framed and kind == "words":
                 box = band(np.abs(x), -1, (0.5 * width + 1.5) * cell) * band(
@@ -215,7 +222,7 @@ def _printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garmen
 
 
 def _side_striped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
-    """One to three stripes down the outside of arms and legs."""
+    """Adds one to three stripes down the outside of arms and legs."""
     ink, count = accent(rng, garment.fabric.base), int(rng.integers(1, 4))
     girth, wide = s.cloth[:, 3], 0.022 / count
     turned = np.where(s.template[:, 0] > 0, s.around, -s.around)
@@ -231,7 +238,7 @@ def _side_striped(colors: Points, s: Spots, rng: np.random.Generator, garment: G
 
 
 def _ribbed(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
-    """Knitted bands at the hem and the cuffs: upright ribs, a little darker."""
+    """Adds knitted bands at the hem and the cuffs: upright ribs that are a little darker."""
     x, width = np.abs(s.template[:, 0]), 0.04
     at_hem = s.template[:, 1] < garment.sizes["bottom"] + 1.3 * width
     inside = np.where(x > 0.2, x > garment.sizes["sleeve"] - width, at_hem)
@@ -240,13 +247,13 @@ def _ribbed(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garmen
 
 
 def _quilted(colors: Points, s: Spots, _rng: np.random.Generator, _garment: Garment) -> Points:
-    """Dark stitched lines around the garment, between which it bulges."""
+    """Adds dark stitched lines around the garment, one every `QUILT` metres."""
     phase = (s.along / QUILT) % 1
     return _darker(colors, 0.55, np.exp(-((np.minimum(phase, 1 - phase) * QUILT / 0.006) ** 2)))
 
 
 def _buttoned(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
-    """A placket with buttons down the front."""
+    """Adds a placket with buttons down the front."""
     high = 0.2
     low = garment.sizes["end" if garment.kind in DRESSES else "bottom"]
     if garment.kind == "polo":
@@ -264,7 +271,7 @@ def _buttoned(colors: Points, s: Spots, rng: np.random.Generator, garment: Garme
 
 
 def _zipped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
-    """A zip down the front, or its halves along the edges of an open front."""
+    """Adds a zip down the front, or one half of a zip along each edge of an open front."""
     ink = color(0.1, 0.05, rng.choice([0.15, 0.6, 0.75]))
     edge = max(garment.sizes.get("gap", 0.0), 0.0)
     front = (s.cloth[:, 2] > 0) * _trunk(s) * band(s.cloth[:, 1], garment.sizes["bottom"], 0.2)
@@ -281,8 +288,9 @@ def _boundary(x: Field, y: Field, half_width: float, half_height: float) -> Fiel
 def _pocketed(
     colors: Points, s: Spots, rng: np.random.Generator, _garment: Garment, kind: str
 ) -> Points:
-    """Pockets as stitched silhouettes: on the chest, in a jacket's front, on jeans (front and back)
-    or on the thighs (cargo).
+    """Adds the stitched outlines of pockets.
+
+    kind: "chest", "jacket" (in front), "jeans" (front and back) or "cargo" (on the thighs).
     """
     sides = rng.choice([1, 2]) if kind == "chest" else 2
     bright = 1.6 if kind == "jeans" and rng.random() < 0.5 else 0.6
@@ -309,12 +317,12 @@ def _pocketed(
 
 
 def banded(colors: Points, s: Spots, ink: np.ndarray, low: float, high: float) -> Points:
-    """A sash or waistband between two heights of the trunk."""
+    """Adds a sash or waistband of color `ink` between two heights of the trunk."""
     return mix(colors, ink, band(s.cloth[:, 1], low, high) * band(s.cloth[:, 3], 0.1, 1.0, 0.01))
 
 
 def _sashed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
-    """A sash around the waist of a coat or a dress."""
+    """Adds a sash around the waist of a coat or a dress."""
     if garment.kind == "coat":
         return banded(colors, s, garment.fabric.base * 0.6, WAIST - 0.02, WAIST + 0.02)
     waist = garment.sizes["waist"]
@@ -322,7 +330,7 @@ def _sashed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment
 
 
 def _turned_up(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
-    """The paler inner side of trouser legs above their hems."""
+    """Adds turned-up hems of trouser legs, which show the paler inner side of the cloth."""
     pale = (0.5 * garment.fabric.base + 0.35).astype(np.float32)
     return mix(colors, pale, band(s.template[:, 1], -9.0, garment.sizes["end"] + 0.045))
 
@@ -342,15 +350,20 @@ _SEWN_ON = (
     (("coat", *DRESSES), "sash", _sashed),
     (("jeans",), "turn_up", _turned_up),
 )
-"""Kinds of garments, the detail that they need for it, None: all have it; a trimming, and its
-further arguments. In this order: they share the fabric's random numbers."""
+"""Rows of: kinds of garments; the detail that a garment needs to have the trimming (None: every
+garment of these kinds has it); the trimming; its further arguments. The order matters, because all
+trimmings of a garment draw from one generator."""
 
 
 def sewn(
     garment: Garment, hem: float, sleeve: float | None = None, seams: bool = True
 ) -> Callable[[Spots], Points]:
-    """The garment's fabric with stitches at the hem (height y) and the sleeves' ends, seams, prints
-    and what is sewn on.
+    """Returns a function that gives the colors (n, 3) of points of a garment.
+
+    They are those of the fabric with stitches, seams, prints and the trimmings of `_SEWN_ON`.
+
+    hem: template height of the stitches at the hem. sleeve: |x| of the stitches at the cuffs. None:
+    no cuffs. seams: whether there are seams.
     """
     details = garment.details
     if "collar" in details and "open" not in details:
@@ -377,7 +390,7 @@ def sewn(
 
 
 def leather(s: Spots, garment: Garment) -> Points:
-    """Shoes: upper, a sole of another color, laces on the instep, and what marks the kind."""
+    """Returns the colors of shoes (n, 3): upper, sole, laces, and details of the kind of shoe."""
     # colors of sole and laces; the order of the draws is part of the seed
     rng, kind, base = garment.fabric.rng(2), garment.kind, garment.fabric.base
     white, sneakers = rng.random() < 0.75, kind == "sneakers"
@@ -412,7 +425,7 @@ def leather(s: Spots, garment: Garment) -> Points:
 
 
 def buckled(s: Spots, garment: Garment) -> Points:
-    """A belt with stitched edges, holes and a buckle in front."""
+    """Returns the colors (n, 3) of a belt with stitched edges, holes, and a buckle in front."""
     width = garment.sizes["width"]
     x = s.template[:, 0]
     y = s.template[:, 1] - (garment.sizes["top"] - 0.5 * width)
@@ -430,9 +443,9 @@ def buckled(s: Spots, garment: Garment) -> Points:
 
 
 def bagged(s: Spots, garment: Garment) -> Points:
-    """A bag with a zip around the top, a front pocket and darker edges.
+    """Returns the colors (n, 3) of a bag with a zip around the top and a front pocket.
 
-    Template: the bag's own unit box.
+    The template coordinates of a bag's points are those in a box from -1 to 1.
     """
     rng, base = garment.fabric.rng(2), garment.fabric.base
     ink = color(0.1, 0.05, rng.choice([0.1, 0.7]))

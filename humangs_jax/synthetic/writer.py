@@ -1,5 +1,4 @@
-"""Synthetic people as capture folders: images, masks, cameras and body poses on disk, made from
-seeds.
+"""Writes synthetic people, made from seeds, as capture folders: images, masks, cameras and poses.
 
 out/manifest.json                    settings of the set and finished subjects, see `data.sets`
 out/SEED/                            a capture (docs/capture_format.md): views of one person in one
@@ -65,13 +64,13 @@ from humangs_jax.synthetic.surroundings import (
 )
 
 HELD_OUT = "held_out"
-"""Sub-folder of a subject's folder."""
+"""Name of the sub-folder for held-out views in a subject's folder."""
 CAPTURE = "capture.json"
-"""File of a capture that is written last."""
+"""Name of the file of a capture that is written last."""
 
 
 class Stream:
-    """Random streams of a seed, by what they draw; stream 0 makes the person."""
+    """Numbers of the random streams of a seed. Stream 0 makes the person."""
 
     POSES, CAMERAS, HELD_OUT_CAMERAS, CLOSE_CAMERAS, MOTION = range(1, 6)
 
@@ -81,57 +80,56 @@ class Layout:
     """What is written for each person."""
 
     image_size: int = 512
-    """Pixels a side; smaller sizes are box averages of it (the loader makes them)."""
+    """Side of the images, pixels. The loader makes smaller ones by averaging."""
     poses: int = 1
-    """How many poses each person has."""
+    """Number of poses of each person."""
     views: int = 60
-    """Cameras of the published protocol that see each pose."""
+    """Number of cameras of the published protocol that see each pose."""
     close_views: int = 0
-    """Further cameras of each pose that are nearer, and see parts of the person."""
+    """Number of further cameras of each pose that are nearer and see parts of the person."""
     held_out_views: int = 0
-    """Cameras of the same pose, and of each of `novel_poses` others, in held_out/."""
+    """Number of cameras in held_out/ that see the first pose, and each of the novel poses."""
     novel_poses: int = 0
-    """Further poses that only held_out/ shows."""
+    """Number of further poses that only held_out/ shows."""
     frames: int = 0
-    """0: poses are independent.
+    """Number of frames of the motion, at 30 per second; `poses` evenly spaced frames are shown.
 
-    Otherwise `poses` evenly spaced frames of a motion of this many frames, 30 a second.
+    0: there is no motion, and poses are independent.
     """
     scan_texture: int = 0
-    """Texels a side of the scan's texture, 0: no scan."""
+    """Side of the scan's texture, texels. 0: no scan is written."""
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """A camera that sees pose number `frame`."""
+    """A camera and the pose that it sees."""
 
     frame: int
-    """Number of the pose that the camera sees."""
+    """Index of the pose."""
     name: str
-    """Name of the view, and of its image."""
+    """Name of the view and of the image."""
     camera: Camera
     """The camera."""
 
 
 def sample_pose(subject: SyntheticSubject, index: int) -> PosedSubject:
-    """The subject in its pose of that number, standing on y = 0.
-
-    Pose 0 is the one of the input views.
-    """
+    """Poses the subject in the random pose number `index`, with the lowest point on y = 0."""
     rng = np.random.default_rng([subject.seed, Stream.POSES, index])
     return stand(subject, sample_rotations(rng, subject.build))
 
 
 def stand(subject: SyntheticSubject, rotations: np.ndarray) -> PosedSubject:
-    """The subject in a pose of rotations (j, 3), its lowest point on y = 0."""
+    """Poses the subject with its lowest point on y = 0. rotations: (j, 3), axis-angle, radians."""
     rotations, translation = np.asarray(rotations, np.float32), np.zeros(3, np.float32)
     translation[1] = -subject.posed_vertices(rotations, translation)[:, 1].min()
     return pose_subject(subject, rotations, translation)
 
 
 def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = None) -> Motion:
-    """The subject's motion, see `sequences`; its lowest points, soles of shoes included, are on y =
-    0 about all the time.
+    """Makes the subject's motion, see `sequences`.
+
+    The lowest point, with shoes, is at a height of about 0 most of the time. kind: None for a
+    random one.
     """
     sequence = sample_sequence(
         np.random.default_rng([subject.seed, Stream.MOTION]), subject.build, frames, kind
@@ -148,7 +146,7 @@ def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = Non
 def capture_views(
     subject: SyntheticSubject, body: BodyModel, poses: list[PosedSubject], views: list[View]
 ) -> Capture:
-    """A capture of these views."""
+    """Renders the views, and returns them as a capture."""
     rendered = [render_view(poses[view.frame], view.camera) for view in views]
     images, masks = (np.stack(x) for x in zip(*rendered, strict=True))
     rotations, translations = (
@@ -167,7 +165,7 @@ def capture_views(
 
 
 def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout) -> None:
-    """One person as `layout` says. Written whole or not at all; an existing folder is replaced."""
+    """Writes one person, whole or not at all. An existing capture in the folder is replaced."""
     subject = make_subject(seed, body)
     # poses are independent, or evenly spaced frames of one motion
     motion = None
@@ -221,12 +219,15 @@ def write_set(
     body: BodyModel | None = None,
     progress: bool = True,
 ) -> list[Path]:
-    """Write people `first` .. `first + subjects - 1` of a split into `out`/SEED; folders that are
-    there already are kept.
+    """Writes people `first` .. `first + subjects - 1` of a split into `out`/SEED.
 
-    workers: processes; more than one use the CPU, write the same files, and need the calling script
-    to be guarded by `if __name__ == "__main__"`. body: default: the body that comes with the
-    package. progress: show a bar. Returns the folders.
+    Finished folders are kept.
+
+    workers: number of processes. If more than one, they use the CPU and write the same files, and
+    the calling script must be guarded by `if __name__ == "__main__"`. body: None for the body that
+    comes with the package. progress: whether a bar is shown.
+
+    Returns: the folders.
 
     Raises: ValueError if the people reach beyond the split, `out` was written with other settings
     or by another version of the generator, or (at the end) some could not be made; OSError if
@@ -292,7 +293,11 @@ def _views(
     size: int,
     mark: str = "",
 ) -> list[View]:
-    """`count` views of each pose, from cameras that `place` finds."""
+    """Makes `count` views of each pose.
+
+    stream: seed of the random numbers. place: function that makes the cameras of one pose. size: of
+    the images, pixels. mark: a part of the views' names.
+    """
     rng, views = np.random.default_rng(stream), []
     shown = poses if count else ()
     for frame, posed in enumerate(shown):
@@ -302,12 +307,12 @@ def _views(
 
 
 def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
-    """The capture folders in `root`, sorted by name; where a manifest says that they are synthetic,
-    only of one split.
+    """Returns the capture folders in `root`, sorted by name.
 
-    Other folders (real captures, those of `humangs preprocess`) are taken as they are. split None:
-    any.
-    Raises: ValueError if a written set holds a subject of another split, or there is no capture.
+    split: the split that all people of a synthetic set must belong to. None: any. It does not
+    matter for other folders: real captures, and those of `humangs preprocess`.
+
+    Raises: ValueError if a synthetic set has a person of another split, or if there is no capture.
     """
     root = Path(root)
     folders = find_captures(root)

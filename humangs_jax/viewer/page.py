@@ -1,9 +1,8 @@
-"""The page that shows an avatar: one HTML file that needs no network, on disk, on localhost or in a
-notebook.
+"""Makes the page that shows an avatar: one HTML file for disk, localhost or a notebook.
 
-Its code lies beside this module in page/, as the browser runs it; here the files become one. The
-browser itself forbids the page all connections (Content-Security-Policy). An avatar and its motion
-travel in it as 16-bit arrays, see `Packed`.
+The page needs no network, and a Content-Security-Policy forbids it all connections. Its code is in
+the files of page/ beside this module, which are put into the one file here. The avatar and its
+motion are in the page as 16-bit arrays, see `Packed`.
 """
 
 import base64
@@ -44,9 +43,9 @@ from humangs_jax.viewer.page_face import pack_face
 
 VERSION = 1
 WEIGHTS = 8
-"""Skinning weights kept of each Gaussian.
+"""Number of skinning weights that are kept for each Gaussian.
 
-The shipped body has at most 7; leaving out the eighth costs nothing there.
+The shipped body has at most 7.
 """
 STEPS = 65535
 SMALLEST_SCALE = 1e-7
@@ -55,9 +54,9 @@ SMALLEST_SCALE = 1e-7
 A thousandth of eps2d for a camera at any distance.
 """
 _SMALLEST_RANGE = 1e-6
-"""Least range of quantized values: keeps the division finite where all are the same."""
+"""Least range of quantized values. It keeps the division finite where all values are equal."""
 SHAPE_STEP = 1e-4
-"""Metres."""
+"""Smallest step of the offsets in `shape_directions`, metres."""
 
 
 @dataclasses.dataclass
@@ -98,10 +97,10 @@ def pack(
     body: BodyModel | None = None,
     motion_name: str = "motion",
 ) -> Packed:
-    """What the page holds of an avatar.
+    """Packs an avatar and a motion for the page.
 
-    Arguments: motion: of the avatar's joints. body: the model that the avatar's vertices are of,
-    for sliders of its shape.
+    motion: None for a page without one. body: the model that the avatar's vertices belong to, which
+    the sliders of shape need; None: there are no sliders. motion_name: shown in the page.
 
     Raises: ValueError, one line, for numbers that are not finite or out of range, a motion of other
     joints, or a body that does not explain the avatar's vertices.
@@ -171,10 +170,10 @@ def pack(
 def largest_weights(
     weights: Float[np.ndarray, "g j"],
 ) -> tuple[Int[np.ndarray, "g 8"], Int[np.ndarray, "g 8"]]:
-    """Joints and weights of the 8 largest of each row, largest first; 65535 is a weight of 1, and
-    rows sum to it.
+    """Returns the joints and values of the 8 largest weights of each row, largest first.
 
-    What is left out is given to the others in proportion; what rounding leaves, to the largest.
+    A value of 65535 is a weight of 1, and rows sum to 65535. Weights that are left out are shared
+    among the others in proportion; the largest one takes what rounding leaves.
     """
     weights = np.pad(
         np.asarray(weights, np.float64), ((0, 0), (0, max(0, WEIGHTS - weights.shape[1])))
@@ -189,8 +188,9 @@ def largest_weights(
 
 
 def _fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | None:
-    """The shape coefficients of `body` with which it has the avatar's vertices; None if it cannot
-    have them to a millimetre (root mean square).
+    """Finds the shape coefficients (s,) with which the body has the avatar's vertices.
+
+    None: the root-mean-square error is a millimetre or more, or the sizes differ.
     """
     target = np.asarray(avatar.rest_vertices, np.float64)
     if body.template.shape != target.shape or len(body.parents) != len(avatar.parents):
@@ -203,7 +203,7 @@ def _fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | 
 
 
 def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any, Any]]:
-    """Values of avatar and motion that have to be finite, by name."""
+    """Returns the values of avatar and motion that have to be finite, by name."""
     values = {
         name: (getattr(avatar, name), FINITE)
         for name in ("skinning_weights", "rest_vertices", "rest_joints")
@@ -217,7 +217,7 @@ def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any,
 
 
 def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    """Add Gaussians, skinning and light to the header and the arrays, in 16 bits or fewer."""
+    """Adds Gaussians, skinning and light to the header and the arrays, in 16 bits or fewer."""
     g = avatar.gaussians
     means, quats, scales, opacities, colors = (
         np.asarray(x, np.float64) for x in (g.means, g.quats, g.scales, g.opacities, g.colors)
@@ -253,8 +253,11 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
 def _pack_shape(
     avatar: Avatar, body: BodyModel, header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> None:
-    """Add how each shape coefficient moves the vertices; the Gaussians of a vertex move with it
-    (they are vertex-major).
+    """Adds how each shape coefficient moves vertices and joints to the header and the arrays.
+
+    Gaussians move with their vertex; they are stored vertex by vertex.
+
+    Raises: ValueError if the body does not explain the avatar's vertices.
     """
     betas = _fitted_shape(avatar, body)
     vertices = len(avatar.rest_vertices)
@@ -279,7 +282,7 @@ def _quantized(
 
 
 def _joined(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Packed:
-    """The arrays one after the other; their types, shapes and places go into the header."""
+    """Joins the arrays into bytes, and adds their types, shapes and offsets to the header."""
     header["arrays"], parts, offset = {}, [], 0
     for name, array in arrays.items():
         data = np.ascontiguousarray(array).tobytes()
@@ -308,9 +311,9 @@ def page_html(
     title: str = "avatar",
     motion_name: str | None = None,
 ) -> str:
-    """The page as text.
+    """Returns the page as text.
 
-    Arguments: motion: None for the walk that comes with the package (if the avatar has its joints).
+    motion: None for the walk that comes with the package, if the avatar has its number of joints.
     title, motion_name: shown in the page.
 
     Raises: ValueError, one line, for an avatar or a motion that cannot be drawn (see `pack`).
@@ -344,7 +347,7 @@ def write_page(
     title: str = "avatar",
     motion_name: str | None = None,
 ) -> int:
-    """Write the page; it appears whole or not at all. Returns its size in bytes.
+    """Writes the page, whole or not at all. Returns its size in bytes.
 
     Raises: as `page_html`; OSError.
     """
@@ -354,17 +357,17 @@ def write_page(
 
 
 class NotebookPage:
-    """What `show` returns: notebooks draw it, `save` writes it."""
+    """The page that `show` returns. A notebook displays it, and `save` writes it to a file."""
 
     def __init__(self, text: str, height: int):
         self._text, self._height = text, height
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the page as one file that any browser opens. Raises: OSError."""
+        """Writes the page as one file that any browser opens. Raises: OSError."""
         write_text(path, self._text)
 
     def _repr_html_(self) -> str:
-        """An iframe that holds the whole page."""
+        """Returns the HTML of an iframe that contains the whole page."""
         style = f"width:100%;height:{self._height}px;border:1px solid #ddd;border-radius:8px"
         return (
             f'<iframe srcdoc="{html.escape(self._text)}" style="{style}" allowfullscreen></iframe>'
@@ -373,15 +376,15 @@ class NotebookPage:
 
 @checked_arguments
 def show(avatar: Avatar, motion: Motion | None = None, height: int = 560) -> NotebookPage:
-    """The avatar in a notebook, moving: the last expression of a cell, or
-    `display(hg.show(avatar))`.
+    """Shows a moving avatar in a notebook.
 
-    The page becomes a part of the notebook's file (some 1.2 MB).
+    Make it the last expression of a cell, or call `display(hg.show(avatar))`. The page becomes part
+    of the notebook's file (about 1.2 MB).
 
     Args:
         avatar: one person.
-        motion: None for the shipped walk.
-        height: pixels.
+        motion: how the avatar moves. None: the shipped walk.
+        height: of the page, pixels.
 
     Returns:
         What Jupyter displays.
@@ -396,9 +399,9 @@ def show(avatar: Avatar, motion: Motion | None = None, height: int = 560) -> Not
 
 
 def serve(text: str, port: int = 0, open_browser: bool = True) -> None:
-    """Serve a page on this machine only, until Ctrl-C.
+    """Serves a page on this machine only, until Ctrl-C.
 
-    Arguments: port: 0 for any free one. Raises: OSError, one line, if the port is taken.
+    port: 0 for any free port. Raises: ArgumentError, one line, if the port cannot be used.
     """
     with page_server({"/": text}, port) as server:
         url = f"http://127.0.0.1:{server.server_address[1]}/"
@@ -410,13 +413,16 @@ def serve(text: str, port: int = 0, open_browser: bool = True) -> None:
 
 
 def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
-    """A server on 127.0.0.1, not yet running, of texts by path, as they are when they are asked
-    for. Raises: as `serve`.
+    """Makes a server of texts on 127.0.0.1, which does not run yet.
+
+    pages: texts by path. A request gets the text that the mapping has at that moment.
+
+    Raises: as `serve`.
     """
 
     class Page(BaseHTTPRequestHandler):
         def do_GET(self):
-            """Answer with the text of the path, or that there is none."""
+            """Answers with the text of the path, or with 404 if there is none."""
             content = pages.get(self.path.split("?")[0].replace("/index.html", "/"))
             data = b"" if content is None else content.encode()
             self.send_response(404 if content is None else 200)
@@ -428,7 +434,7 @@ def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
                 self.wfile.write(data)
 
         def log_message(self, format, *args):
-            """Nothing: few pages, one user."""
+            """Logs nothing."""
 
     try:
         server = ThreadingHTTPServer(("127.0.0.1", port), Page)
@@ -439,8 +445,9 @@ def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
 
 
 def known_body(avatar: Avatar) -> BodyModel | None:
-    """The shipped body on the avatar's vertices, if the avatar is one of its people: what the
-    sliders of shape need.
+    """Returns the shipped body with the avatar's vertices, which the sliders of shape need.
+
+    None: no shape of that body has the avatar's vertices.
     """
     if avatar.parents != PARENTS:
         return None
@@ -454,15 +461,16 @@ def known_body(avatar: Avatar) -> BodyModel | None:
 
 
 def page_script(*names: str) -> str:
-    """The text of some of the page's scripts, below the tables that they share with the readers of
-    motions in Python.
+    """Returns the text of some of the page's scripts, after the tables of `page_rules`.
+
+    names: of files in page/, without .js.
     """
     rules = json.dumps(page_rules(), separators=(",", ":")).replace("<", "\\u003c")
     return "\n".join([f"const RULES = {rules};", *(read_part(f"{name}.js") for name in names)])
 
 
 def read_part(name: str) -> str:
-    """The text of a file in page/."""
+    """Returns the text of a file in page/."""
     return (
         (resources.files("humangs_jax") / "viewer" / "page" / name)
         .read_text(encoding="utf-8")
@@ -471,8 +479,9 @@ def read_part(name: str) -> str:
 
 
 def _template() -> str:
-    """index.html with styles, shaders and scripts in their places; the avatar's are still
-    marked.
+    """Returns index.html with styles, shaders and scripts filled in.
+
+    The places for title, header and data of the avatar are still marked.
     """
     scripts = (
         *("kinematics", "scene", "face", "camera", "splatting", "motion_files", "skeletons"),

@@ -1,6 +1,4 @@
-"""What the page holds of a face: how rows of vertices and of hidden Gaussians move per unit of
-each expression.
-"""
+"""Packs a face for the page: how vertices and hidden Gaussians move with each expression."""
 
 from typing import Any
 
@@ -18,8 +16,9 @@ from humangs_jax.body.motion import Motion
 def pack_face(
     avatar: Avatar, motion: Motion | None, header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> Avatar:
-    """The avatar with its hidden Gaussians behind the others; what moves and shows them goes into
-    the header and the arrays:
+    """Returns the avatar with its hidden Gaussians after the others.
+
+    What moves and shows Gaussians is added to the header and to the arrays, which are:
 
     face_rows uint16 (g,): the row of `face_directions` that each Gaussian follows, 65535 for none.
     face_directions int16 (e, rows, 3): times step, metres. face_eyes uint8 (g, 2): shares of both
