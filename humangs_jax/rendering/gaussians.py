@@ -1,8 +1,8 @@
-"""3D Gaussians: the scene that every splatter here draws.
+"""3D Gaussians, the scene that every splatter here draws.
 
-Covariance of a Gaussian: A R diag(s)^2 R^T A^T with R the rotation of its quaternion, s its scales
-(standard deviations, metres) and A an optional linear deformation (blend skinning leaves it;
-identity if absent).
+The covariance of a Gaussian is A R diag(s)^2 R^T A^T. R is the rotation of its quaternion, and s
+are its scales (standard deviations, metres). A is an optional linear deformation, which blend
+skinning leaves; the identity if absent.
 """
 
 import functools
@@ -42,23 +42,23 @@ class Gaussians(Batchable):
     colors.
     """
     deformations: Float[Array, "g 3 3"] | None = None
-    """Linear maps that are applied to the covariances after the rotation, never to the means, (g,
-    3, 3), or None.
+    """Linear maps, (g, 3, 3), or None. They are applied to the covariances after the rotation, and
+    never to the means.
     """
     pixel_footprint: Annotated[Float[Array, " g"] | None, NOT_NEGATIVE] = None
     """Side of the pixels of the images whose low-pass the scales contain (`avatar.animate`), (g,),
-    metres, or None. Renderers then add no more than `MIP_EPS2D` pixels^2, and dim what this makes
-    larger in images of larger pixels.
+    metres, or None. Renderers then add at most `MIP_EPS2D` pixels^2, and dim Gaussians that this
+    makes larger in images of larger pixels.
     """
     harmonics: Float[Array, "g k 3"] | None = None
-    """What the direction of sight adds to the colors, see below: spherical harmonics of degrees 1
-    (k = 3), 1 to 2 (8) or 1 to 3 (15) in the frame of the means, (g, k, 3), or None.
+    """Spherical harmonics of the colors that the direction of sight adds (see below), (g, k, 3), or
+    None. Degrees are 1 (k = 3), 1 to 2 (k = 8) or 1 to 3 (k = 15), in the frame of the means.
     `skin_gaussians` turns them with the Gaussians, so those of an avatar are in its T-pose.
     """
 
 
 def added_variance(pixel_footprint: Float[Array, " g"] | None, eps2d: float) -> float:
-    """Returns the pixels^2 that are added to the projected variances: `eps2d`, but no more than
+    """Returns the variance that is added to projected variances, pixels^2: `eps2d`, but at most
     `MIP_EPS2D` if the scales contain a low-pass.
     """
     if pixel_footprint is None:
@@ -69,8 +69,8 @@ def added_variance(pixel_footprint: Float[Array, " g"] | None, eps2d: float) -> 
 def widened(
     scales: Float[Array, "g 3"], pixel_footprint: Float[Array, " g"] | None, sign: int = 1
 ) -> Float[Array, "g 3"]:
-    """Adds the low-pass of pixels of a size in metres to scales, all but `MIP_EPS2D` of it. sign:
-    -1 takes it away again.
+    """Returns scales with the low-pass of pixels of `pixel_footprint` metres added, except
+    `MIP_EPS2D` of it. sign: -1 removes the low-pass again.
     """
     if pixel_footprint is None:
         return scales
@@ -80,7 +80,7 @@ def widened(
 
 
 def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:
-    """Returns F = A R diag(s), so that the covariance is F F^T."""
+    """Returns F = A R diag(s), (g, 3, 3), metres. The covariance is F F^T."""
     quats = gaussians.quats
     if normalize_quats:
         quats = quaternion.normalize(gaussians.quats)
@@ -97,10 +97,10 @@ def covariances(gaussians: Gaussians) -> Float[Array, "g 3 3"]:
 
 
 def factored(gaussians: Gaussians) -> Gaussians:
-    """Returns Gaussians of the same covariances without `deformations`: quats and scales from the
-    singular vectors of A R diag(s).
+    """Returns Gaussians with the same covariances but without `deformations`. Quats and scales come
+    from the singular vectors of A R diag(s).
 
-    Not meant to be differentiated: the factors are not unique where two scales coincide.
+    This is not meant to be differentiated: the factors are not unique where two scales coincide.
     """
     if gaussians.deformations is None:
         return gaussians
@@ -115,16 +115,15 @@ def skin_gaussians(
     transforms: Float[Array, "g 4 4"],
     mode: Literal["affine", "rotation"] = "affine",
 ) -> Gaussians:
-    """Move each Gaussian by its (blended) transform; scales, opacities and colors stay, harmonics
-    are rotated by the rotation part of the transform.
+    """Returns the Gaussians moved by their (blended) transforms. Scales, opacities and colors stay,
+    and harmonics are turned by the rotation part of the transform.
 
-    affine: the covariance is transformed by the full linear part, which is appended to
-    `deformations`.
-    rotation: as published, the linear part times the Gaussian's rotation matrix is read as a
-    quaternion. Where blending left no rotation the quaternion's norm is below 1; draw with
-    `normalize_quats=False` to reproduce that.
+    affine: the covariance is transformed by the full linear part, which is put in front of
+    `deformations`. rotation: as published, the linear part times the Gaussian's rotation matrix is
+    read as a quaternion. Where blending left no rotation, the quaternion's norm is below 1; draw
+    with `normalize_quats=False` to reproduce this.
 
-    Raises: ValueError for another mode, or for `rotation` of Gaussians that carry deformations
+    Raises: ValueError for another mode, or for `rotation` of Gaussians that have deformations
     already.
     """
     linear, means = transforms[:, :3, :3], transform.apply(transforms, gaussians.means)
@@ -148,18 +147,20 @@ def skin_gaussians(
 
 
 SMALLEST_SCALE = 1e-6
-"""Metres; keeps the logarithm finite for flat Gaussians."""
+"""Smallest scale, metres. It keeps the logarithm finite for flat Gaussians."""
 COLOR_MARGIN = 0.005
-"""How far colors are pulled inside (0, 1), where the gradient of the sigmoid does not vanish."""
+"""Distance from 0 and 1 to which colors are clamped, because the gradient of the sigmoid vanishes
+there.
+"""
 OPACITY_MARGIN = 0.001
-"""The same of opacities: less than the smallest that is drawn, 1/255, so that what is hidden stays
-hidden.
+"""Distance from 0 and 1 to which opacities are clamped. It is less than the smallest opacity that
+is drawn, 1/255, so that hidden Gaussians stay hidden.
 """
 
 
 @pytree_dataclass
 class UnconstrainedGaussians(Batchable):
-    """Parameters of Gaussians, or of a batch of sets, that an optimizer of optax may move
+    """Parameters of a set of Gaussians, or of a batch of sets, that an optimizer of optax may move
     freely.
     """
 
@@ -174,13 +175,13 @@ class UnconstrainedGaussians(Batchable):
     color_logits: Float[Array, "g 3"]
     """Logits of the colors, (g, 3)."""
     harmonics: Float[Array, "g k 3"] | None = None
-    """The harmonics as they are, (g, k, 3), or None."""
+    """The harmonics, unchanged, (g, k, 3), or None."""
 
 
 @checked_arguments
 def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """Inverts `constrain`, but for opacities and colors within `OPACITY_MARGIN` and `COLOR_MARGIN`
-    of 0 or 1.
+    """Returns parameters from which `constrain` makes these Gaussians, except for opacities and
+    colors within `OPACITY_MARGIN` and `COLOR_MARGIN` of 0 or 1.
 
     Args:
         gaussians: without deformations. A low-pass is no parameter: it stays in the scales.
@@ -218,8 +219,8 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
 
 @checked_arguments
 def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
-    """Returns the Gaussians that parameters stand for: scales are positive, opacities and colors in
-    (0, 1).
+    """Returns the Gaussians of parameters without bounds. Scales are positive, opacities and colors
+    in (0, 1).
 
     Args:
         parameters: without bounds, as an optimizer of optax moves them.
@@ -251,13 +252,15 @@ def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
 # = -c y, Y_2 = c z, Y_3 = -c x).
 
 COUNTS = (0, 3, 8, 15)
-"""Number of functions of degrees 1 to l, by l."""
+"""Number of functions of the degrees 1 to l, for l = 0 to 3."""
 POINTS = 32
-"""Directions from which functions are found again: more than functions, spread evenly."""
+"""Number of directions, spread evenly, at which turned functions are evaluated. It is larger than
+the number of functions.
+"""
 
 
 def check_count(count: int) -> None:
-    """Raises: ValueError for a number of functions that is not that of whole degrees."""
+    """Checks that a number of functions is that of whole degrees. Raises: ValueError."""
     if count not in COUNTS[1:]:
         raise ValueError(
             f"harmonics: expected (g, 3, 3), (g, 8, 3) or (g, 15, 3), got (g, {count}, 3)"
@@ -270,7 +273,9 @@ def basis(
     z: Array | np.ndarray | float,
     count: int,
 ) -> list:
-    """Returns Y_1 to Y_count of unit vectors, given as planes. Raises: as `check_count`."""
+    """Returns Y_1 to Y_count of unit vectors, which are given as planes. Raises: as
+    `check_count`.
+    """
     check_count(count)
     xx, yy, zz = x * x, y * y, z * z
     a = math.sqrt(3 / (4 * math.pi))
@@ -292,7 +297,9 @@ def basis(
 def added_colors(
     harmonics: Float[Array, "g k 3"], x: Array, y: Array, z: Array
 ) -> Float[Array, "g 3"]:
-    """Returns the sum over k for unit vectors d, given as planes of (g,)."""
+    """Returns the sum over k of Y_k(d) harmonics_k, (g, 3), for unit vectors d given as planes of
+    (g,).
+    """
     values = jnp.stack(basis(x, y, z, harmonics.shape[1]), axis=-1)
     return jnp.sum(values[..., None] * harmonics, axis=1)
 
@@ -300,7 +307,9 @@ def added_colors(
 def turned_harmonics(
     harmonics: Float[Array, "*g k 3"], rotations: Float[Array, "*#g 3 3"]
 ) -> Float[Array, "*g k 3"]:
-    """Turns harmonics with everything else: colors that were seen along d are seen along R d."""
+    """Returns harmonics turned by rotations R: colors that were seen along d are then seen along R
+    d.
+    """
     count = harmonics.shape[-2]
     points, inverse = _points(count)
     before = jnp.matmul(jnp.asarray(points, harmonics.dtype), rotations, precision=EXACT)
@@ -311,7 +320,7 @@ def turned_harmonics(
 
 @functools.cache
 def _points(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the unit vectors (p, 3) on a spiral, and the matrix (k, p) from the values there to
+    """Returns unit vectors on a spiral (p, 3), and the matrix (k, p) that maps values at these to
     the factors of the functions.
     """
     z = 1 - (2 * np.arange(POINTS) + 1) / POINTS

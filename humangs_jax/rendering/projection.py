@@ -58,8 +58,8 @@ Planes = list[Array]
 
 
 class ProjectedGaussians(NamedTuple):
-    """2D Gaussians on the image, planes of (g,). In gsplat's arrays: `means2d`, `depths`,
-    `conics`.
+    """2D Gaussians on the image, planes of (g,). `means2d`, `depths` and `conics` are in the form
+    of gsplat's arrays.
     """
 
     x: Float[Array, " g"]
@@ -77,28 +77,30 @@ class ProjectedGaussians(NamedTuple):
     determinant: Float[Array, " g"]
     """Determinant of the covariance, (g,), pixels^4."""
     r00: Float[Array, " g"]
-    """Entry 00 of the upper triangular r of r^T r = conic / 2, (g,), 1 / pixels; finite where not
-    drawn.
+    """Entry 00 of the upper triangular r with r^T r = conic / 2, (g,), 1 / pixels. It is finite
+    also where nothing is drawn.
     """
     r01: Float[Array, " g"]
-    """Entry 01 of r, as r00."""
+    """Entry 01 of r, (g,), 1 / pixels."""
     r11: Float[Array, " g"]
-    """Entry 11 of r, as r00."""
+    """Entry 11 of r, (g,), 1 / pixels."""
     visible: Bool[Array, " g"]
     """Whether each Gaussian is drawn, (g,)."""
     dimming: Float[Array, " g"] | None = None
     """Factor of the opacity, (g,), in (0, 1]; None where nothing is dimmed."""
     added_colors: Float[Array, "g 3"] | None = None
-    """What harmonics add to the colors as seen from here, (g, 3), RGB; None without harmonics."""
+    """RGB that harmonics add to the colors, as seen from this camera, (g, 3); None without
+    harmonics.
+    """
 
     def dimmed(self, opacities: Float[Array, " g"]) -> Float[Array, " g"]:
-        """Returns opacities as they are drawn."""
+        """Returns the opacities times `dimming`, as they are drawn."""
         if self.dimming is None:
             return opacities
         return opacities * self.dimming
 
     def seen_from_here(self, colors: Float[Array, "g 3"]) -> Float[Array, "g 3"]:
-        """Returns colors as they are drawn."""
+        """Returns the colors with `added_colors`, at least 0, as they are drawn."""
         if self.added_colors is None:
             return colors
         return jnp.maximum(colors + self.added_colors, 0.0)
@@ -110,7 +112,7 @@ class ProjectedGaussians(NamedTuple):
 
     @property
     def conics(self) -> Float[Array, "g 3"]:
-        """Entries 00, 01, 11 of the inverse covariances, 1 / pixels^2."""
+        """Entries 00, 01, 11 of the inverse covariances, (g, 3), 1 / pixels^2."""
         r00, r01, r11 = self.r00, self.r01, self.r11
         return 2 * jnp.stack([r00 * r00, r00 * r01, r01 * r01 + r11 * r11], axis=-1)
 
@@ -118,11 +120,11 @@ class ProjectedGaussians(NamedTuple):
 def project_gaussians(
     gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG
 ) -> ProjectedGaussians:
-    """Projects every Gaussian onto the image as `config` says: the first half of
+    """Returns every Gaussian projected onto the image, as `config` says. This is the first half of
     `splatting.render`.
 
-    A `jacobian_margin` clamps the point where the Jacobian is evaluated to that fraction of the
-    half field of view beyond the border, for cameras without lens.
+    `config.jacobian_margin` clamps the point where the Jacobian is evaluated, to that fraction of
+    the half field of view beyond the border. It applies to cameras without lens.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
     eps2d = added_variance(gaussians.pixel_footprint, config.eps2d)
@@ -213,9 +215,10 @@ def _covariance(m0: Planes, m1: Planes, eps2d: Array | float) -> tuple[Array, Ar
 
 
 def _dimming(m0: Planes, m1: Planes, determinant: Array, eps2d: float, footprint: Array) -> Array:
-    """Returns the factor of the opacity; `footprint` is in pixels.
+    """Returns the factor of the opacity, (g,). It is 1 where the determinant overflows.
 
-    1 for footprints whose determinant overflows.
+    footprint: side of the pixels of the images that the scales were fitted to, in pixels of this
+    image.
     """
     finite = determinant < jnp.inf
     m0, m1 = ([jnp.where(finite, entry, 0.0) for entry in row] for row in (m0, m1))
@@ -225,7 +228,7 @@ def _dimming(m0: Planes, m1: Planes, determinant: Array, eps2d: float, footprint
 
 
 def _cross(m0: Planes, m1: Planes, j: int, i: int) -> Array:
-    """Returns the cross product of the columns j and i of M."""
+    """Returns the cross product of the columns j and i of M, (g,)."""
     return m0[j] * m1[i] - m1[j] * m0[i]
 
 
@@ -295,7 +298,9 @@ def _times_factors(
 
 
 def _rotation_planes(quats: Float[Array, "g 4"]) -> list[Planes]:
-    """Does what `quaternion.to_matrix` does, entry by entry."""
+    """Returns the rotation matrices of quaternions as planes, the same numbers as
+    `quaternion.to_matrix`.
+    """
     w, x, y, z = _planes(quats)
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
