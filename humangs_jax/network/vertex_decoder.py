@@ -1,9 +1,9 @@
-"""The decoder: makes K Gaussians of the features of a body vertex.
+"""The decoder: makes K Gaussians from the features of a body vertex.
 
-Input of a vertex: pooled local feature, global token, positional encoding of the canonical
-position, and optionally its photo color, the fraction of views that see it, and what the photos
-show at distances along its normal. The first `tight` Gaussians of a vertex are those whose offsets
-a loss keeps small.
+The input of a vertex is its pooled local feature, the global token, and a positional encoding of
+the canonical position. Optional inputs are its photo color, the fraction of views that see it, and
+the photos' colors and masks at distances along its normal. The first `tight` Gaussians of a vertex
+are those whose offsets a loss keeps small.
 """
 
 from typing import Annotated, Literal
@@ -33,21 +33,20 @@ from humangs_jax.rendering.gaussians import Gaussians
 INIT_STD = 0.02
 LAST_STD = 0.001
 INITIAL_OPACITY = -1.0
-"""Before the sigmoid."""
+"""Initial opacity, before the sigmoid."""
 COLOR_MARGIN = 0.01
-"""Photo colors are pulled this far inside (0, 1) before the inverse sigmoid: white stays
-correctable.
+"""Distance from 0 and 1 to which photo colors are clamped before the inverse sigmoid, so that white
+can still be corrected.
 """
 WEIGHT_EPSILON = 1e-9
-"""Added to skinning weights before their logarithm, as published."""
+"""Number added to skinning weights before their logarithm, as published."""
 THINNER = 1.2
-"""Subtracted from the bias of the scale along the normal: a third of the thickness, so that
-silhouettes are sharp.
+"""Number subtracted from the bias of the scale along the normal. It makes a third of the thickness,
+so that silhouettes are sharp.
 """
 OBLIQUE = (0.36, 0.48, 0.8)
-"""A unit vector along no axis of a body.
-
-Where normals are opposite to it, frames turn quickly between vertices.
+"""A unit vector along no axis of a body. Where normals are opposite to it, frames turn quickly
+between vertices.
 """
 
 
@@ -69,20 +68,21 @@ class VertexDecoder(Decoder):
         gain="drawing in proportion to K",
         measured="evaluation.md",
     )
-    """Gaussians per vertex without such a loss."""
+    """Number of Gaussians per vertex without such a loss."""
     skinning_joints: Count | None = None
-    """Joints of the head that corrects skinning weights, None without it."""
+    """Number of joints of the head that corrects skinning weights. None: no such head."""
     offset_scale: Spread | None = None
-    """Offsets are bounded to it by tanh (normalised units; what shells add is not), None leaves
-    them unbounded as published.
+    """Bound of the offsets, by tanh, normalised units. The distance that shells add is not bounded.
+    None leaves offsets unbounded, as published.
     """
     initial_log_scale: Bias = -3.0
     """Initial bias of the scales, before the softplus."""
     frame: Literal["canonical", "normal"] = "canonical"
-    """Axes of offsets and rotations: those of the canonical body (published), or ones whose z is
-    the vertex's normal, along which Gaussians start `THINNER`."""
+    """Axes of offsets and rotations: those of the canonical body (published), or axes whose z is
+    the vertex's normal. Along the normal Gaussians start thinner (`THINNER`).
+    """
     residual_color: bool = False
-    """Colors are predicted relative to the photo color."""
+    """Whether colors are predicted relative to the photo color."""
 
     def __post_init__(self):
         """Raises ValueError without a Gaussian."""
@@ -140,7 +140,9 @@ class VertexDecoder(Decoder):
         )
 
     def _heads(self, x: Float[Array, "n c"], shells: int) -> "RawGaussians":
-        """Runs the MLP: a trunk, then a head for each kind of output. shells: their number."""
+        """Returns the outputs of the MLP: a trunk, then a head for each kind of output. shells:
+        number of shells.
+        """
         k = self.gaussians_per_vertex
 
         def hidden_layer(x, name):
@@ -212,8 +214,9 @@ def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
 
 
 def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> Float[Array, "n c"]:
-    """Joins what is configured of: local feature, global token, encoded position, photo color as 2
-    rgb - 1, visible fraction, normal, shells; in this order.
+    """Returns the inputs of the decoder, (n, c): local feature, global token, encoded position,
+    photo color as 2 rgb - 1, visible fraction, normal and shells, in this order. Missing ones are
+    left out.
     """
     vertices = canonical.shape[0]
     parts = [features.local]
@@ -239,8 +242,8 @@ def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> F
 
 
 def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
-    """Returns rotations that take z to each normal, smooth in the normal but for the direction
-    opposite to `OBLIQUE`.
+    """Returns rotations (n, 4) that take z to each normal. They are smooth in the normal except
+    near the direction opposite to `OBLIQUE`.
     """
     oblique = jnp.asarray(OBLIQUE, normals.dtype)
     upright = quaternion.between(jnp.asarray([0.0, 0.0, 1.0], normals.dtype), oblique)
@@ -250,11 +253,11 @@ def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
 def activate(
     raw: RawGaussians, config: VertexDecoder, features: VertexFeatures | None = None
 ) -> VertexGaussians:
-    """Normalises quaternions, and applies a softplus to scales, a sigmoid to colors and opacities;
-    offsets are bounded if so configured.
+    """Returns the Gaussians of the heads' outputs. Quaternions are normalised, scales go through a
+    softplus, colors and opacities through a sigmoid. Offsets are bounded if so configured.
 
-    With shells each Gaussian chooses between them by weights that sum to 1; the mean distance along
-    the normal and the mean photo color are what its own offset and color correct.
+    With shells, each Gaussian has weights of the shells that sum to 1. Its offset and color correct
+    the weighted mean of the distances along the normal and of the photo colors.
     """
     # shape
     offsets, quats, scales = jnp.split(raw.geometry, (3, 7), axis=-1)
@@ -289,8 +292,8 @@ def activate(
 
 
 def _mean(weights: Float[Array, "n k s"], values: Float[Array, " s"]) -> Float[Array, "n k"]:
-    """Returns the means (n, k) of values (s,) under weights (n, k, s): metres, which an accelerator
-    must not round to 8 bits.
+    """Returns the means (n, k) of values (s,) with weights (n, k, s). They are lengths, which an
+    accelerator must not round to 8 bits.
     """
     return jnp.matmul(weights, values, precision=EXACT)
 
@@ -298,8 +301,8 @@ def _mean(weights: Float[Array, "n k s"], values: Float[Array, " s"]) -> Float[A
 def corrected_skinning_weights(
     weights: Float[Array, "n j"], offsets: Float[Array, "g j"] | None, gaussians_per_vertex: int
 ) -> Float[Array, "g j"]:
-    """Returns the skinning weights of every Gaussian: its vertex's, or softmax(log(w + 1e-9) +
-    offsets) with a skinning head.
+    """Returns the skinning weights of every Gaussian, (g, j): those of its vertex, or with a
+    skinning head softmax(log(w + 1e-9) + offsets).
     """
     weights = jnp.repeat(weights, gaussians_per_vertex, axis=0)
     if offsets is None:

@@ -1,8 +1,8 @@
-"""Errors of real captures, added to the inputs of training: exposure, masks, cameras, poses and
+"""Adds errors of real captures to the inputs of training: exposure, masks, cameras, poses and
 shape.
 
-The targets stay true. The network learns to place Gaussians well although its photos and bodies are
-a little off, as `humangs fit` leaves them.
+The targets stay true. So the network learns to place Gaussians well although its photos and bodies
+are a little off, as those of `humangs fit` are.
 """
 
 import math
@@ -24,42 +24,46 @@ from humangs_jax.geometry.camera import Camera
 
 @configuration
 class Augmentation:
-    """Standard deviations of normal distributions, unless a field says otherwise; one draw for each
-    photo, or for each example.
+    """Standard deviations of the errors. They are normally distributed unless a field says
+    otherwise, and drawn for each photo or for each example.
     """
 
     share: Share = 0.0
-    """The share of the examples that are disturbed in other ways than by exposure and tint. 0:
-    nothing is disturbed at all, and no work is done.
+    """Share of the examples that have other errors than of exposure and tint. 0: there are no
+    errors at all, and no computation.
     """
     exposure: Spread = 0.08
-    """The spread of the natural logarithm of the gain of each photo."""
+    """Standard deviation of the natural logarithm of each photo's gain."""
     tint: Spread = 0.03
-    """The spread of the natural logarithm of the gain of each channel of a photo."""
+    """Standard deviation of the natural logarithm of the gain of each channel of a photo."""
     mask_pixels: Annotated[int, Range(0, 64)] = 2
-    """Masks are eroded or dilated by up to this, uniformly; the color of some background appears
-    there.
+    """Largest number of pixels by which masks are eroded or dilated, uniformly distributed. A
+    random background color appears there.
     """
     camera_degrees: Annotated[float, Range(0, 360)] = 0.25
-    """The spread of the turn of a camera about the person, degrees."""
+    """Standard deviation of the turn of a camera about the person, degrees."""
     camera_metres: Spread = 0.002
-    """The spread of the shift of a camera along each axis, metres."""
+    """Standard deviation of the shift of a camera along each axis, metres."""
     pose_degrees: Annotated[float, Range(0, 360)] = 0.15
-    """The spread of each axis of each joint, degrees, the same in all photos of an example."""
+    """Standard deviation of each axis of each joint, degrees. The error is the same in all photos
+    of an example.
+    """
     body_metres: Spread = 0.002
-    """The spread of each axis of the translation, metres, the same in all photos of an example."""
+    """Standard deviation of each axis of the translation, metres. The error is the same in all
+    photos of an example.
+    """
     betas: Spread = 0.1
-    """The spread of each shape coefficient, the same in all photos of an example; the wrong shape
-    is also that of the targets.
+    """Standard deviation of each shape coefficient. The error is the same in all photos of an
+    example and in its targets.
     """
 
 
 Numbers = dict[str, Float[Array, "..."]]
-"""`random_numbers`."""
+"""The numbers that `random_numbers` returns, by name."""
 
 
 def random_numbers(key: Key, views: SubjectViews) -> Numbers:
-    """All random numbers of an example with such photos, uniform in [0, 1), by name."""
+    """Returns all random numbers of an example with such photos, uniform in [0, 1), by name."""
     count, joints = views.rotations.shape[:2]
     shapes = {"chosen": (), "betas": views.betas.shape}
     shapes |= {"gains": (count, 1, 1, 1), "tints": (count, 1, 1, 3)}
@@ -70,7 +74,7 @@ def random_numbers(key: Key, views: SubjectViews) -> Numbers:
 
 
 def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -> Example:
-    """The example with other exposures, or with all of its inputs and betas disturbed.
+    """Returns the example with errors of exposure and tint, or with errors of all inputs and betas.
 
     Pure and jittable.
     """
@@ -93,7 +97,7 @@ def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -
 
 
 def _gains(numbers: Numbers, config: Augmentation) -> Float[Array, "v 1 1 3"]:
-    """(v, 1, 1, 3), one exposure for each photo."""
+    """Returns the gain of each channel of each photo, (v, 1, 1, 3)."""
     gain = config.exposure * normal_of(numbers["gains"])
     return jnp.exp(gain + config.tint * normal_of(numbers["tints"]))
 
@@ -101,10 +105,10 @@ def _gains(numbers: Numbers, config: Augmentation) -> Float[Array, "v 1 1 3"]:
 def augment_views(
     numbers: Numbers, views: SubjectViews, pelvis: Float[Array, "3"], config: Augmentation
 ) -> SubjectViews:
-    """Photos, masks, cameras and poses.
+    """Returns the views with errors of photos, masks, cameras and poses.
 
-    numbers: `random_numbers`. pelvis: (3,) metres, in the rest pose: cameras turn about the posed
-    one.
+    numbers: from `random_numbers`. pelvis: (3,) metres, in the rest pose. Cameras turn about the
+    posed pelvis.
     """
     turns = math.radians(config.pose_degrees) * normal_of(numbers["rotations"])
     images, masks = augment_photos(numbers, views.images, views.masks, config)
@@ -124,7 +128,7 @@ def augment_photos(
     masks: Float[Array, "v h w"],
     config: Augmentation,
 ) -> tuple[Float[Array, "v h w 3"], Float[Array, "v h w"]]:
-    """Photos on white whose exposure, tint and masks are off.
+    """Returns photos on white with errors of exposure, tint and masks, and these masks.
 
     A photo is m f + (1 - m) of its mask m and the person's color f. It becomes m' (m g f + (1 - m)
     b) + (1 - m') with the gain g, the mask m' and the color b of a background.
@@ -140,7 +144,9 @@ def augment_photos(
 def _grown(
     masks: Float[Array, "v h w"], radii: Int[Array, " v"], most: int
 ) -> Float[Array, "v h w"]:
-    """Masks dilated by radii > 0 and eroded by radii < 0, in pixels; squares grow to squares."""
+    """Returns masks dilated by radii > 0 and eroded by radii < 0, in pixels. Squares grow to
+    squares.
+    """
     for radius in range(1, most + 1):
         larger, smaller = _largest_near(masks), -_largest_near(-masks)
         choice = radii[:, None, None]
@@ -149,7 +155,7 @@ def _grown(
 
 
 def _largest_near(images: Float[Array, "v h w"]) -> Float[Array, "v h w"]:
-    """Maxima over 3 x 3 pixels; what is beyond the border repeats it."""
+    """Returns the maxima over 3 x 3 pixels. Beyond the border the pixels of the border count."""
     for axis in (1, 2):
         size = images.shape[axis]
         before = jnp.take(images, jnp.maximum(jnp.arange(size) - 1, 0), axis)
@@ -161,7 +167,7 @@ def _largest_near(images: Float[Array, "v h w"]) -> Float[Array, "v h w"]:
 def _augment_cameras(
     numbers: Numbers, cameras: Camera, centers: Float[Array, "v 3"], config: Augmentation
 ) -> Camera:
-    """Cameras that are turned about centres (v, 3) of the world, and shifted."""
+    """Returns cameras that are turned about centres (v, 3) of the world, and shifted."""
     turns = math.radians(config.camera_degrees) * normal_of(numbers["turns"])
     shifts = config.camera_metres * normal_of(numbers["shifts"])
     rotations = quaternion.matrix_from_axis_angle(turns)

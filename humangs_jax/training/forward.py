@@ -1,4 +1,4 @@
-"""From an example to images: photos -> canonical Gaussians -> posed as each target -> drawn.
+"""Runs the network on an example: photos -> canonical Gaussians -> posed as each target -> drawn.
 
 Validation: the same views of the same unseen people every time, with the running statistics, as
 numbers and as a sheet. Several processes share the people; every process ends up with the means
@@ -39,7 +39,7 @@ from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.sources import SourceFactory
 
 RASTERIZED = ("posed_vertices", "canonical_vertices", "position_maps", "depth_maps")
-"""What `prepare_inputs` computes, rather than copies."""
+"""Inputs that `prepare_inputs` computes. It copies the others."""
 
 
 def reconstruct_example(
@@ -50,7 +50,9 @@ def reconstruct_example(
     train: bool = False,
     axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[HumanGSOutputs, Parameters]:
-    """Canonical Gaussians of one subject and the batch statistics, see `apply_humangs`."""
+    """Returns the canonical Gaussians of one subject and the batch statistics, see
+    `apply_humangs`.
+    """
     model = token_share(config, len(inputs.images))
     prepared = jax.lax.stop_gradient(prepare_inputs(body, inputs, model))
     computed = tap("position maps", lambda: {name: getattr(prepared, name) for name in RASTERIZED})
@@ -58,7 +60,7 @@ def reconstruct_example(
 
 
 def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
-    """The network with the token capacity of a step with that number of photos.
+    """Returns the network's configuration with the token capacity for a step of `views` photos.
 
     The configured capacity is for the largest of `views.input_counts`. Fewer photos get their share
     plus that of one view, because one photo may show more of a person than the others. More photos,
@@ -83,8 +85,9 @@ def draw_targets(
     backgrounds: Float[Array, "v 3"],
     config: TrainConfig,
 ) -> Drawn:
-    """The Gaussians drawn in the pose and from the camera of every target. inputs: the photos that
-    they come from.
+    """Returns the Gaussians drawn in the pose and from the camera of every target.
+
+    inputs: the photos from which the Gaussians were made.
     """
     driver = config.model.architecture.driver
     if driver is not None:
@@ -108,7 +111,9 @@ def draw_targets(
 def draw_posed(
     posed: Gaussians, targets: SubjectViews, backgrounds: Float[Array, "v 3"], config: TrainConfig
 ) -> Drawn:
-    """Gaussians posed for each target, from its camera. posed: with a leading axis v."""
+    """Returns the images of Gaussians that are posed for each target (leading axis v), from the
+    target's camera.
+    """
     splat = dataclasses.replace(config.splat, distortion=bool(config.loss.distortion))
 
     def draw(posed):
@@ -123,16 +128,14 @@ def draw_posed(
 
 
 def white_backgrounds(targets: SubjectViews) -> Float[Array, "v 3"]:
-    """One per target."""
+    """Returns a white background for each target, (v, 3)."""
     return jnp.ones((*targets.translations.shape[:-1], 3), targets.images.dtype)
 
 
 def predict(
     variables: Variables, body: BodyModel, example: Example, config: TrainConfig
 ) -> tuple[Drawn, HumanGSOutputs]:
-    """What the trained network shows of an example's targets, on white, and the Gaussians that it
-    shows.
-    """
+    """Returns the trained network's images of an example's targets, on white, and its Gaussians."""
     outputs, _ = reconstruct_example(variables, body, example.inputs, config)
     white = white_backgrounds(example.targets)
     return draw_targets(
@@ -150,15 +153,19 @@ METRICS = ("psnr", "psnr_fg", "ssim", "semi_transparent", "dropped_tokens", "ove
 def validation_examples(
     make_source: SourceFactory, config: TrainConfig, count: int
 ) -> list[Example]:
-    """This process's examples of the first `count` subjects, see `as_validated`."""
+    """Returns this process's examples of the first `count` subjects, with the views of
+    `as_validated`.
+    """
     source = make_source(as_validated(config))
     own = range(jax.process_index(), min(count, len(source)), jax.process_count())
     return [jax.tree.map(jnp.asarray, source.example(0, i, source.input_counts[0])) for i in own]
 
 
 def as_validated(config: TrainConfig) -> TrainConfig:
-    """The run with the views that it is validated on: inputs evenly spaced and of one pose, as many
-    as in the middle one of the training's counts; targets as large as the inputs.
+    """Returns the configuration with the views of validations.
+
+    Inputs are evenly spaced and of one pose, as many as the middle one of the training's counts.
+    Targets are as large as the inputs.
     """
     counts = sorted(config.views.input_counts)
     views = ViewSampling(
@@ -177,8 +184,8 @@ def as_validated(config: TrainConfig) -> TrainConfig:
 
 
 def compared_as(base: TrainConfig, make_source: SourceFactory) -> SourceFactory:
-    """The people with the photos and targets that a run is validated on, for variants of it: only
-    the size of the photos, which a network is made for, is the variant's.
+    """Returns a source of the people with the photos and targets that `base` is validated on.
+    Variants of the run use it: they change only the size of the photos that the network sees.
     """
     own = as_validated(base.at(base.steps - 1))
 
@@ -198,9 +205,11 @@ def evaluate(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
-    """The images of one example's targets and their mean psnr, psnr_fg (both dB), ssim,
-    semi-transparent foreground, and lpips if its network is there. semi-transparent foreground is
-    NaN where the network draws pixels: there is no alpha.
+    """Returns the images of one example's targets, and their metrics.
+
+    Metrics are means of psnr, psnr_fg (both dB), ssim, semi_transparent, and lpips if its network
+    is there, and the sums dropped_tokens and overflow. semi_transparent is NaN where the network
+    draws pixels, because there is no alpha.
     """
     drawn, outputs = predict(variables, body, example, config)
     images, masks = example.targets.images, example.targets.masks
@@ -232,7 +241,8 @@ def validate(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
 ) -> tuple[dict[str, float], list[np.ndarray]]:
-    """Means over the examples of all processes, and the images of this process's.
+    """Returns the means of the metrics over the examples of all processes, and the images of this
+    process's examples.
 
     All arguments are local arrays.
     """
@@ -251,7 +261,7 @@ def validate(
 
 
 def _means(names: Sequence[str], rows: list[dict[str, float]]) -> dict[str, float]:
-    """Over all processes, some of which may have no rows."""
+    """Returns the means of the metrics over all processes. Some processes may have no rows."""
     own = np.asarray([[row[name] for name in names] for row in rows]).reshape(-1, len(names))
     totals = np.append(own.sum(axis=0), len(own))
     if jax.process_count() > 1:
@@ -262,7 +272,9 @@ def _means(names: Sequence[str], rows: list[dict[str, float]]) -> dict[str, floa
 
 
 def sheet(examples: Sequence[Example], images: Sequence[np.ndarray]) -> Float[np.ndarray, "h w 3"]:
-    """A row per example: its inputs, then each target beside what the network shows of it."""
+    """Returns an image with a row per example: its inputs, then each target beside the network's
+    image of it.
+    """
     rows = []
     for example, shown in zip(examples, images, strict=True):
         targets = np.asarray(example.targets.images)

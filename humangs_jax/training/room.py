@@ -1,8 +1,8 @@
-"""Room for (splat, tile) pairs in a step of training: by what its targets need.
+"""Measures the room for (splat, tile) pairs that a step of training needs for its targets.
 
-A traced call would take room for the most demanding person, five times what the targets of the
-shipped network need, and sort, gather and keep all of it. What does not fit is counted in every
-step (`overflow`), reported by the loop, and gets twice the room from there on.
+By default a traced call takes room for the most demanding person. This is five times what the
+targets of the shipped network need, and all of it would be sorted, gathered and kept. Pairs that do
+not fit are counted in every step (`overflow`). The loop then logs it and doubles the room.
 """
 
 import dataclasses
@@ -23,20 +23,20 @@ from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.forward import reconstruct_example
 
 MARGIN = 2.0
-"""Room over the need that was measured: other people and poses need more, and Gaussians change
-while they are trained.
+"""Room relative to the measured need. Other people and poses need more, and Gaussians change while
+they are trained.
 """
 WORTH = 1 << 16
-"""Pairs of a traced call from which on a program that measures the need is worth its compilation:
-below, a step is over in milliseconds.
+"""Number of pairs of a traced call from which on the need is measured. With fewer pairs a step
+takes milliseconds, and compiling a program that measures is not worth it.
 """
 MEASURED = 4
-"""Subjects of a batch that are measured, one after the other."""
+"""Number of subjects of a batch that are measured, one after the other."""
 
 
 def usual_room(config: TrainConfig, body: BodyModel) -> int:
-    """Pairs for which a step has room where nothing was measured; 0 where the driver draws pixels
-    and no Gaussians. body: the one that carries the Gaussians.
+    """Returns the number of pairs that a step has room for if nothing was measured; 0 if the driver
+    draws pixels and no Gaussians. body: the body that carries the Gaussians.
     """
     parts = config.model.architecture
     if parts.driver is not None:
@@ -48,9 +48,10 @@ def usual_room(config: TrainConfig, body: BodyModel) -> int:
 def with_measured_room(
     config: TrainConfig, variables: Variables, body: BodyModel, batch: Example
 ) -> TrainConfig:
-    """The configuration of a stage with room for `MARGIN` times what the targets of a batch need.
+    """Returns the configuration of a stage with room for `MARGIN` times what the targets of a batch
+    need.
 
-    It stays as it is where it says how much room there is, or where that saves nothing.
+    It is returned unchanged if it sets `max_pairs`, or if measuring saves nothing.
     """
     usual = usual_room(config, body)
     if config.splat.max_pairs is not None or usual < WORTH:
@@ -67,7 +68,9 @@ def with_measured_room(
 
 
 def with_twice_the_room(config: TrainConfig, body: BodyModel) -> TrainConfig:
-    """The configuration of a stage after something did not fit; never more than is usual."""
+    """Returns the configuration of a stage with twice the room, but never more than
+    `usual_room`.
+    """
     splat = config.splat
     pairs = 2 * (splat.max_pairs or 0)
     if pairs >= usual_room(config, body):
@@ -84,7 +87,7 @@ def with_twice_the_room(config: TrainConfig, body: BodyModel) -> TrainConfig:
 def needed_room(
     variables: Variables, body: BodyModel, batch: Example, config: TrainConfig
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Most rows and most pairs that any target of a batch needs now."""
+    """Returns the largest numbers of rows and of pairs that any target of a batch needs now."""
     size = jnp.asarray([config.target_size, config.target_size])
 
     def of(example: Example) -> tuple[Int[Array, " v"], Int[Array, " v"]]:

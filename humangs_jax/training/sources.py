@@ -1,7 +1,7 @@
-"""Where a run's examples come from: capture folders, data sets, people made on the fly, or several
-of these.
+"""Sources of a run's examples: capture folders, data sets, synthetic people made during training,
+or several of these.
 
-A run asks for a new source at every stage, because image sizes differ.
+A run makes a new source at every stage, because image sizes differ.
 """
 
 import logging
@@ -35,15 +35,15 @@ from humangs_jax.training.sharding import batch_sharding
 logger = logging.getLogger(__name__)
 
 SYNTHETIC = "humangs_jax.synthetic"
-"""The wing of synthetic people, which a run without them does not import."""
+"""Package of synthetic people, which a run without them does not import."""
 SourceFactory = Callable[[TrainConfig], Source]
-"""Configuration of a stage -> examples of its sizes."""
+"""Function from the configuration of a stage to a source of examples of its sizes."""
 
 
 def stage_loader(
     make_source: SourceFactory, config: TrainConfig, step: int, mesh: Mesh | None = None
 ) -> Loader:
-    """Batches from a step on, until the end of the stage that holds there."""
+    """Returns a loader of batches from a step on, for the stage that the step belongs to."""
     part = config.at(step)
     sharding = None
     if mesh is not None:
@@ -60,11 +60,11 @@ def stage_loader(
 
 
 def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list[str]:
-    """A line for each sample of this process in a step with numbers that are not finite, or colors
-    and masks beyond [0, 1].
+    """Returns a line for each sample of this process in a step whose numbers are not finite, or
+    whose colors or masks are beyond [0, 1].
 
-    batch: of that step, on one device. None: made again; a loader is a pure function, so a run need
-    not keep what it trains on.
+    batch: the batch of that step, on one device. None: it is made again, because a loader is a pure
+    function; a run then need not keep its batches.
     """
     found, kinds = [], {"images": UNIT, "masks": UNIT}
     for i, row in enumerate(loader.rows):
@@ -86,14 +86,16 @@ def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list
 def captured_people(
     folders: Sequence[str | Path], body: BodyModel, body_file: str | Path = DEFAULT_BODY
 ) -> SourceFactory:
-    """Capture folders whose parameters belong to `body`; images that are decoded once serve all
-    stages.
+    """Returns a source of capture folders whose parameters belong to `body`. Images are decoded
+    once for all stages.
     """
     return _cached_people(CaptureCache(folders, body, body_file=body_file))
 
 
 def _cached_people(cache: PeopleCache) -> SourceFactory:
-    """People on disk; images that are decoded once serve all stages. Their depths are unknown."""
+    """Returns a source of people on disk. Images are decoded once for all stages. Depths are
+    unknown.
+    """
 
     def make(config: TrainConfig) -> Source:
         depths = config.loss.depth > 0  # all examples of a mixture have the same arrays
@@ -110,16 +112,18 @@ def _cached_people(cache: PeopleCache) -> SourceFactory:
 
 
 def mixed_people(parts: Sequence[SourceFactory], weights: Sequence[float | int]) -> SourceFactory:
-    """Several of these, each with its share of the examples, see `examples.Mixture`."""
+    """Returns a source that mixes several sources. weights: the share of each, see
+    `examples.Mixture`.
+    """
     return lambda config: Mixture(tuple(part(config) for part in parts), tuple(weights))
 
 
 def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> SourceFactory:
-    """The people of a folder of captures, of a scene list, or of a data set (docs/datasets.md),
-    whose body is `body`.
+    """Returns a source of the people in a folder of captures, a scene list or a data set
+    (docs/datasets.md), whose body is `body`.
 
-    split: of synthetic captures, see `synthetic.writer.find_people`.
-    Raises: ValueError if the folder has none of these.
+    split: which part of synthetic captures to take, see `synthetic.writer.find_people`.
+    Raises: ValueError if the folder holds none of these.
     """
     if (data / "capture.json").is_file() or any(data.glob("*/capture.json")):
         folders = find_captures(data)
@@ -136,11 +140,11 @@ def training_people(
     body: BodyModel,
     body_file: str | Path = DEFAULT_BODY,
 ) -> SourceFactory:
-    """The people of `people_on_disk`, `on_the_fly` synthetic people rendered for every step, or
-    both by halves.
+    """Returns a source of the people of `people_on_disk`, of `on_the_fly` synthetic people that are
+    rendered for every step, or of both, half and half.
 
-    The latter are made once, into out/people.npz, by one process. Raises: ValueError if there are
-    none, or if synthetic people are asked for beside a body that is not theirs.
+    One process makes the synthetic people once, into out/people.npz. Raises: ValueError if there is
+    nobody, or if synthetic people are asked for with another body than the shipped one.
     """
     parts = []
     if data is not None:

@@ -1,10 +1,10 @@
-"""All that a run carries from step to step, and the optimizer whose state is part of it.
+"""Everything that a run carries from step to step, and the optimizer whose state is part of it.
 
-Random numbers are not in it: they follow from the seed and the step. The optimizer as published:
-AdamW, warm-up and cosine, clipped gradients, and a guard against bad steps. A gradient is made
-finite entry by entry first (NaN becomes 0, infinities +-1e-6). A step whose gradient norm exceeds
-`skip_norm`, or whose loss is not finite, changes nothing, neither parameters nor moments nor the
-schedule, and is counted, and so is every step that had anything to make finite.
+Random numbers are not carried, because they follow from the seed and the step. The optimizer is the
+published one: AdamW, warm-up and cosine, clipped gradients, and a guard against bad steps. First a
+gradient is made finite entry by entry (NaN becomes 0, infinities +-1e-6). If then its norm exceeds
+`skip_norm`, or the loss is not finite, the step is skipped and counted: it changes neither
+parameters nor moments nor the schedule. Steps that had anything to make finite are counted, too.
 """
 
 from typing import Any, NamedTuple, cast
@@ -25,10 +25,10 @@ INFINITY_STAND_IN = 1e-6
 
 @pytree_dataclass
 class TrainState:
-    """All that a step of training changes."""
+    """The arrays that a step of training changes."""
 
     step: Int[Array, ""]
-    """Steps done, skipped ones included."""
+    """Number of steps done, skipped ones included."""
     params: PyTree
     """The parameters of the network (`init_humangs`)."""
     batch_stats: PyTree
@@ -36,17 +36,19 @@ class TrainState:
     opt_state: PyTree
     """The state of `make_optimizer`."""
     ema_params: PyTree | None
-    """The running average of `params`; None: there is none."""
+    """The running average of `params`; None if there is no average."""
 
     @property
     def variables(self) -> Variables:
-        """The network's variables to use: averaged parameters where there are any."""
+        """Returns the network's variables to use, with the averaged parameters if there are any."""
         params = self.params if self.ema_params is None else self.ema_params
         return {"params": params, "batch_stats": self.batch_stats}
 
 
 def init_state(config: TrainConfig, variables: Variables | None = None) -> TrainState:
-    """The state before the first step, from fresh variables of `config.seed` or from given ones."""
+    """Returns the state before the first step, with the given variables or fresh ones of
+    `config.seed`.
+    """
     if variables is None:
         variables = init_humangs(jax.random.key(config.seed), config.model)
     # copies: the training step gives its state's buffers away, so neither the caller nor two fields
@@ -68,13 +70,13 @@ class GuardState(NamedTuple):
     nonfinite: Int[Array, ""]
     """Steps so far whose loss or gradient was not finite, skipped or not."""
     norm: Float[Array, ""]
-    """The norm of the last gradient, made finite, before clipping."""
+    """Norm of the last gradient, after it was made finite and before it is clipped."""
     inner: PyTree
-    """The state of the optimizer that is guarded."""
+    """The state of the guarded optimizer."""
 
 
 def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
-    """Step number -> learning rate of a run of `steps` steps."""
+    """Returns the schedule of a run of `steps` steps: step number -> learning rate."""
     warmup = min(config.warmup_steps, steps)
     return optax.warmup_cosine_decay_schedule(
         0.0, config.learning_rate, warmup, max(steps, warmup + 1)
@@ -82,12 +84,12 @@ def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
 
 
 def decayed(params: PyTree) -> PyTree:
-    """True for the parameters that weight decay acts on."""
+    """Returns True for each parameter that weight decay acts on, else False."""
     return jax.tree.map(lambda x: x.ndim >= 2, params)
 
 
 def finite_gradients(gradients: PyTree) -> PyTree:
-    """NaN entries become 0 and infinite ones +-1e-6."""
+    """Returns gradients whose NaN entries are replaced by 0, and infinite ones by +-1e-6."""
     stand_in = INFINITY_STAND_IN
     return jax.tree.map(
         lambda x: jnp.nan_to_num(x, nan=0.0, posinf=stand_in, neginf=-stand_in), gradients
@@ -95,15 +97,15 @@ def finite_gradients(gradients: PyTree) -> PyTree:
 
 
 def gradient_norm(gradients: PyTree) -> Scalar:
-    """Euclidean norm over all entries of all leaves."""
+    """Returns the Euclidean norm over all entries of all leaves."""
     return jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(gradients)))
 
 
 def guard(
     inner: optax.GradientTransformation, skip_norm: float
 ) -> optax.GradientTransformationExtraArgs:
-    """`inner` on finite gradients, skipped where their norm exceeds `skip_norm` or the loss is not
-    finite.
+    """Returns an optimizer that makes gradients finite, then applies `inner`. A step is skipped if
+    the norm exceeds `skip_norm` or the loss is not finite.
 
     The loss is the extra argument `value` of `update`.
     """
@@ -137,7 +139,7 @@ def guard(
 def make_optimizer(
     config: OptimizerConfig, steps: int, divided: bool = False
 ) -> optax.GradientTransformationExtraArgs:
-    """The optimizer of a run of `steps` steps; its state is a `GuardState`.
+    """Returns the optimizer of a run of `steps` steps. Its state is a `GuardState`.
 
     divided: whether arrays of the state are divided among devices.
     """
@@ -161,13 +163,15 @@ class Joined(NamedTuple):
     """The entries of all arrays of a tree, as two arrays."""
 
     decayed: Float[Array, "n 1"]
-    """Those of arrays that weight decay acts on: a column, which it acts on too."""
+    """Entries of the arrays that weight decay acts on, (n, 1). The column has two axes, so weight
+    decay acts on it, too.
+    """
     others: Float[Array, " m"]
-    """Those of all other arrays."""
+    """Entries of all other arrays, (m,)."""
 
 
 def join(tree: PyTree) -> Joined:
-    """The entries of a tree in the order of its arrays."""
+    """Returns the entries of a tree, in the order of its arrays."""
     leaves = jax.tree.leaves(tree)
 
     def entries(wanted: bool) -> Array:
@@ -178,7 +182,7 @@ def join(tree: PyTree) -> Joined:
 
 
 def part(joined: Joined, like: PyTree) -> PyTree:
-    """The tree of the arrays that `join` has joined. like: the shapes and types."""
+    """Returns the tree of arrays that `join` joined. like: a tree with their shapes and types."""
     leaves, structure = jax.tree.flatten(like)
     begins = {True: 0, False: 0}
     entries = {True: joined.decayed[:, 0], False: joined.others}
@@ -194,9 +198,10 @@ def part(joined: Joined, like: PyTree) -> PyTree:
 def on_joined(
     inner: optax.GradientTransformationExtraArgs,
 ) -> optax.GradientTransformationExtraArgs:
-    """`inner` on the joined entries of parameters and gradients.
+    """Returns an optimizer that applies `inner` to the joined entries of parameters and gradients.
 
-    Its state has the arrays that it has without, so that a run can go on elsewhere.
+    Its state has the same arrays as the state of `inner`, so that a run can continue on other
+    devices.
     """
 
     def update(gradients: PyTree, state: PyTree, params: PyTree, **extra: Any):
