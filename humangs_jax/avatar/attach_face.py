@@ -1,5 +1,5 @@
-"""A face for an avatar on a body with expressions: which Gaussians move how, and those that
-photos do not show.
+"""Makes a face for an avatar on a body with expressions: how its Gaussians move, and Gaussians for
+what photos do not show.
 """
 
 import functools
@@ -39,37 +39,39 @@ COLORS = {
     "tongue": (0.66, 0.33, 0.32),
     "mouth": (0.27, 0.10, 0.10),
 }
-"""RGB of what no photo shows; lids have the color of the skin around the eye."""
+"""The RGB colors of parts that no photo shows. Lids have the color of the skin around the eye."""
 CLOSING = 4.0
-"""Opacity of a lid per unit of its blink."""
+"""The opacity of a lid per unit of the coefficient of its blink."""
 OPAQUE = 0.97
 COVER = 0.6
 """Standard deviation of a hidden Gaussian over the side of its face: neighbors overlap without
 gaps.
 """
 THICKNESS = 0.25
-"""The thickness of a hidden Gaussian, over its smaller side."""
+"""The thickness of a hidden Gaussian as a share of its smaller side."""
 LID_LIFT = 0.003
-"""Metres by which lids lie in front of the body's: Gaussians of the eye are as thick."""
+"""Metres by which lids lie in front of the body's lids, because Gaussians of the eye are as
+thick.
+"""
 EYE = (0.0165, 0.0095, 0.005, 0.03)
 """Metres: half the width and height of the opening between the lids, and the depths before the
 centre of the eye between which Gaussians show the eye."""
 SOFT = 0.3
 """The share of the opening over which a Gaussian belongs to the eye in part."""
 AROUND_EYE = (0.02, 0.045)
-"""Metres from the centre of an eye, of the skin whose color its lids get."""
+"""Distances from the centre of an eye, metres, between which skin gives its color to the lids."""
 BESIDE = 8
-"""Vertices beside one, from which its stretch is found."""
+"""The most neighbours of a vertex from which its stretch is found."""
 RIDGE = 0.01
-"""A weight relative to the sum of the squared edges: it keeps skin from being stretched along its
-normal, which edges say little about.
+"""Weight of the ridge, relative to the sum of the squared edges. It keeps skin from being stretched
+along its normal, about which edges say little.
 """
 NEAR = {"mouth": 0.06, "lid": 0.04}
-"""Metres around teeth or lids: how vertices there lie against those of the mean body says where
-these belong.
+"""Metres around teeth or lids. Vertices within them, compared with those of the mean body, say
+where teeth or lids belong.
 """
 FEWEST = 12
-"""Vertices that tell more than a shift."""
+"""The least number of vertices for an affine map; fewer give a shift."""
 
 
 # Bodies of avatars
@@ -77,8 +79,8 @@ FEWEST = 12
 
 
 def shipped_network() -> HumanGSConfig:
-    """The network of the shipped weights, without reading their tensors; the default one if none
-    are shipped.
+    """Returns the configuration of the shipped weights, without reading their tensors; the default
+    one if no weights are shipped.
     """
     with resources.as_file(resources.files("humangs_jax") / SHIPPED) as file:
         metadata = {}
@@ -90,10 +92,10 @@ def shipped_network() -> HumanGSConfig:
 
 
 def body_of(avatar: Avatar) -> BodyModel | None:
-    """The shipped body, with the vertices that carry Gaussians, if the face of the avatar is one of
-    it; else None.
+    """Returns the shipped body, remeshed to the vertices that carry Gaussians, if the avatar's face
+    is that of this body; else None.
 
-    The avatar's own vertices may be displaced, and followed by those of a skirt.
+    The avatar's vertices may be displaced, and followed by those of a skirt.
     """
     if avatar.parents != PARENTS:
         return None
@@ -105,7 +107,7 @@ def body_of(avatar: Avatar) -> BodyModel | None:
 
 
 def _has_face(avatar: Avatar, body: BodyModel) -> bool:
-    """Whether all triangles in which the body's expressions show are also the avatar's."""
+    """Returns whether the avatar has all triangles of the body that expressions move."""
     if body.expressions is None or len(avatar.rest_vertices) < len(body.template):
         return False
     faces, own = np.asarray(body.faces), np.asarray(avatar.faces)
@@ -122,7 +124,9 @@ def _has_face(avatar: Avatar, body: BodyModel) -> bool:
 
 
 def with_face(avatar: Avatar, body: BodyModel | None = None) -> Avatar:
-    """See `Avatar.with_face`. One that has a face is returned as it is."""
+    """Returns the avatar with a face, see `Avatar.with_face`. An avatar that has a face is returned
+    as it is.
+    """
     if avatar.face is not None:
         return avatar
     found = body_of(avatar) if body is None else body
@@ -136,7 +140,7 @@ def with_face(avatar: Avatar, body: BodyModel | None = None) -> Avatar:
 
 
 def faced(avatar: Avatar) -> Avatar:
-    """The avatar with a face where its body is known, else as it is."""
+    """Returns the avatar with a face if its body is known, else the avatar as it is."""
     found = None
     if avatar.face is None:
         found = body_of(avatar)
@@ -146,8 +150,8 @@ def faced(avatar: Avatar) -> Avatar:
 
 
 def with_face_for(avatar: Avatar, motion: Motion) -> Avatar:
-    """The avatar with a face if the motion has expressions for one; where its body is not known,
-    a line says so.
+    """Returns the avatar with a face if the motion has expressions. If the avatar's body is not
+    known, it stays without, and a warning says so.
     """
     if motion.expressions is None or avatar.face is not None:
         return avatar
@@ -188,7 +192,9 @@ def _face(avatar: Avatar, body: BodyModel, of_arkit: bool) -> Face:
 def _stretching(
     avatar: Avatar, vertices: Int[np.ndarray, " m"], row: Int[np.ndarray, " n"]
 ) -> tuple[Int[np.ndarray, "m k"], Float[np.ndarray, "m k 3"]]:
-    """For each vertex that moves the rows of those beside it, and their w, see `avatar.face`."""
+    """Returns for each vertex that moves the rows of its neighbours, and their w, see
+    `avatar.face`.
+    """
     edges, _ = mesh_edges(np.asarray(avatar.faces))
     pairs = np.concatenate([edges, edges[:, ::-1]])
     pairs = pairs[row[pairs[:, 0]] < len(vertices)]
@@ -208,7 +214,9 @@ def _stretching(
 
 
 def _vertex_of_gaussians(avatar: Avatar) -> Int[np.ndarray, " g"]:
-    """The vertex that each Gaussian belongs to: the nearest one where refinement has added some."""
+    """Returns the vertex that each Gaussian belongs to; the nearest one if refinement has added
+    Gaussians.
+    """
     each, count = avatar.gaussians_per_vertex, len(avatar.rest_vertices)
     if each is not None:
         return np.repeat(np.arange(count), each)
@@ -216,8 +224,8 @@ def _vertex_of_gaussians(avatar: Avatar) -> Int[np.ndarray, " g"]:
 
 
 def _eyes(avatar: Avatar) -> Float[np.ndarray, "g 2"]:
-    """Shares by which Gaussians belong to the eyes: those that are seen between the lids of open
-    eyes.
+    """Returns the share of each Gaussian that belongs to the left and to the right eye, in [0, 1].
+    Gaussians between the lids of open eyes belong to an eye.
     """
     means = np.asarray(avatar.gaussians.means)
     shares = []
@@ -234,8 +242,8 @@ def _eyes(avatar: Avatar) -> Float[np.ndarray, "g 2"]:
 
 
 def _nothing(expressions: Expressions) -> dict[str, Any]:
-    """The fields of a face without hidden Gaussians: SMPL-X's own mesh has eyes and an inside of
-    the mouth.
+    """Returns the fields of a face without hidden Gaussians, as for SMPL-X, whose own mesh has eyes
+    and the inside of a mouth.
     """
     e = len(expressions.names)
     empty = Gaussians(*(from_host(np.zeros((0, *shape))) for shape in ((3,), (4,), (3,), (), (3,))))
@@ -256,8 +264,8 @@ def _shipped_parts() -> FaceParts:
 
 
 def _hidden(avatar: Avatar, body: BodyModel, follows: np.ndarray) -> dict[str, Any]:
-    """The fields of a face about its hidden Gaussians. follows: which Gaussians move with the
-    face.
+    """Returns the fields of a face about its hidden Gaussians. follows: which Gaussians move with
+    the face.
     """
     expressions = body.expressions
     assert expressions is not None
@@ -304,8 +312,8 @@ def _map_around(
     after: Float[np.ndarray, "m 3"],
     reach: float,
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The affine map that takes the vertices `before` around points to those `after`; a shift
-    where there are few.
+    """Returns the affine map that takes the vertices `before` near some points to the vertices
+    `after`; a shift if few vertices are near. reach: metres within which vertices are near.
     """
     middle = points.reshape(-1, 3).mean(axis=0)
     distance = np.linalg.norm(before - middle, axis=1)
@@ -319,7 +327,7 @@ def _map_around(
 
 
 def _skin_around(avatar: Avatar, eye: str, follows: np.ndarray) -> Float[np.ndarray, "3"]:
-    """The median color of the skin below and beside an eye."""
+    """Returns the median color of the skin below and beside an eye. eye: the name of its joint."""
     offset = (
         np.asarray(avatar.gaussians.means)
         - np.asarray(avatar.rest_joints)[avatar.joint_names.index(eye)]
@@ -338,8 +346,8 @@ def _gaussians_of(
     colors: Float[np.ndarray, "q 3"],
     in_mouth: np.ndarray,
 ) -> tuple[Gaussians, Float[np.ndarray, "q 3"]]:
-    """A flat Gaussian for each face, and its normal. corners: at rest. drawn: as they are when
-    they are seen.
+    """Returns a flat Gaussian for each quadrangle, and its normal. corners: the corners at rest,
+    metres. drawn: the corners when the Gaussian is seen.
     """
     first = (drawn[:, 1] + drawn[:, 2] - drawn[:, 0] - drawn[:, 3]) / 2
     second = (drawn[:, 2] + drawn[:, 3] - drawn[:, 0] - drawn[:, 1]) / 2

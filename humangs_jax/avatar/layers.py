@@ -1,4 +1,5 @@
-"""Views of an avatar as files: PNG images, and an OpenEXR file of layers for compositing programs.
+"""Writes views of an avatar as files: PNG images, and an OpenEXR file of layers for compositing
+programs.
 
 Layers of a view, besides the colors:
 
@@ -47,12 +48,13 @@ from humangs_jax.rendering.splatting import Rendering, render
 LAYERS = ("rgba", "z", "position", "normal", "part")
 EXR_NAME = "views.exr"
 COVERED = 0.5
-"""Pixels of less alpha have no part."""
+"""Pixels with less alpha belong to no part."""
 RGBA = ("R", "G", "B", "A")
 DEPTH = "Z"
 WIDE = (DEPTH, "position.")
-"""How the names of channels start that stay in 32 bits when others are halved: metres, of which
-half precision has steps of 2 mm at 4 m."""
+"""The beginnings of the names of channels that stay in 32 bits when others are halved. They are
+lengths in metres, and half precision has steps of 2 mm at 4 m.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -93,7 +95,7 @@ class ExrLayers:
             raise ArgumentError("channels", f"{unknown[0]!r}: expected some of {', '.join(LAYERS)}")
 
     def bytes_of(self, views: int, width: int, height: int) -> int:
-        """Size of all layers in memory, in 32 bits."""
+        """Returns the size of all layers in memory, bytes, with 32 bits for each number."""
         channels = {"rgba": 4, "z": 1, "position": 3, "normal": 3, "part": 1}
         return 4 * views * width * height * sum(channels[name] for name in {"rgba", *self.layers})
 
@@ -167,7 +169,7 @@ def exr_view(
     layers: Iterable[str],
     how: SplatConfig,
 ) -> ExrView:
-    """A view with its layers. rendering: of this avatar, pose and camera onto black."""
+    """Returns a view with its layers. rendering: of this avatar, pose and camera, onto black."""
     layers, alpha = set(layers), np.asarray(rendering.alpha)
     channels, attributes = {}, {}
     # positions follow from the depth
@@ -213,8 +215,8 @@ def exr_view(
 def write_renderings_exr(
     path: str | os.PathLike[str], cameras: Camera, renderings: Iterable[Rendering]
 ) -> None:
-    """Renderings onto black as an EXR file of premultiplied RGBA in 32 bits, Z in metres and the
-    camera, one part per view.
+    """Write renderings onto black as an EXR file with one part for each view: premultiplied RGBA in
+    32 bits, Z in metres, and the camera.
     """
     each = enumerate(zip(cameras, renderings, strict=True))
     write_exr(
@@ -236,8 +238,8 @@ def _plain_view(name: str, camera: Camera, rendering: Rendering) -> ExrView:
 
 
 def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
-    """The points of the world on the rays of the pixels (centres at +0.5), at these depths along
-    the camera's axis, metres.
+    """Returns the world points on the rays of the pixels (centres at +0.5), metres. depth:
+    distances along the camera's axis, metres.
     """
     require_pinhole("unprojection", camera)
     K = np.asarray(camera.K, np.float64)
@@ -249,13 +251,13 @@ def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.nda
 
 
 def gaussian_parts(avatar: Avatar) -> Int[np.ndarray, " g"]:
-    """The joint that each Gaussian follows most."""
+    """Returns the joint that each Gaussian follows most."""
     return np.asarray(avatar.skinning_weights).argmax(axis=-1)
 
 
 def gaussian_normals(avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
-    """Unit normals of the posed body's surface: of the nearest vertex, turned by the Gaussian's own
-    transform.
+    """Returns unit normals of the posed body's surface at each Gaussian: the normal of the nearest
+    vertex, turned by the Gaussian's transform.
     """
     normals = surface_normals(avatar.rest_vertices, avatar.faces, avatar.gaussians.means)
     return _posed_normals(normals, avatar, pose)

@@ -1,18 +1,17 @@
-"""What no photo shows of a person is guessed from what the photos show.
+"""Guesses the parts of a person that no photo shows from the parts that photos show.
 
 The network knows that a back wears something, but not what: without a photo it paints cloth in
 grey. Here each vertex that no photo shows takes colors, opacities and heights above the skin of its
-Gaussians from vertices that photos show: those that are near it on the surface, in front of it or
-behind it, or on the other side of the body. It is an attention over the vertices v that are shown,
+Gaussians from vertices that photos show. These are near it on the surface, in front of it or behind
+it, or on the other side of the body. The guess is an attention over the vertices v that are shown,
 and over their mirror images:
 
     guess(u) = sum_v softmax_v(log sure(v) - |f(u) - f(v)|^2 / (2 SPREAD^2)) value(v)
 
 The features f are the position in the T-pose, in metres, where depths from front to back count
-little, and the skinning
-weights: a sleeve is not like the trunk behind it. On the head the plain position is the feature,
-and the face is no source: the back of a head gets hair, not a second face. Faces and hands stay as
-the network made them.
+little, and the skinning weights, because a sleeve is not like the trunk behind it. On the head the
+plain position is the feature, and the face is no source: the back of a head gets hair, not a second
+face. Faces and hands stay as the network made them.
 """
 
 from typing import NamedTuple
@@ -35,44 +34,49 @@ from humangs_jax.network.reader import project_and_test
 from humangs_jax.rendering.gaussians import Gaussians
 
 UNSEEN = 0.15
-"""Cosine between a vertex's normal and the line of sight of the photo that shows it best; below,
-nothing is known of the vertex.
+"""Cosine between a vertex's normal and the line of sight, in the photo that shows the vertex best.
+Below it nothing is known of the vertex.
 """
 SEEN = 0.45
-"""The same cosine, above which nothing is guessed; between the two both are mixed."""
+"""The same cosine from which on nothing is guessed. Between `UNSEEN` and `SEEN` guesses are mixed
+in.
+"""
 SPREAD = 0.015
 """Metres in the space of the features, over which sources are averaged."""
 LEAST_HIDDEN = 1 / 3
-"""Share of the vertices that no photo shows, below which nothing is guessed. Of people who are
-shown from all around, folds and the insides of hands are left, which the network knows better.
+"""Share of the vertices that no photo shows, below which nothing is guessed. If photos show a
+person from all around, only folds and the insides of hands are left, which the network knows
+better.
 """
 DEPTH = 0.5
-"""What a metre from front to back counts: the back of a trunk is like its front more than like
-its sides.
+"""Factor on distances from front to back, because the back of a trunk is more like its front than
+like its sides.
 """
 PART = 0.6
-"""Metres that a change of the square roots of the skinning weights by 1 counts."""
+"""The distance, in metres, that a change of the square roots of the skinning weights by 1 counts
+as.
+"""
 MIRRORED = 0.05
-"""Metres that a source on the other side of the body is farther away than one on the same side."""
+"""Metres that are added to the distance of a source on the other side of the body."""
 FARTHEST = 0.5
-"""Metres in the space of the features: beyond them a source says nothing."""
+"""The largest distance of a source in the space of the features, metres."""
 APART = 10.0
-"""Metres between the head and the rest in the space of the features."""
+"""The distance between the head and the rest in the space of the features, metres."""
 CROWN = 0.93
 """Share of the head's height above which the crown begins."""
 FACE = 0.5
-"""Share of the head's depth in front of which the face begins, which stays."""
+"""Share of the head's depth in front of which the face begins. The face keeps its colors."""
 NAPE = (0.35, 0.55)
-"""Shares of the head's depth and height: what is behind the first and above the second is hair,
-as the crown is.
+"""Shares of the head's depth and height. Vertices behind the first and above the second are hair,
+like those of the crown.
 """
 GLANCE = (0.03, 0.25)
-"""Instead of `UNSEEN` and `SEEN`, for hair as a source: photos of a face show the crown at a
-glancing angle.
+"""`UNSEEN` and `SEEN` for hair as a source, because photos of a face show the crown at a glancing
+angle.
 """
 HEAD_JOINTS = ("head", "jaw", "eye")
 BLOCK = 256
-"""Vertices whose sources are weighed at a time: bounds the memory."""
+"""Vertices whose sources are weighed at a time, which bounds the memory."""
 TINY = 1e-6
 """The least distance and weight, so that quotients and logarithms are finite."""
 
@@ -80,10 +84,12 @@ TINY = 1e-6
 def with_guesses(
     outputs: HumanGSOutputs, inputs: HumanGSInputs, body: BodyModel, config: HumanGSConfig
 ) -> HumanGSOutputs:
-    """The outputs with guesses for what no photo shows; the outputs as they are where all is shown.
+    """Returns the outputs with guesses for what no photo shows. Returns the outputs as they are if
+    photos show all.
 
-    So are those of networks that read whole photos, not the person alone, and of those whose
-    Gaussians are not on vertices. Gradients do not pass through the choice of sources.
+    Outputs are also returned as they are for networks that read whole photos, not the person alone,
+    and for networks whose Gaussians are not on vertices. Gradients do not pass through the choice
+    of sources.
     """
     on_vertices = not outputs.is_empty and outputs.skinning_weights is None
     rest, normals = inputs.canonical_vertices, inputs.canonical_normals
@@ -96,8 +102,8 @@ def with_guesses(
 
 
 def _shown_by_view(inputs: HumanGSInputs, config: HumanGSConfig) -> Float[Array, "v n"]:
-    """How well each photo shows each vertex: the cosine between its normal and the line of sight, 0
-    where it is hidden, beyond the frame or beyond the mask, and in padding.
+    """Returns how well each photo shows each vertex: the cosine between its normal and the line of
+    sight. It is 0 where the vertex is hidden, beyond the frame or beyond the mask, and in padding.
     """
     assert inputs.posed_normals is not None  # `prepare_inputs` computes them
     unit_length = subject_unit(inputs.canonical_vertices)
@@ -111,24 +117,24 @@ def _shown_by_view(inputs: HumanGSInputs, config: HumanGSConfig) -> Float[Array,
 
 
 class Regions(NamedTuple):
-    """Which vertices of a body may take guesses and give them, and where each lies for the
-    distances between them.
+    """The vertices of a body that may take guesses and give them, and their places in the space of
+    the features.
     """
 
     head: Bool[Array, " n"]
-    """Which belong to the head, (n,)."""
+    """Which vertices belong to the head, (n,)."""
     free: Bool[Array, " n"]
-    """Which take guesses, (n,): all but the face."""
+    """Which vertices take guesses, (n,): all but the face."""
     sources: Bool[Array, " n"]
-    """Which give guesses, (n,): of the head the hair alone."""
+    """Which vertices give guesses, (n,): all but those of the head that are not hair."""
     features: Float[Array, "n f"]
-    """Where the vertices lie, (n, f), metres."""
+    """The features of the vertices, (n, f), metres."""
     mirrored: Float[Array, "n f"]
-    """Where their mirror images lie, (n, f), metres."""
+    """The features of the vertices' mirror images, (n, f), metres."""
 
 
 def body_regions(body: BodyModel, rest: Float[Array, "n 3"]) -> Regions:
-    """The regions of a body whose vertices in the T-pose are `rest`, metres."""
+    """Returns the regions of a body. rest: its vertices in the T-pose, metres."""
     weights = body.skinning_weights
     head = _share_of(body, HEAD_JOINTS) > 0.5
     hands = _share_of(body, ("wrist", "index", "middle", "pinky", "ring", "thumb")) > 0.5
@@ -163,13 +169,15 @@ def _features(
 
 
 def _share_of(body: BodyModel, joints: tuple[str, ...]) -> Float[Array, " n"]:
-    """Sum of the skinning weights of all joints whose names contain one of these words."""
+    """Returns for each vertex the sum of the skinning weights of the joints whose names contain one
+    of the words in `joints`.
+    """
     chosen = [any(word in name for word in joints) for name in body.joint_names]
     return jnp.sum(body.skinning_weights * jnp.asarray(chosen, float), axis=1)
 
 
 def _mirrored(name: str) -> str:
-    """The name of the joint on the other side."""
+    """Returns the name of the same joint on the other side."""
     side, _, part = name.partition("_")
     other = {"left": "right", "right": "left"}
     if side in other:
@@ -184,10 +192,10 @@ def guessed(
     shown: Float[Array, " n"],
     regions: Regions,
 ) -> Gaussians:
-    """The Gaussians of the n vertices with guesses where they are not shown.
+    """Returns the Gaussians of the n vertices, with guesses where photos do not show the vertices.
 
-    rest, normals: of the body in the T-pose, metres and unit. shown: cosines of the best photos,
-    see `_shown_by_view`.
+    rest, normals: the body in the T-pose, metres, and its unit normals. shown: the cosine in the
+    photo that shows each vertex best, see `_shown_by_view`.
     """
     count = len(rest)
     sure = jnp.clip((shown - UNSEEN) / (SEEN - UNSEEN), 0, 1)
@@ -221,9 +229,10 @@ def attended(
     sure: Float[Array, " n"],
     regions: Regions,
 ) -> Float[Array, "n c"]:
-    """The values, each mixed with its guess by the share `need`, which is 0 where nothing changes.
+    """Returns the values, each mixed with its guess. need: the share of the guess for each vertex;
+    0 where nothing changes.
 
-    sure: how much a vertex counts as a source; 0: it is none. Vertices far from all sources keep
+    sure: how much a vertex counts as a source; 0 for no source. Vertices far from all sources keep
     their values. The time grows with the number of vertices in need.
     """
     count = len(need)
@@ -259,12 +268,12 @@ def attended(
 # ------------------------------------------------------------------------------------------------
 
 CLEARLY = 0.5
-"""Cosine between normal and line of sight, from which on a photo shows what a surface looks
+"""Cosine between normal and line of sight from which on a photo shows clearly what a surface looks
 like.
 """
 LEAST_SHOWN = 0.5
-"""Share of the area of a side that photos have to show clearly, or of a part of the body to
-contain; else it is a guess.
+"""Share of the area of a side that photos must show clearly, or of a part of the body that must be
+in photos. Below it the side or part is a guess.
 """
 SIDES = {
     "front": (0.0, 0.0, 1.0),
@@ -272,14 +281,16 @@ SIDES = {
     "left side": (1.0, 0.0, 0.0),
     "right side": (-1.0, 0.0, 0.0),
 }
-"""Directions of the normals in the T-pose; those within 60 degrees belong to a side."""
+"""The directions of the sides in the T-pose. Surfaces whose normals are within 60 degrees belong to
+a side.
+"""
 PARTS = {"head": HEAD_JOINTS, "lower legs": ("knee",), "feet": ("ankle", "foot")}
-"""Words of the names of the joints whose vertices these are."""
+"""Words of the names of the joints that move each part."""
 
 
 def guess_line(capture: Capture) -> str | None:
-    """One line that names the sides and parts of the person that no photo of a capture shows;
-    None where all are shown.
+    """Returns one line that names the sides and parts of the person that no photo of a capture
+    shows; None if all are shown.
     """
     names = [f"the {name}" for name in unseen_sides(capture)]
     if not names:
@@ -292,9 +303,9 @@ def guess_line(capture: Capture) -> str | None:
 
 
 def unseen_sides(capture: Capture) -> list[str]:
-    """Names of `SIDES` and `PARTS` that hardly any photo shows.
+    """Returns the names of the `SIDES` and `PARTS` that hardly any photo shows.
 
-    On the host, without occlusion by other limbs.
+    This runs on the host, and does not consider that other limbs may be in front.
     """
     body, rest = capture.body, shaped(capture.body, capture.betas)
     faces, weights = np.asarray(body.faces), np.asarray(body.skinning_weights)

@@ -1,20 +1,20 @@
-"""Equal exposure and white balance of the photos of one person.
+"""Makes the exposure and the white balance of the photos of one person equal.
 
-Cameras that meter for themselves show one skin in several colors; a gain for each channel makes
+Cameras that meter for themselves show one skin in several colors. A gain for each channel makes
 them agree. What two photos both show of the body should have one color in both. The gains are those
 that bring the medians of the ratios nearest to 1; their logarithms have the mean 0 over the photos.
 Where little is shared they stay near 1.
 
-Photos of the front and of the back share no point of the body, and neither do those of both sides.
-Groups of photos that are linked by shared points are compared by the parts of the body: skin, hair
-and a garment have about one color in front and behind, left and right. White balance first: the
-color of a part, its brightness left out, hardly depends on how the light falls on it. Parts that
-differ (an open coat in front, hair over a neck) do not count: the fit is robust. Brightness does
-depend on the light; it is made equal where the photos are of other moments, or where their white
-balance is not one.
+Photos of the front and of the back share no point of the body, nor do photos of the left and of the
+right side. Groups of photos that are linked by shared points are compared by the parts of the body:
+skin, hair and a garment have about one color in front and behind, left and right. White balance
+comes first, because the color of a part, its brightness left out, hardly depends on how the light
+falls on it. Parts that differ (an open coat in front, hair over a neck) do not count, since the fit
+is robust. Brightness does depend on the light. It is made equal only where the photos are of other
+moments, or where their white balance is not one.
 
-Gains are found once for the photos of a capture, which then records them (`Capture.gains`): found
-again from photos that are nearly equal, they would not be ones.
+Gains are found once for the photos of a capture, which then records them (`Capture.gains`). Gains
+found again from photos that are nearly equal would not be 1.
 """
 
 import dataclasses
@@ -43,7 +43,7 @@ EXPOSURE_SIZE = 256
 FACING = 0.5
 """A photo shows a point where the cosine between normal and ray is at least this."""
 THICKNESS = 0.02
-"""A photo shows a point that lies at most so many metres behind the nearest surface."""
+"""A photo shows a point that lies at most this many metres behind the nearest surface."""
 INSIDE = 5
 """Side of the square around each point that must lie in the mask, pixels."""
 WHOLE = 0.99
@@ -55,22 +55,23 @@ USABLE = (0.06, 0.95)
 LEAST_POINTS = 50
 """Points that two photos must share to be compared."""
 ALIKE = 50
-"""How many neighbouring points err alike."""
+"""The number of neighbouring points whose errors are alike."""
 NOISE = 0.03
 """Standard deviation of a median of log ratios, whatever the number of points."""
 EXPECTED = 0.15
-"""Standard deviation of the logarithm of a gain."""
+"""Standard deviation of the logarithm of a gain that is expected before the photos are compared."""
 CLEAR = 1.0
-"""Root mean square of the medians over their standard errors, below which all photos stay as they
-are: loose clothes and shadows make 0.3 to 0.9 in photos of equal exposure (eight test people)."""
+"""Root mean square of the medians over their standard errors. Below it all photos stay as they are:
+loose clothes and shadows make 0.3 to 0.9 in photos of equal exposure (eight test people).
+"""
 NORMAL_MAD = 1.4826
 
 
 def equalize_exposure(capture: Capture) -> Capture:
-    """The capture in equal exposure, which is what network and refinement see, with the gains
-    recorded; the same object where they are recorded already.
+    """Returns the capture in equal exposure, with its gains recorded. Network and refinement read
+    these photos. Returns the same object if its gains are recorded already.
 
-    Without masks nothing is known of the exposure, and nothing is recorded.
+    Captures without masks are returned as they are, because nothing is known of their exposure.
 
     capture: photos on white; all masks show the person.
     """
@@ -92,7 +93,9 @@ def equalize_exposure(capture: Capture) -> Capture:
 
 
 def exposure_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
-    """Gain per view and channel with which a rendered avatar looks as each camera exposed it."""
+    """Returns the gains by which a rendered avatar gets the exposure of each camera, (v, 3): one
+    for each view and channel.
+    """
     if capture.gains is not None:
         return 1 / capture.gains
     apart, found = views_without_person(capture), np.ones((capture.view_count, 3))
@@ -107,7 +110,7 @@ def exposure_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
 def points_of(
     capture: Capture,
 ) -> tuple[Float[np.ndarray, "v n 3"], Bool[np.ndarray, "v n"]]:
-    """The colors of the body's vertices in each photo, and which of them it shows.
+    """Returns the colors of the body's vertices in each photo, and which vertices it shows.
 
     capture: photos on white, with masks, all of which show the person.
     """
@@ -117,7 +120,7 @@ def points_of(
 
 
 def _looks(capture: Capture) -> Iterator[tuple[Any, ...]]:
-    """The arguments of `seen_colors` for one photo after the other."""
+    """Yields the arguments of `_seen_colors` for each photo."""
     views = to_network_views(capture, EXPOSURE_SIZE, crop=True)
     rest = shape_body(capture.body, views.betas)
     per_view = views.images, views.masks, views.cameras
@@ -128,17 +131,19 @@ def _looks(capture: Capture) -> Iterator[tuple[Any, ...]]:
 
 
 def calls_of_exposure(capture: Capture) -> Iterator[Call]:
-    """The program that looks for the colors of the body in photos, wherever it is."""
+    """Yields the program that finds the colors of the body in photos. The program does not depend
+    on where the body is.
+    """
     yield _seen_colors, next(_looks(capture))
 
 
 def gains_of(
     colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Gains of views from the colors of common points; all 1 where there is hardly a difference, or
-    nothing in common.
+    """Returns the gains of views, found from the colors of common points. All are 1 where the
+    colors hardly differ, or where views have nothing in common.
 
-    colors: in [0, 1]. seen: which points a view shows.
+    colors: in [0, 1]. seen: which points each view shows.
     """
     count, logs = len(colors), np.log(np.maximum(colors, 1e-6))
     known = _known(colors, seen)
@@ -179,9 +184,9 @@ PARTS = (
     ("neck",),
     ("head", "jaw", "eye"),
 )
-"""What names of joints contain, part by part of the body: left and right are one part."""
+"""Words of the joint names of each part of the body. Left and right are one part."""
 LEAST_OF_PART = 20
-"""Points of a part that a group of photos shows, at least."""
+"""The least number of points that a group of photos must show of a part."""
 TINT = 0.03
 """Standard deviation of the logarithm of a part's tint, in front against behind, in one light (16
 synthetic people: 0.02 to 0.04, without open coats).
@@ -191,25 +196,26 @@ BRIGHTNESS = 0.2
 (16 synthetic people: 0.1 to 0.3).
 """
 OFFSET = 0.01
-"""Standard deviation of a color, of stray light, that makes the tint of dark parts uncertain."""
+"""Standard deviation of a color by stray light, which makes the tint of dark parts uncertain."""
 OTHER_LIGHT = 0.04
-"""Root mean square of the logarithms of white balances from which photos of one moment are taken
-for differently balanced: in one light at most 0.03 is found (16 synthetic people)."""
+"""Root mean square of the logarithms of white balances. Photos of one moment above it count as
+balanced differently; in one light at most 0.03 is found (16 synthetic people).
+"""
 OTHER_DAYS = 0.4
 """Standard deviation of the logarithm of a gain between photos that may be of other days."""
 FITS = 16
 """How often the rows are weighted by their residuals."""
 REDESCENDING = 8
-"""In how many of these fits, the last ones, parts that differ lose all weight: earlier they would
-hang on where the search begins.
+"""In this number of fits, the last ones, parts that differ lose all weight. In earlier fits that
+would tie the result to the start of the search.
 """
 
 
 def linked_views(
     colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]
 ) -> Int[np.ndarray, " v"]:
-    """The number of each view's group: views are in one where common points say what their gains
-    are, of the two or by way of others.
+    """Returns the number of each view's group. Two views are in one group if they share enough
+    points to compare their gains, directly or by way of other views.
     """
     known = np.all(_known(colors, seen), axis=-1)
     shared = np.einsum("an,bn->ab", known, known, dtype=int) >= LEAST_POINTS
@@ -223,7 +229,9 @@ def _known(
 
 
 def body_parts(body: BodyModel) -> Int[np.ndarray, " n"]:
-    """The part of the body that each vertex moves with, an index into `PARTS`; -1: none of them."""
+    """Returns the part of the body that each vertex moves with, an index into `PARTS`; -1 for none
+    of them.
+    """
     of_joint = [
         next((i for i, words in enumerate(PARTS) if any(word in name for word in words)), -1)
         for name in body.joint_names
@@ -238,14 +246,15 @@ def gains_between(
     groups: Int[np.ndarray, " v"],
     frames: Int[np.ndarray, " v"],
 ) -> Float[np.ndarray, "v 3"]:
-    """Gains of groups of views that have no point in common, from the colors of the body's parts.
+    """Returns the gains of groups of views that have no point in common, from the colors of the
+    body's parts.
 
     Arguments:
         colors: in [0, 1], equal within each group.
-        seen: which points a view shows.
-        parts: of the points, see `body_parts`.
-        groups: of the views, see `linked_views`.
-        frames: of the views. Groups that share one are in one light.
+        seen: which points each view shows.
+        parts: the part of each point, see `body_parts`.
+        groups: the group of each view, see `linked_views`.
+        frames: the frame of each view. Groups that share a frame are in one light.
     """
     count = int(groups.max()) + 1
     medians = part_colors(colors, seen, parts, groups)
@@ -292,7 +301,8 @@ def part_colors(
     parts: Int[np.ndarray, " n"],
     groups: Int[np.ndarray, " v"],
 ) -> list[list[PartColor | None]]:
-    """The color of each of `PARTS` in each group of views; None where it shows too little of it.
+    """Returns the color of each of `PARTS` in each group of views; None where the group shows too
+    little of the part.
 
     Arguments: see `gains_between`.
     """
@@ -307,7 +317,9 @@ def part_colors(
 
 
 def _part_color(logs: Float[np.ndarray, "n 3"]) -> PartColor | None:
-    """None for too few points."""
+    """Returns the color of a part from the logarithms of its points' colors; None for fewer than
+    `LEAST_OF_PART` points.
+    """
     if len(logs) < LEAST_OF_PART:
         return None
     tints = logs - logs.mean(axis=1, keepdims=True)
@@ -322,8 +334,12 @@ def _robust_differences(
     errors: Float[np.ndarray, " r"],
     count: int,
 ) -> Float[np.ndarray, "count c"]:
-    """Numbers x near 0 with x[one] - x[other] = value for most of the rows, by least squares with
-    weights: first those of absolute residuals, then those of Cauchy's distribution.
+    """Returns `count` numbers x near 0 such that x[one] - x[other] = value for most rows. They are
+    found by weighted least squares: first with weights of absolute residuals, then with those of
+    Cauchy's distribution.
+
+    ends: (one, other) of each row. values: the difference in each of c columns. errors: the
+    standard error of each row.
     """
     differences = np.eye(count)[ends[:, 0]] - np.eye(count)[ends[:, 1]]
     prior = np.eye(count) / OTHER_DAYS
@@ -351,9 +367,9 @@ def apply_gain(
     alpha: Float[np.ndarray, "v h w"],
     gains: Float[np.ndarray, "v 3"],
 ) -> Float[np.ndarray, "v h w 3"]:
-    """Images over white with their colors multiplied.
+    """Returns images over white with their colors multiplied by the gains of their views.
 
-    A rendering in the exposure of its camera: by 1 / gains.
+    Gains of 1 / `Capture.gains` give a rendering the exposure of its camera.
     """
     white = 1 - alpha[..., None]
     return np.clip((images - white) * gains[:, None, None].astype(np.float32) + white, 0, 1)
@@ -368,7 +384,7 @@ def _seen_colors(
     mask: Float[Array, "h w"],
     camera: Camera,
 ) -> tuple[Float[Array, "n 3"], Bool[Array, " n"]]:
-    """The colors of the body's vertices in one photo, and which of them it shows."""
+    """Returns the colors of the body's vertices in one photo, and which vertices it shows."""
     vertices = pose_body(body, rest, pose).vertices
     towards = camera.center - vertices
     normals = vertex_normals(vertices, body.faces)

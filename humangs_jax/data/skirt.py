@@ -1,15 +1,16 @@
-"""A skirt: a tube of vertices around both legs, where the photos show cloth between them.
+"""Adds a skirt to a body: a tube of vertices around both legs, where the photos show cloth between
+them.
 
-Each leg of a body is a tube, and no vertex spans the gap between them: on a body alone,
-a long skirt becomes a pair of ragged trousers. The vertices of the skirt are linear combinations of
-those of the legs, in shape, pose directions and skinning
-weights: where it spans the gap, of one point on each leg. So it bends smoothly between them. Its
-rows lie on the convex section of both legs; from there it is displaced along its normals to the
-edges of the masks, as the body is (`data.vertex_offsets`).
+Each leg of a body is a tube, and no vertex spans the gap between the legs. On a body alone, a long
+skirt becomes a pair of ragged trousers. The vertices of the skirt are linear combinations of
+vertices of the legs, in shape, pose directions and skinning weights. In the gap each combines one
+point on each leg, so that the skirt bends smoothly between them. The rows of the skirt lie on the
+convex section of both legs. From there they are displaced along their normals to the edges of the
+masks, as the body is (`data.vertex_offsets`).
 
 The photos show a skirt where points between the legs, and beside both, lie inside the masks. It
-ends above the first row where they do not. Legs that no photo shows apart have no skirt. All on the
-host, by numpy and scipy.
+ends above the first row where they do not. Legs that no photo shows apart have no skirt. All of
+this runs on the host, by numpy and scipy.
 """
 
 import jax
@@ -39,13 +40,13 @@ from humangs_jax.geometry.mesh import vertex_areas
 LEGS = (("left_hip", "left_knee", "left_ankle"), ("right_hip", "right_knee", "right_ankle"))
 TRUNK = ("pelvis", "spine1")
 TOP = 0.08
-"""Where a skirt may begin: 0 at the hips, 0.5 at the knees, 1 at the ankles. Above, the body is
-around both legs.
+"""The height where a skirt may begin: 0 at the hips, 0.5 at the knees, 1 at the ankles. Above it
+the body is around both legs.
 """
 BOTTOM = 0.97
-"""Where a skirt may end, in the same measure."""
+"""The height where a skirt may end, in the same measure as `TOP`."""
 ROWS = 28
-"""Rows of a skirt. All skirts share one program."""
+"""The number of rows of a skirt, the same for all, so that all skirts share one program."""
 GAP = 11
 """Vertices of a row in each of the gaps between the legs."""
 HALF = 13
@@ -53,32 +54,32 @@ HALF = 13
 SKIRT_VERTICES = ROWS * 2 * (GAP + HALF)
 """The vertices of a skirt, the last ones of a body that has one."""
 BESIDE = 0.02
-"""Metres beside the legs: trousers reach as far."""
+"""Points count if they are at least this many metres beside the legs. Trousers reach as far."""
 SHOWN = 0.8
 """A row is part of a skirt if this share of its points is inside the masks."""
 VOTES = 4
-"""Rows with fewer points say nothing."""
+"""The least number of points of a row; rows with fewer say nothing."""
 LEAST_ROWS = 4
-"""Wide trousers look worse with a skirt. To tell them apart, at least so many rows must have a
-point inside the masks beside both legs.
+"""The least number of rows with a point inside the masks that is `CLEAR` of both legs. It tells
+skirts from wide trousers, which look worse with a skirt.
 """
 CLEAR = 0.06
-"""Metres that such a point is beside both legs."""
+"""Metres by which such a point is beside both legs."""
 LONG_CLEAR = 0.1
-"""The same where no photo shows the legs apart below the hem."""
+"""The same distance where no photo shows the legs apart below the hem, metres."""
 REACH = OffsetFitConfig(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)
 HELD = 1e4
-"""Weight of no displacement of the body, in the fit of the skirt."""
+"""Weight of no displacement of the body's vertices in the fit of the skirt."""
 
 
 def add_skirt(
     body: BodyModel, capture: Capture, displacement: Float[np.ndarray, "n 3"]
 ) -> tuple[BodyModel, Float[np.ndarray, "m 3"]] | None:
-    """The body with a skirt, and the displacement of both, metres; None where the photos show no
-    skirt.
+    """Returns the body with a skirt, and the displacement of the vertices of both, metres; None if
+    the photos show no skirt.
 
-    Arguments: body: one of `data.views.gaussian_body`, whose vertices come first. capture: with
-    masks. displacement: of the body.
+    Arguments: body: one of `data.views.gaussian_body`; its vertices come first in the result.
+    capture: has masks. displacement: of the vertices of `body`, metres.
     """
     # a map of the surface has no place for it
     if body.texels is not None:
@@ -108,8 +109,8 @@ def add_skirt(
 
 
 def find_hem(body: BodyModel, capture: Capture) -> float | None:
-    """How far down the legs the photos show a skirt, from `TOP` to `BOTTOM`; None: they show
-    none.
+    """Returns how far down the legs the photos show a skirt, from `TOP` to `BOTTOM`; None if they
+    show none.
     """
     legs = _legs(body)
     if legs is None or capture.masks is None:
@@ -163,9 +164,10 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
 
 
 def with_tube(body: BodyModel, hem: float) -> BodyModel:
-    """The body, then the vertices of a tube around its legs down to `hem`.
+    """Returns the body with the vertices of a tube around its legs, from `TOP` down to `hem`,
+    behind its own vertices.
 
-    Raises: ValueError if it has no such legs.
+    Raises: ValueError if the body has no legs that hang in the T-pose.
     """
     # each vertex of the tube combines vertices of the body, and so does all that belongs to it
     combined = _tube(body, np.linspace(TOP, hem, ROWS))
@@ -204,7 +206,9 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
 
 
 def _legs(body: BodyModel) -> Int[np.ndarray, "2 3"] | None:
-    """Joints of legs that hang in the T-pose."""
+    """Returns the joints of the legs, (2, 3): hip, knee and ankle of each; None if the legs do not
+    hang in the T-pose.
+    """
     names = list(body.joint_names)
     if not all(name in names for leg in LEGS for name in leg):
         return None
@@ -216,7 +220,9 @@ def _legs(body: BodyModel) -> Int[np.ndarray, "2 3"] | None:
 def _along(
     joints: Float[np.ndarray, "j 3"], legs: Int[np.ndarray, "2 3"], levels: Float[np.ndarray, " r"]
 ) -> Float[np.ndarray, "2 r 3"]:
-    """Points on the lines from hip to knee to ankle."""
+    """Returns the points on the lines from hip to knee to ankle at some heights, in the measure of
+    `TOP`, (2, r, 3).
+    """
     lines = np.zeros((len(legs), len(levels), 3))
     for side, leg in enumerate(legs):
         for axis in range(3):
@@ -231,7 +237,7 @@ def _radii(
     legs: Int[np.ndarray, "2 3"],
     levels: Float[np.ndarray, " r"],
 ) -> Float[np.ndarray, "2 r"]:
-    """Mean distance of the skin of each leg from these lines, metres."""
+    """Returns the mean distance of the skin of each leg from the lines of `_along`, metres."""
     lines = _along(joints, legs, levels)
     radii = np.zeros(lines.shape[:2])
     for side, leg in enumerate(legs):
@@ -245,7 +251,7 @@ def _radii(
 
 
 def _tube(body: BodyModel, levels: Float[np.ndarray, " r"]) -> sparse.csr_array:
-    """Rows (r * loop, n) that make the vertices of a tube of those of the body.
+    """Returns a matrix (r * loop, n) that makes the vertices of a tube of the vertices of the body.
 
     A loop goes over the front from the left to the right, around the right leg, over the back, and
     around the left leg.
@@ -284,10 +290,10 @@ def _farthest(
     origin: Float[np.ndarray, "3"],
     rays: Float[np.ndarray, "r 3"],
 ) -> sparse.csr_array:
-    """The last points (r, n) of a surface along horizontal rays, in barycentric coordinates (Moller
-    and Trumbore 1997).
+    """Returns the last point of a surface along each horizontal ray, in barycentric coordinates: a
+    matrix (r, n) of weights of the vertices (Moller and Trumbore 1997).
 
-    Raises: ValueError where a ray meets none.
+    Raises: ValueError where a ray does not meet the surface.
     """
     heights = vertices[faces, 1]
     faces = faces[(heights.min(axis=1) <= origin[1]) & (heights.max(axis=1) >= origin[1])]

@@ -1,4 +1,4 @@
-"""How far the skin of the body moves to fill the masks.
+"""Finds how far the skin of a body must move to fill the masks.
 
 The body is displaced: its vertices are moved along their normals until its silhouettes meet those
 of all photos. Where a vertex lies on the body's own silhouette in a photo, the mask's edge along
@@ -33,12 +33,14 @@ STEP = 0.0025
 WEAKNESS = 0.002
 """Weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette."""
 HELD = 20.0
-"""Weight of no displacement for hands and head."""
+"""Weight of no displacement for vertices of hands and head."""
 HELD_JOINTS = ("head", "jaw", "eye", "wrist", "index", "middle", "pinky", "ring", "thumb")
 NEAR = 2.5
-"""Pixels. A vertex may be on the body's silhouette if it is no farther from the edge."""
+"""Pixels. A vertex may be on the body's silhouette if it is no farther from the silhouette's
+edge.
+"""
 PROBE = 0.012
-"""Metres by which such a vertex is moved along its normal, to see whether it leaves the
+"""Metres by which such a vertex is moved along its normal to see whether it leaves the
 silhouette.
 """
 LEAVES = 0.6
@@ -47,10 +49,11 @@ outwards."""
 DRAWN = 0.5
 """Pixels by which polygons are drawn larger than they are."""
 WRAP = 0.07
-"""In the last step, vertices outside a mask move inwards by up to this many metres, until all masks
-contain them by the inset."""
+"""The largest move of the last step, metres. Vertices outside a mask move inwards until all masks
+contain them by the inset.
+"""
 WRAP_ROUNDS = 6
-"""How often these moves are averaged over the neighbours."""
+"""How often the moves of the last step are averaged over the neighbours."""
 OUTSIDE = 0.01
 """Metres outside of a mask from which on a vertex counts as outside."""
 MISFIT = 0.025
@@ -73,24 +76,24 @@ PerVertex = Float[np.ndarray, " n"]
 @dataclasses.dataclass(frozen=True)
 class OffsetFitConfig:
     """How a surface moves to the edges of the masks. The defaults are those of bodies: the network
-    adds clothes on top, and knows naked ones.
+    adds clothes on top, since it knows naked bodies.
     """
 
     outwards: float = 0.05
-    """How far outwards along a normal a mask's edge is looked for, and the largest move, metres."""
+    """The largest move outwards along a normal, metres. A mask's edge is looked for within it."""
     inwards: float = 0.06
-    """The same inwards, metres."""
+    """The largest move inwards, metres."""
     smoothness: float = 0.03
     """The length over which a move spreads to the vertices around it, metres."""
     inset: tuple[float, float] = (0.005, 0.025)
     """The least and the most that the surface may lie inside the masks, metres."""
     iterations: int = 2
-    """How often edges are looked for and the surface is moved."""
+    """How often edges are looked for and the surface is then moved."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MaskedView:
-    """One photo: the window around the person, and the body as it is posed there."""
+    """One photo: the window around the person, and the body in the pose of the photo."""
 
     coverage: Float[np.ndarray, "h w"]
     """The share of each pixel that the person covers, (h, w), in [0, 1]."""
@@ -102,26 +105,28 @@ class MaskedView:
     offset: Float[np.ndarray, "n 3"]
     """The offset of that move, (n, 3), metres."""
     low: Float[np.ndarray, "2"]
-    """The least x and y in the window that count as in the photo, (2,), pixels: `NEAR` inside its
-    corner.
+    """The least x and y in the window of points that count as inside the photo, (2,), pixels. This
+    is `NEAR` inside the photo's corner.
     """
     high: Float[np.ndarray, "2"]
-    """The largest x and y that do, (2,), pixels."""
+    """The largest x and y of such points, (2,), pixels."""
     hidden: Float[np.ndarray, "h w"] | None = None
-    """Where somebody may be in front, (h, w), in [0, 1]: the ends of masks say nothing there. None:
-    nowhere.
+    """The share of each pixel where somebody may be in front, (h, w), in [0, 1]. The ends of masks
+    say nothing there. None: nowhere.
     """
 
     @functools.cached_property
     def mask(self) -> Float[np.ndarray, "h w"]:
-        """Signed distance to the edge of the mask, pixels."""
+        """The signed distance of each pixel to the edge of the mask, (h, w), pixels; positive
+        inside.
+        """
         return signed_distance(self.coverage).astype(np.float32)
 
     def seen(
         self, points: Float[np.ndarray, "*n 3"], index: np.ndarray | slice = slice(None)
     ) -> tuple:
-        """Pixels (*n, 2) of points in the rest pose, pixels for a metre there, and which the photo
-        shows.
+        """Projects points of the rest pose. Returns their pixels (*n, 2), the pixels per metre
+        there, and which points the photo shows.
         """
         posed = np.einsum("nab,n...b->n...a", self.linear[index], points)
         posed += self.offset[index].reshape(len(posed), *[1] * (points.ndim - 2), 3)
@@ -141,14 +146,15 @@ def fit_vertex_offsets(
     *,
     always: bool = True,
 ) -> Float[np.ndarray, "n 3"]:
-    """How far the vertices of the shaped body of a person move in the T-pose, metres, so that it
-    fills the masks; bounded.
+    """Returns how far the vertices of a person's shaped body move in the T-pose to fill the masks,
+    metres. Moves are bounded.
 
-    Arguments: body: the capture's, or one of `data.views.gaussian_body`. capture: with masks;
-    frames and worlds may be any.
-    always: else 0 where the body fits the masks already, see `MISFIT`: it then gains less than the
-    network's own clothes lose. Where masks say nothing, or nothing of the body is near them, it is
-    0.
+    Arguments: body: the capture's body, or one of `data.views.gaussian_body`. capture: has masks;
+    frames and worlds may be any. inset: the least and the most that the surface may lie inside the
+    masks, metres. always: whether a body that fits the masks already is moved, too, see `MISFIT`.
+    If not, it moves by 0, because it would gain less than the network's own clothes lose.
+
+    Bodies also move by 0 where the masks say nothing, or are not near the body.
     """
     assert capture.masks is not None
     rest = shaped(body, capture.betas)
@@ -173,10 +179,11 @@ def fit_vertex_offsets(
 def to_edges(
     views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: OffsetFitConfig
 ) -> Points:
-    """How far the vertices of a surface in the T-pose move along its normals to the masks' edges,
-    smoothly.
+    """Returns how far the vertices of a surface in the T-pose move along its normals to the masks'
+    edges, metres. The moves are smooth.
 
-    held: weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette.
+    held: the weight of no displacement of each vertex, beside 1 for each photo that shows it on the
+    silhouette.
     """
     total = np.zeros_like(rest)
     for _ in range(reach.iterations):
@@ -187,7 +194,9 @@ def to_edges(
 
 
 def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[MaskedView]:
-    """The views of a capture whose masks are not empty, cut to the person."""
+    """Returns the views of a capture whose masks are not empty, cut to the person. rest: the
+    vertices of the body in the T-pose, metres.
+    """
     assert capture.masks is not None
     joints = np.asarray(body.joint_regressor, float) @ rest
     weights, views, posed = np.asarray(body.skinning_weights, float), [], {}
@@ -251,8 +260,8 @@ def _window(
 def _share_outside(
     views: list[MaskedView], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]
 ) -> float:
-    """The share of the free vertices that are `OUTSIDE` outside of a mask, or, if few are outside
-    at all, the share of these.
+    """Returns the share of the free vertices that are more than `OUTSIDE` outside of a mask. If
+    fewer than `MISFIT` are outside by any distance, their share is returned.
     """
     if not free.any():
         return 0.0

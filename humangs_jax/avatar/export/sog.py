@@ -26,9 +26,9 @@ from humangs_jax.rendering.gaussians import COUNTS, Gaussians
 META = "meta.json"
 VERSION = 2
 USUAL = "default"
-"""The usual `model`; others are "antialiased" and "2dgs"."""
+"""The usual `model` of a file; other models are "antialiased" and "2dgs"."""
 LEVELS = 256
-"""Numbers in a codebook, at most."""
+"""The most numbers in a codebook."""
 FIRST_PLACE = 252
 """Alpha of a quaternion whose largest component is w; the next three are of x, y and z."""
 COLUMNS = 64
@@ -36,9 +36,10 @@ COLUMNS = 64
 
 
 def read_sog(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a bundle. said: takes lines.
+    """Returns the Gaussians in the bytes of a bundle. Lines about what is left out are appended to
+    `said`.
 
-    Raises: InvalidFileError; what damaged files raise.
+    Raises: InvalidFileError; for damaged files also other errors.
     """
     with open_archive(io.BytesIO(data), len(data)) as archive:
         root = _root(archive)
@@ -81,7 +82,7 @@ def read_sog(data: bytes, said: list[str]) -> Gaussians:
 
 
 def _root(archive: zipfile.ZipFile) -> str:
-    """The folder in the archive that meta.json lies in, "" for none."""
+    """Returns the folder in the archive that holds meta.json, "" for none."""
     found = [name for name in archive.namelist() if name.rsplit("/", 1)[-1] == META]
     if len(found) != 1:
         raise InvalidFileError(f"no bundle of SOG: expected one {META} inside, found {len(found)}")
@@ -130,8 +131,8 @@ def _numbers(values: Any, name: str, least: int, most: int) -> Float[np.ndarray,
 
 
 def _codebook(meta: dict[str, Any], part: str) -> Float[np.ndarray, "256"]:
-    """The numbers that bytes stand for; those beyond a short one are NaN, which `loaded` leaves
-    out.
+    """Returns the numbers that bytes stand for. Numbers beyond the end of a short codebook are NaN;
+    `loaded` leaves such Gaussians out.
     """
     found = _numbers(_part(meta, part).get("codebook"), f"{part}.codebook", 1, LEVELS)
     return np.pad(found, (0, LEVELS - len(found)), constant_values=np.nan)
@@ -146,7 +147,7 @@ def _pixels(archive: zipfile.ZipFile, name: str) -> UInt8[np.ndarray, "h w 4"]:
 
 
 def _picture(archive: zipfile.ZipFile, name: str, count: int) -> UInt8[np.ndarray, "g 4"]:
-    """The first pixels, row by row."""
+    """Returns the first `count` pixels of a picture, row by row."""
     pixels = _pixels(archive, name).reshape(-1, 4)
     if len(pixels) < count:
         raise InvalidFileError(f"{shown(name)}: {len(pixels):,} pixels for {count:,} Gaussians")
@@ -166,7 +167,7 @@ def _positions(
 def _harmonics(
     archive: zipfile.ZipFile, root: str, meta: dict[str, Any], count: int
 ) -> dict[str, Float[np.ndarray, "g k 3"]]:
-    """Under their name, nothing if there are none."""
+    """Returns the harmonics under the name "shN"; an empty dictionary if there are none."""
     if meta.get("shN") is None:
         return {}
     bands = _whole(_part(meta, "shN").get("bands"), "shN.bands")

@@ -38,40 +38,44 @@ else:
 Version = Literal[3, 4]
 """The versions that are written. More programs read 3."""
 SPZ_MAGIC = 0x5053474E
-"""NGSP."""
+"""The letters NGSP at the beginning of a file."""
 WITH_TABLE = 4
 """The version from which on the arrays are compressed one by one."""
 HEADER = struct.Struct("<IIIBBBB")
-"""Magic, version, number of Gaussians, degree, fractional bits, flags, number of streams (before
-version 4 nothing).
+"""The header: magic, version, number of Gaussians, degree, fractional bits, flags, and number of
+streams (0 before version 4).
 """
 TABLE_PLACE = struct.Struct("<I12x")
-"""What version 4 has behind it: where the table begins."""
+"""Version 4 behind the header: the offset at which the table begins."""
 TABLE_ROW = struct.Struct("<QQ")
-"""Bytes of a stream, and of what it unpacks to."""
+"""A row of the table: the bytes of a stream, and of what it unpacks to."""
 RECORD = struct.Struct("<II")
-"""How the records of others begin: whose, and how many bytes follow."""
+"""The beginning of a record of another program: its kind, and the number of bytes that follow."""
 COORDINATE_SYSTEM = 0xADBE0003
-"""The record of files whose axes are not to the right, up and back."""
+"""The kind of the record that files have whose axes are not right, up and back."""
 ANTIALIASED = 1
-"""The flag of Gaussians that were trained with the filters of Mip-Splatting."""
+"""The flag of files whose Gaussians were trained with the filters of Mip-Splatting."""
 MORE_BEHIND = 2
-"""The flag of files with records of others."""
+"""The flag of files that have records of other programs."""
 MOST_FRACTIONAL_BITS = 20
-"""Steps of a micrometre; less where the Gaussians reach farther than 8 m."""
+"""The most fractional bits of positions, in steps of a micrometre. Gaussians that reach farther
+than 8 m have fewer.
+"""
 COLOR_SCALE = 0.15
 """Factor on the harmonic of degree 0 before it becomes a byte."""
 SCALE_STEPS = 16.0
-"""Steps of a byte for a factor e of the scale."""
+"""The number of steps of a byte by which a scale grows by the factor e."""
 SCALE_ZERO = 10.0
-"""What is added to the logarithm of a scale in metres, so that it becomes a byte >= 0."""
+"""The number that is added to the logarithm of a scale in metres, so that the byte is not
+negative.
+"""
 HARMONIC_STEPS = 128.0
-"""Steps of a byte for 1 of a harmonic, which is 0 at this byte."""
+"""The number of steps of a byte for a change of a harmonic by 1; also the byte of 0."""
 QUATERNION_STEPS = 511
 
 
 class _Header(NamedTuple):
-    """What a file says of itself."""
+    """The fields of a file's header."""
 
     magic: int
     version: int
@@ -83,7 +87,7 @@ class _Header(NamedTuple):
 
     @property
     def widths(self) -> tuple[int, ...]:
-        """Bytes of a Gaussian in each array: positions, opacities, colors, scales, quaternions,
+        """The bytes of a Gaussian in each array: positions, opacities, colors, scales, quaternions,
         harmonics.
         """
         positions = 6 if self.version == 1 else 9
@@ -144,8 +148,8 @@ def _byte(values: Float[np.ndarray, "*b"]) -> UInt8[np.ndarray, "*b"]:
 
 
 def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g"]:
-    """(g,) uint32: the index of the largest of x, y, z, w, then for each of the others a sign and a
-    size out of 1 / sqrt(2).
+    """Returns quaternions packed into uint32, (g,): the index of the largest of x, y, z, w, then a
+    sign and a size for each of the others. Sizes are shares of 1 / sqrt(2).
     """
     xyzw = quats[:, [1, 2, 3, 0]]
     largest = np.argmax(np.abs(xyzw), axis=1)
@@ -167,9 +171,10 @@ def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g
 
 
 def read_spz(data: bytes, said: list[str]) -> Gaussians:
-    """Gaussians of the bytes of a file. said: takes lines.
+    """Returns the Gaussians in the bytes of a `.spz`. Lines about what is left out are appended to
+    `said`.
 
-    Raises: InvalidFileError; what gzip and zstd raise for damaged files.
+    Raises: InvalidFileError; for damaged files also the errors of gzip and zstd.
     """
     if data.startswith(b"NGSP"):
         header, parts = _with_table(data, said)
@@ -213,7 +218,8 @@ def read_spz(data: bytes, said: list[str]) -> Gaussians:
 
 
 def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header:
-    """The header at the start of a file of that many bytes, if it may unpack to what it says.
+    """Returns the header of a file of `size` bytes, after checking that the file may unpack to what
+    it says. start: the first bytes of the file, unpacked.
 
     Raises: InvalidFileError.
     """
@@ -233,7 +239,7 @@ def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header
 
 
 def _of_gzip(data: bytes) -> tuple[_Header, list[bytes]]:
-    """The header and the six arrays of a file of version 1 to 3."""
+    """Returns the header and the six arrays of a file of version 1 to 3."""
     with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
         header = _checked_header(file.read(HEADER.size), (1, 2, 3), len(data))
         sizes = [header.count * width for width in header.widths]
@@ -253,8 +259,11 @@ def _check_size(size: int, header: _Header, more: bool = False) -> None:
 
 
 def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
-    """The header and the six arrays of a file of version 4. What the table says must fit the file
-    and the number of Gaussians before anything is unpacked, so nothing becomes larger than it may.
+    """Returns the header and the six arrays of a file of version 4.
+
+    The table must fit the file and the number of Gaussians before anything is unpacked, so that
+    nothing becomes larger than it may. Lines about records that are not used are appended to
+    `said`.
     """
     header = _checked_header(data, (WITH_TABLE,), len(data))
     begin = HEADER.size + TABLE_PLACE.size
@@ -295,7 +304,7 @@ def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
 
 
 def _records(data: bytes) -> list[str]:
-    """Lists in words the records of other programs."""
+    """Returns a line that lists the records of other programs; no line if there are none."""
     names, at = [], 0
     while at + RECORD.size <= len(data):
         kind, size = RECORD.unpack_from(data, at)
@@ -310,7 +319,10 @@ def _records(data: bytes) -> list[str]:
 
 
 def _unpacked(stream: bytes, size: int) -> bytes:
-    """That many bytes, of a zstd frame. Raises: InvalidFileError for another number; ZstdError."""
+    """Returns the `size` bytes that a zstd frame unpacks to.
+
+    Raises: InvalidFileError for another number of bytes; ZstdError.
+    """
     content = zstd.ZstdDecompressor().decompress(stream, size + 1)
     if len(content) != size:
         raise InvalidFileError(
@@ -321,13 +333,13 @@ def _unpacked(stream: bytes, size: int) -> bytes:
 
 
 def _fixed_point(positions: UInt8[np.ndarray, "g 9"], bits: int) -> Float[np.ndarray, "g 3"]:
-    """Numbers of three bytes each, which are the upper three of four."""
+    """Returns numbers of 3 bytes each as floats. bits: the number of fractional bits."""
     padded = np.pad(positions.reshape(len(positions), 3, 3), ((0, 0), (0, 0), (1, 0)))
     return np.ascontiguousarray(padded).view("<i4")[..., 0] / 2.0 ** (8 + bits)
 
 
 def _smallest_three(packed: UInt8[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
-    """Inverse of `_packed_quaternions`."""
+    """Returns unit quaternions (wxyz) from the 4 bytes that `_packed_quaternions` makes of each."""
     word = np.ascontiguousarray(packed).view("<u4")[:, 0]
     signed = [word >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
     three = np.stack([np.where(part & 512, -1.0, 1.0) * (part & 511) for part in signed], axis=1)

@@ -1,5 +1,5 @@
-"""The layout of the published network's data: lists of scenes with cameras, and the body of each
-frame as arrays.
+"""Reads and writes the layout of the published network's data: lists of scenes with cameras, and
+the body of each frame as arrays.
 
     train.json, test.json   [{"scene_name", "mesh_transform" 4 x 4,
                               "frames": [{"image_path", "w2c" 4 x 4 OpenCV, "fxfycxcy",
@@ -49,13 +49,13 @@ from humangs_jax.io.reading import shown
 
 LISTS = ("train.json", "test.json")
 WHITE = 250 / 255
-"""A pixel with a channel below is the person where there is no mask; 8-bit JPEG images ripple by a
-few levels.
+"""Where there is no mask, a pixel with a channel below this belongs to the person. 8-bit JPEG
+images ripple by a few levels.
 """
 KEPT_FRAMES = 64
 """Poses of a scene that are kept in memory."""
 SIGNIFICANT = 9
-"""Digits of numbers in the lists: those of float32."""
+"""Digits of the numbers in lists, as many as float32 has."""
 
 
 class SceneFrame(NamedTuple):
@@ -74,7 +74,7 @@ class SceneFrame(NamedTuple):
 
 
 def find_scene_list(path: str | Path) -> tuple[Path, ...]:
-    """The path, if it is a list of scenes or a folder that holds one."""
+    """Returns the path if it is a list of scenes or a folder that holds one; else nothing."""
     path = Path(path)
     found = (path.is_file() and path.suffix == ".json") or any(
         (path / name).is_file() for name in LISTS
@@ -83,7 +83,9 @@ def find_scene_list(path: str | Path) -> tuple[Path, ...]:
 
 
 def _list_of(path: str | Path) -> Path:
-    """The JSON file; of a folder train.json, else test.json."""
+    """Returns the JSON file of a list. Of a folder this is train.json, or test.json if there is
+    none.
+    """
     file = Path(path)
     if file.is_dir():
         return next((file / name for name in LISTS if (file / name).is_file()), file / LISTS[0])
@@ -91,8 +93,8 @@ def _list_of(path: str | Path) -> Path:
 
 
 def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
-    """The scenes of a list by name, as they stand in it. path: the JSON file, or a folder
-    (train.json, else test.json).
+    """Read the scenes of a list by name, as they stand in the list. path: the JSON file, or a
+    folder (train.json, else test.json).
 
     Raises: CaptureError naming file and key.
     """
@@ -115,8 +117,8 @@ def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
 def open_scene_list(
     path: str | Path, body: FileBody, size: int | None = None
 ) -> tuple[Person, ...]:
-    """The people of a list, each opened when it is asked for. size: of the stored squares; None:
-    that of the images.
+    """Returns the people of a list. Each is opened when it is first asked for. size: the side of
+    the stored squares, pixels; None: that of the images.
 
     Raises: CaptureError if the list cannot be read.
     """
@@ -143,7 +145,7 @@ def open_scene_list(
 
 
 def _open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) -> Subject:
-    """One scene of a list in metres. Images that are not there are left out and counted.
+    """Open one scene of a list, in metres. Images that do not exist are left out and counted.
 
     Raises: CaptureError.
     """
@@ -189,7 +191,10 @@ def _open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody)
 
 
 def _scene_frames(file: Path, name: str, scene: Mapping[str, Any]) -> list[SceneFrame]:
-    """The frames of a scene, checked. Raises: CaptureError naming file and key."""
+    """Returns the frames of a scene after checking them.
+
+    Raises: CaptureError naming file and key.
+    """
     views, (frames,) = [], members(scene, file, name, frames=list)
     for i, frame in enumerate(frames):
         at = f"{name}.frames[{i}]"
@@ -214,7 +219,9 @@ def _scene_frames(file: Path, name: str, scene: Mapping[str, Any]) -> list[Scene
 def _present(
     file: Path, name: str, scene: Mapping[str, Any]
 ) -> tuple[list[SceneFrame], dict[str, int]]:
-    """Frames whose image and arrays are there, and how many are not."""
+    """Returns the frames whose image and arrays exist, and how many are left out for each
+    reason.
+    """
     views, missing = [], {"no image": 0, "no smpl_path": 0}
     is_there = functools.lru_cache(None)(lambda path: _inside(file, name, path).is_file())
     for view in _scene_frames(file, name, scene):
@@ -246,7 +253,9 @@ def _read_view(
 
 
 def _not_white(image: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the person in an image on white: those below `WHITE`, and what they enclose."""
+    """Returns which pixels of an image on white show the person: those below `WHITE`, and the
+    pixels that these enclose.
+    """
     from scipy.ndimage import binary_fill_holes
 
     return np.asarray(binary_fill_holes(image.min(axis=-1) < WHITE))
@@ -259,7 +268,7 @@ def _not_white(image: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
 def scene_entry(
     name: str, mesh_transform: Float[np.ndarray, "4 4"], frames: Sequence[SceneFrame]
 ) -> dict[str, Any]:
-    """A scene as it stands in a list."""
+    """Returns a scene as it stands in a list."""
     return {
         "scene_name": name,
         "mesh_transform": rounded(mesh_transform),
@@ -277,7 +286,7 @@ def scene_entry(
 
 
 def rounded(array: Float[np.ndarray, "..."]) -> Any:
-    """Nested lists of numbers of `SIGNIFICANT` digits."""
+    """Returns nested lists of the numbers of an array, rounded to `SIGNIFICANT` digits."""
 
     def short(x):
         if isinstance(x, list):
@@ -294,7 +303,7 @@ def write_arrays(
     faces: np.ndarray,
     joint_transforms: Float[np.ndarray, "j 4 4"],
 ) -> None:
-    """The npz of a frame."""
+    """Write the npz of a frame."""
     arrays = {"v_posed": posed, "v_cano": rest, "joint_transforms": joint_transforms}
     write_npz(
         path,
@@ -304,7 +313,10 @@ def write_arrays(
 
 
 def read_evaluation(path: str | Path) -> dict[str, dict[str, list[int]]]:
-    """Context and target views of each scene. Raises: CaptureError naming file and key."""
+    """Read the context and target views of each scene.
+
+    Raises: CaptureError naming file and key.
+    """
     file = Path(path)
     content = checked_json(file)
     for name, views in expect(content, dict, file, "").items():
