@@ -24,13 +24,13 @@ from humangs_jax.rendering.gaussians import Gaussians
 BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
 """The expressions that close the left and the right eye."""
 SMALLEST_OPENING = 0.001
-"""Metres: half of what the lips are apart where the mouth begins to show its inside."""
+"""Half of the distance of the lips at which the mouth begins to show its inside, metres."""
 RIM = 0.3
 """The share of the opening's radius over which its inside fades towards the lips: Gaussians are
 some millimetres wide.
 """
 BEFORE_LIPS = 0.004
-"""Metres in front of the lips, where a tongue is seen whole."""
+"""Metres in front of the lips from which on a point, as of a tongue, is fully seen."""
 
 
 @pytree_dataclass
@@ -40,24 +40,25 @@ class Face(Batchable):
     """
 
     row: Int[Array, " g"]
-    """The row of `expressions.directions` that each Gaussian follows; m: it stays."""
+    """The row of `expressions.directions` that each Gaussian follows; m for Gaussians that stay."""
     eyes: Float[Array, "g 2"]
     """The shares by which each Gaussian belongs to the left and to the right eye, (g, 2), in [0,
     1].
     """
     beside: Int[Array, "m k"]
-    """Rows of the vertices beside each one that moves; m: one that stays."""
+    """The rows of the vertices beside each vertex that moves, (m, k); m for a vertex that stays."""
     stretching: Float[Array, "m k 3"]
-    """The w of each of these, 1 / metres."""
+    """The w of each of these neighbours, (m, k, 3), 1 / metres."""
     hidden_normals: Float[Array, "q 3"]
     """Unit normals of the hidden Gaussians, for the light."""
     hidden_directions: Float[Array, "q 3 e"]
     """How the hidden Gaussians move, (q, 3, e), metres per unit of a coefficient."""
     hidden_shown: Float[Array, "q e"]
-    """How much opacity they get for a unit of a coefficient, (q, e): the sum is clipped to [0, 1].
+    """The opacity that each hidden Gaussian gets for a unit of a coefficient, (q, e). The sum is
+    clipped to [0, 1].
     """
     in_mouth: Float[Array, " q"]
-    """1 for those of the mouth, which are seen between the lips alone; 0 for lids."""
+    """1 for Gaussians of the mouth, which are seen between the lips alone, 0 for lids; (q,)."""
     lips: Float[Array, "4 3"]
     """The inner edges of the upper and the lower lip in the middle, the left and the right corner,
     (4, 3), metres in the T-pose.
@@ -72,16 +73,18 @@ class Face(Batchable):
     """The expressions, as moves of the avatar's rest vertices."""
 
     def select(self, index: Array | np.ndarray) -> "Face":
-        """The face of an avatar with these of its Gaussians."""
+        """Returns the face of an avatar that has the Gaussians at `index` alone."""
         return replace(self, row=self.row[index], eyes=self.eyes[index])
 
     def without_expression(self) -> Float[Array, " e"]:
-        """The coefficients of a face at rest."""
+        """Returns the coefficients of a face at rest, all 0."""
         return jnp.zeros(len(self.expressions.names), self.hidden_shown.dtype)
 
 
 def moved_hidden(face: Face, expression: Float[Array, " e"]) -> Gaussians:
-    """The hidden Gaussians in T-pose, where and as visible as an expression makes them."""
+    """Returns the hidden Gaussians in T-pose, moved by an expression, with opacities by how much it
+    shows them.
+    """
     moves = jnp.einsum("qae,e->qa", face.hidden_directions, expression, precision=EXACT)
     shown = jnp.clip(jnp.einsum("qe,e->q", face.hidden_shown, expression, precision=EXACT), 0, 1)
     means = face.hidden.means + moves
@@ -91,8 +94,8 @@ def moved_hidden(face: Face, expression: Float[Array, " e"]) -> Gaussians:
 
 
 def between_lips(points: Float[Array, "q 3"], lips: Float[Array, "4 3"]) -> Float[Array, " q"]:
-    """How much of each point is seen through the opening of the mouth, an ellipse; all of one
-    before the lips.
+    """Returns how much of each point is seen through the opening of the mouth, in [0, 1]. The
+    opening is an ellipse; a point well in front of the lips is fully seen.
     """
     upper, lower, left, right = lips
     center = (upper + lower) / 2
@@ -109,8 +112,8 @@ def between_lips(points: Float[Array, "q 3"], lips: Float[Array, "4 3"]) -> Floa
 def moved_gaussians(
     face: Face, gaussians: Gaussians, expression: Float[Array, " e"], stretched: bool
 ) -> Gaussians:
-    """The Gaussians of an avatar in T-pose, with an expression; eyes fade as far as their lids
-    close.
+    """Returns the Gaussians of an avatar in T-pose, moved by an expression. Gaussians of eyes fade
+    as far as their lids close. stretched: whether the Gaussians are deformed, too.
     """
     moves = jnp.einsum("mae,e->ma", face.expressions.directions, expression, precision=EXACT)
     moves = jnp.concatenate([moves, jnp.zeros_like(moves[:1])])
@@ -128,7 +131,9 @@ def moved_gaussians(
 
 
 def with_hidden(gaussians: Gaussians, hidden: Gaussians) -> Gaussians:
-    """Both together. hidden: without harmonics or low-pass, which become those of the others."""
+    """Returns the Gaussians and the hidden ones behind them. hidden: has no harmonics and no
+    low-pass; it gets harmonics of 0 and the median low-pass where the others have these.
+    """
     fields = {}
     if gaussians.harmonics is not None:
         shape = (len(hidden.means), *gaussians.harmonics.shape[1:])

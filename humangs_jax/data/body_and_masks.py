@@ -1,8 +1,8 @@
-"""The posed body against the masks: which views show the person.
+"""Compares the posed body with the masks, to find out which views show the person.
 
-A mask that is empty, or nowhere near the body, does not only say nothing: the network takes its
-white photo for the person, and refinement makes the avatar transparent there. All that reads photos
-leaves such views out, by name. All on the host, by numpy: nothing is compiled.
+A mask that is empty, or nowhere near the body, does harm: the network takes its white photo for the
+person, and refinement makes the avatar transparent there. All that reads photos leaves such views
+out, by name. All of this runs on the host, by numpy: nothing is compiled.
 """
 
 import logging
@@ -51,10 +51,10 @@ def report_left_out(names: Sequence[str], reasons: dict[int, str]) -> None:
 
 
 def views_without_person(capture: Capture) -> dict[int, str]:
-    """The views whose mask is empty or hardly meets what of the posed body is in the frame, and
-    which of the two.
+    """Returns the views that do not show the person, with the reason: the mask is empty, or it
+    hardly meets the part of the posed body in the frame.
 
-    A body that is not finite is another fault, which whoever poses it names.
+    A body that is not finite is another fault, which is reported where the body is posed.
     """
     found = dict.fromkeys(empty_views(capture.masks), "the mask is empty")
     if capture.masks is None or len(found) == capture.view_count:
@@ -80,7 +80,7 @@ def views_without_person(capture: Capture) -> dict[int, str]:
 
 
 def empty_views(masks: Float[np.ndarray, "v h w"] | None) -> list[int]:
-    """The views whose mask shows nobody."""
+    """Returns the views whose mask shows nobody."""
     if masks is None:
         return []
     return [i for i, mask in enumerate(masks) if not (np.asarray(mask) > MASK_THRESHOLD).any()]
@@ -97,8 +97,8 @@ def surface_points(
     frames: Int[np.ndarray, " v"],
     count: int,
 ) -> dict[int, Float[np.ndarray, "count 3"]]:
-    """Points spread evenly over the skin, metres, by the frames that views show; without pose
-    correctives.
+    """Returns points spread evenly over the skin, metres, for each frame that a view shows. Pose
+    correctives are left out.
     """
     rest = shaped(body, betas)
     joints = np.asarray(body.joint_regressor) @ rest
@@ -114,7 +114,7 @@ def surface_points(
 
 
 def shaped(body: BodyModel, betas: Float[np.ndarray, " s"]) -> Float[np.ndarray, "n 3"]:
-    """The vertices of the person's body in the T-pose."""
+    """Returns the vertices of the person's body in the T-pose, metres."""
     betas = np.asarray(betas, float)
     return (
         np.asarray(body.template, float)
@@ -130,10 +130,11 @@ def skinned(
     weights: Float[np.ndarray, "n j"],
     corrected: bool = False,
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """Matrices and offsets from the rest pose to a frame, of vertices with these skinning weights.
+    """Returns the matrices and the offsets (metres) that take vertices with some skinning weights
+    from the rest pose to a frame.
 
-    joints: of the rest pose. corrected: with the body's pose correctives, if it has some; weights
-    are those of all vertices.
+    joints: the joints of the rest pose, metres. corrected: whether the body's pose correctives are
+    added, if it has some; then `weights` has to be those of all vertices.
     """
     turns = Rotation.from_rotvec(np.asarray(poses.rotations)[frame].astype(float)).as_matrix()
     world, places = posed_tree(turns, bones_of(joints, body.parents), body.parents)
@@ -155,7 +156,9 @@ def points_in_image(
     width: int,
     height: int,
 ) -> Float[np.ndarray, "q 2"]:
-    """Where a camera sees the points, pixels; those that it does not see are left out."""
+    """Returns the pixels at which a camera sees the points; points that it does not see are left
+    out.
+    """
     seen = points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
     seen = seen[seen[:, 2] > 1e-6]
     pixels = (K @ (seen / seen[:, 2:]).T)[:2].T

@@ -1,4 +1,5 @@
-"""What a folder holds: the photos that are used, and what is not used, each file with the reason.
+"""Finds the photos of a folder that are used, and the files that are not used, each with the
+reason.
 
 Every command that looks for photos asks `scan_folder`, so that all of them take the same files and
 can say what they leave out. Names that begin with a dot are no photos: macOS writes `._IMG_1.jpg`
@@ -35,13 +36,13 @@ OTHER_PICTURES = (
 )
 """Pictures that are not read, but that somebody may take for photos."""
 RAW_PICTURES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
-"""What cameras write besides JPEG."""
+"""File types of raw pictures, which cameras write besides JPEG and which are not read."""
 OTHER_VIDEOS = (".webm", ".mts", ".m2ts", ".3gp", ".wmv", ".mpg")
 """Videos that are not read."""
 SYSTEM_FOLDERS = ("__MACOSX", "@eaDir")
 """Folders of previews, which archives of macOS and disks of Synology have."""
 NAMES_SHOWN = 3
-"""How many files of each unused kind are named."""
+"""The number of files of each unused kind that are named."""
 
 _WORDS = "(?:masks?|mattes?|alpha|silhouettes?|seg|segmentation)"
 _MASK_BEHIND = re.compile(rf"(?P<photo>.+?)[._ -]+{_WORDS}", re.IGNORECASE)
@@ -50,12 +51,12 @@ _MASK_BEFORE = re.compile(rf"{_WORDS}[._ -]+(?P<photo>.+)", re.IGNORECASE)
 
 @dataclasses.dataclass(frozen=True)
 class Reason:
-    """Why files are not used, as in "2 videos beside photos"."""
+    """The reason why files are not used, as in "2 videos beside photos"."""
 
     noun: str
-    """What the files are, singular."""
+    """The kind of the files, in the singular."""
     because: str
-    """The rest of the phrase."""
+    """The rest of the phrase, behind the kind."""
 
 
 CLIP = Reason("video", "beside photos")
@@ -79,7 +80,7 @@ class Unused:
 
 @dataclasses.dataclass(frozen=True)
 class FolderScan:
-    """The photos in a folder and in the folders in it, and what is not used."""
+    """The photos in a folder and its subfolders, and the files that are not used."""
 
     folder: Path
     """The folder that was searched."""
@@ -90,15 +91,16 @@ class FolderScan:
     among them.
     """
     masks: tuple[Path, ...] = ()
-    """The masks of the photos in the same folder, where each photo has one; else these are unused.
+    """The masks of the photos, where each photo has one in its folder. If only some photos have
+    masks, the masks are unused.
     """
 
 
 def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False) -> FolderScan:
-    """The photos of a folder, and what it holds besides.
+    """Find the photos of a folder and its subfolders, and the files that are not used.
 
-    Arguments: skip: whether a folder in it is of something else than photos.
-    Raises: CaptureError if the folder cannot be read.
+    Arguments: skip: whether a subfolder holds something else than photos. Raises: CaptureError if
+    the folder cannot be read.
     """
     if not folder.is_dir():
         return FolderScan(folder, ())
@@ -142,9 +144,9 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
 
 
 def photos_in(folder: Path) -> dict[str, Path]:
-    """Name without suffix -> photo, of the photos that lie in a folder itself.
+    """Returns the photos that lie directly in a folder, by their names without suffix.
 
-    Of several photos with one name that of the first of `PHOTO_SUFFIXES` is taken.
+    Of several photos with one name, the one with the first suffix of `PHOTO_SUFFIXES` is taken.
     """
     if not folder.is_dir():
         return {}
@@ -164,18 +166,18 @@ def photos_in(folder: Path) -> dict[str, Path]:
 
 
 def is_photo(path: Path) -> bool:
-    """Whether a file is called like a photo."""
+    """Returns whether the name of a file is that of a photo."""
     return path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".")
 
 
 def is_video(path: Path) -> bool:
-    """Whether a file is called like a video."""
+    """Returns whether the name of a file is that of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
 
 
 def photo_of_mask(name: str) -> str | None:
-    """The name of the photo that the name of a mask tells, perhaps without suffix; None if it does
-    not say "mask".
+    """Returns the name of the photo that the name of a mask contains, perhaps without suffix; None
+    if the name is not that of a mask.
 
     "1.jpg.mask.png" and "mask_1.jpg.png" are masks of "1.jpg", "1_mask.png" and "1-matte.png" of
     "1".
@@ -186,8 +188,8 @@ def photo_of_mask(name: str) -> str | None:
 
 
 def _masks_beside(pictures: Iterable[Path]) -> dict[Path, Path]:
-    """Mask -> photo, of pictures that are called like the mask of another one in the same
-    folder.
+    """Returns the photo of each mask. A picture is a mask if its name is that of the mask of
+    another picture in the same folder.
     """
     pictures = list(pictures)
     named: dict[tuple[Path, str], Path] = {}
@@ -203,8 +205,8 @@ def _masks_beside(pictures: Iterable[Path]) -> dict[Path, Path]:
 
 
 def unused_line(unused: Iterable[Unused]) -> str | None:
-    """What is not used, with numbers, reasons and the first names, in one line; None for
-    nothing.
+    """Returns one line with the numbers, the reasons and the first names of the files that are not
+    used; None if there are none.
     """
     groups: dict[Reason, list[str]] = {}
     for each in unused:

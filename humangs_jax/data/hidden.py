@@ -1,4 +1,4 @@
-"""Where something in front of the person makes a hole in a mask: a chair, a table, a bicycle.
+"""Finds things in front of the person that make a hole in a mask: a chair, a table, a bicycle.
 
 A mask says where the person is seen. Where the posed body lies well inside of the photo and the
 mask has a hole or ends, something is in front, or the mask is wrong: the photo says nothing there.
@@ -27,39 +27,49 @@ from humangs_jax.data.vertex_offsets import silhouette
 from humangs_jax.io.images import resized
 
 LONGEST = 512
-"""Pixels: longest side of the photos in which silhouettes are compared."""
+"""Longest side of the photos in which silhouettes are compared, pixels."""
 INSIDE = 0.035
-"""Metres inside the edge of the silhouette from which on a pixel is expected on the mask: poses and
-shapes of fits are off by less."""
+"""Metres inside the edge of the silhouette from which on the mask should show the person. Poses and
+shapes of fits are off by less.
+"""
 THICK = 0.015
-"""Metres: half of the least thickness of what is expected and not there. With `INSIDE`, arms and
-the gap between arm and trunk are too thin for it."""
+"""Half of the least thickness of a hole, metres. With `INSIDE`, arms and the gap between arm and
+trunk are too thin for holes.
+"""
 AREA = 0.005
-"""Square metres: the least area of it."""
+"""The least area of a hole, square metres."""
 EDGE = 0.01
-"""Metres inside the edge of the silhouette up to which a hole reaches that was found further in."""
+"""Metres inside the edge of the silhouette up to which a hole is extended that was found further
+inside.
+"""
 RIM = 0.03
-"""Metres by which a hole is enlarged: clothes are in front of it as well, and the mask's edge
-beside it shows colors of what is in front."""
+"""Metres by which a hole is enlarged. The thing in front hides clothes as well, and the mask's edge
+beside it shows its colors.
+"""
 INTO_MASK = 0.008
-"""Metres of `RIM` that count within the mask."""
+"""Metres of `RIM` that reach into the mask."""
 LOOSE = 0.04
 """Metres outside the silhouette up to which the mask may show clothes and hair."""
 NEARBY = 0.25
 """Metres around a hole in which the mask may not show the person beside the body."""
 BESIDE = 0.35
-"""Most area of the person beside the body there, of that of the hole: more is the same part of the
-body, in another pose."""
+"""The largest area of the person beside the body near a hole, as a share of the area of the hole.
+With more, the hole is a part of the body that has another pose.
+"""
 AGREES = 0.75
-"""Least share of the mask that lies on the body: else the body is not where the person is."""
+"""The least share of the mask that lies on the body. With less, the body is not where the person
+is.
+"""
 SHOWN = 0.3
-"""Least share of the body's silhouette that the mask shows: else most of it is a guess."""
+"""The least share of the body's silhouette that the mask shows. With less, most of the body would
+be a guess.
+"""
 
 
 def with_hidden_parts(capture: Capture) -> Capture:
-    """The capture with those pixels unknown where something is in front of the posed body.
+    """Returns the capture with those pixels unknown where something is in front of the posed body.
 
-    The same object where there are none, and without masks.
+    Returns the same object if there are no such pixels, or no masks.
     """
     found = hidden_parts(capture)
     if found is None:
@@ -77,8 +87,8 @@ def with_hidden_parts(capture: Capture) -> Capture:
 
 
 def hidden_line(before: Capture, after: Capture) -> str | None:
-    """A line that names the photos in which `with_hidden_parts` has found something; None for
-    none.
+    """Returns a line that names the photos in which `with_hidden_parts` has found something; None
+    if there are none. before, after: the capture before and after that call.
     """
     if after.unknown is None:
         return None
@@ -93,8 +103,8 @@ def hidden_line(before: Capture, after: Capture) -> str | None:
 
 
 def hidden_parts(capture: Capture) -> Bool[np.ndarray, "v h w"] | None:
-    """Where something is in front of the posed body in each photo, and is not unknown already; None
-    where nothing is found.
+    """Returns the pixels of each photo at which something is in front of the posed body and which
+    are not unknown already; None if nothing is found.
     """
     if capture.masks is None:
         return None
@@ -118,7 +128,7 @@ def hidden_parts(capture: Capture) -> Bool[np.ndarray, "v h w"] | None:
 def _hidden_part(
     capture: Capture, view: int, vertices: Float[np.ndarray, "n 3"], faces: np.ndarray
 ) -> Bool[np.ndarray, "h w"]:
-    """`hidden_parts` of one photo. Arguments: vertices: of the posed body, metres."""
+    """Returns `hidden_parts` of one photo. vertices: those of the posed body, metres."""
     assert capture.masks is not None
     height, width = capture.masks.shape[1:]
     scale = min(1.0, LONGEST / max(height, width))
@@ -168,7 +178,7 @@ def _hidden_part(
 
 
 def _opened(where: Bool[np.ndarray, "h w"], radius: float) -> Bool[np.ndarray, "h w"]:
-    """The union of the discs of a radius, in pixels, that fit into the True pixels."""
+    """Returns the union of the discs of a radius, in pixels, that fit into the True pixels."""
     inner = ndimage.distance_transform_edt(where) > radius
     if not inner.any():
         return inner

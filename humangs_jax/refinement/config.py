@@ -1,4 +1,4 @@
-"""Settings of refinement: how long, what is compared, how fast each parameter moves, what holds it
+"""Settings of refinement: its length, its loss, the rate of each parameter, and what holds changes
 back.
 """
 
@@ -22,12 +22,14 @@ from humangs_jax.core.configuration import (
 
 MEASURED = "refinement.md"
 ITERATIONS = 4
-"""As many as the learned update was trained with; docs/tradeoff.md has what each gains."""
+"""The number of iterations with which the learned update was trained. docs/tradeoff.md says what
+each gains.
+"""
 
 HEAD = ("head", "jaw", "eye")
 """Parts of the names of the head's joints."""
 HEAD_STEPS = 500
-"""They take 4 s of one core, for photos of 512 pixels."""
+"""Default number of steps on the head. They take 4 s of one core, for photos of 512 pixels."""
 
 
 @configuration

@@ -1,5 +1,5 @@
-"""Detail where people look: steps on the head, or another region, alone, in crops of the photos
-around it.
+"""Refines the head, or another region, alone, by steps on crops of the photos around it: people
+look there for detail.
 
 Only Gaussians of the head move; those around it are drawn. Colors are compared inside of the masks,
 and alpha beyond a mask costs more than in steps on the whole person, so that little coverage grows
@@ -39,48 +39,53 @@ from humangs_jax.refinement.steps import RefineState, started, update
 from humangs_jax.rendering.splat_config import SplatConfig
 
 LEAST_SIDE = 512
-"""Pixels of the photos' longer side from which heads show more than the iterations leave."""
+"""The least longer side of photos for steps on the head, pixels. From it on heads show more detail
+than the iterations reach.
+"""
 LARGEST_HEAD = 112
-"""Pixels: photos are reduced until heads are no larger."""
+"""The largest side of a head in pixels. Photos are reduced until heads are no larger."""
 LOOK = 1024
-"""Pixels of the photos' longer side in which heads are looked for, at most; crops are of photos of
-twice that at most.
+"""The largest longer side of the photos in which heads are looked for, pixels. Crops are made of
+photos of at most twice this side.
 """
 SIDES = 32
 """Sides of the crops are multiples of it, pixels."""
 SIMILAR = 1.25
-"""Photos are reduced anew where heads are smaller or larger by more."""
+"""Photos are reduced again if the heads in them are smaller or larger than wanted by more than this
+factor.
+"""
 EXCESS = 1.0
-"""Weight of alpha beyond the mask."""
+"""Weight of alpha beyond the mask in the loss."""
 OPAQUE = 0.1
-"""Gaussians of the head above this opacity are to be in the crops."""
+"""Gaussians of the head with more opacity than this have to lie in the crops."""
 OUTLIERS = 1.0
-"""Percent of them, at each side, that need not be."""
+"""Percent of these Gaussians, at each side, that may lie outside of the crops."""
 FAR = 1e4
-"""Pixels: bound of places outside of photos."""
+"""Bound of the coordinates of points outside of photos, pixels."""
 PARTS = 10
-"""The parts of a run; between them it can be interrupted."""
+"""The number of parts of a run; it can be interrupted between them."""
 
 
 class Crops(NamedTuple):
-    """Crops of the photos around the head, and the Gaussians that they are about."""
+    """Crops of the photos around the head, and the Gaussians that they show."""
 
     moved: Bool[np.ndarray, " g"]
-    """Which Gaussians are those of the head, (g,)."""
+    """Which Gaussians belong to the head, (g,)."""
     drawn: Int[np.ndarray, " d"]
-    """The indices of those that the crops show, (d,)."""
+    """The indices of the Gaussians that the crops show, (d,)."""
     views: SubjectViews
     """The crops."""
     finer: bool
-    """Whether the crops have smaller pixels than the other steps have seen."""
+    """Whether the crops have smaller pixels than the photos of the other steps."""
     splat: SplatConfig
-    """How they are drawn, with buffers."""
+    """How the crops are drawn, with buffers."""
 
 
 def shows_heads(capture: Capture, config: RefineConfig) -> bool:
-    """Whether photos are large enough for steps on the head, and heads where they are to be: with
-    cameras that were found from the person and one pose for all photos they are centimetres off.
-    That blurs a face, and the steps would fit the blur. A pose for each photo takes it away.
+    """Returns whether photos are large enough for steps on the head, and heads are in their places.
+
+    If the cameras were found from the person and all photos share one pose, heads are centimetres
+    off. That blurs a face, and the steps would fit the blur. A pose for each photo avoids this.
     """
     longest = max(capture.images.shape[1:3])
     in_place = capture.calibrated or capture.frame_count >= capture.view_count > 1
@@ -90,9 +95,10 @@ def shows_heads(capture: Capture, config: RefineConfig) -> bool:
 def sharpened(
     avatar: Avatar, trust: Float[Array, " g"], crops: Crops, config: RefineConfig, clock: Clock
 ) -> Avatar:
-    """The avatar after `config.head_steps` steps on its head; 0 steps compile all that others need.
+    """Returns the avatar after `config.head_steps` steps on its head. A call with 0 steps compiles
+    all programs that calls with more steps need.
 
-    avatar: with the low-pass of the photos. trust: see `RefineState`.
+    avatar: has the low-pass of the photos. trust: see `RefineState`.
     """
     count, settings = config.head_steps, dataclasses.replace(config, **HOST_SETTINGS)
     # the Gaussians that the crops show; no step is made yet, all programs are compiled
@@ -134,7 +140,7 @@ def _advanced(
     settings: RefineConfig,
     clock: Clock,
 ) -> RefineState:
-    """The state at step `stop`, with buffers in which all fits."""
+    """Returns the state at step `stop`, with buffers that have room for everything."""
 
     def advanced(splat: SplatConfig) -> tuple[RefineState, Array]:
         begin = replace(state, splat=splat, overflow=from_host(0, np.int32))
@@ -148,7 +154,9 @@ def _advanced(
 def _steps(
     state: RefineState, photos: Photo, avatar: Avatar, stop: Int[Array, ""], config: RefineConfig
 ) -> RefineState:
-    """The state at step `stop`, one photo a step, in turns; its overflow is that of all steps."""
+    """Returns the state at step `stop`. Each step takes one photo, in turns. The overflow of the
+    result is the sum over these steps.
+    """
 
     def one(state: RefineState) -> RefineState:
         photo = jax.tree.map(lambda x: x[state.done % len(photos.image)], photos)
@@ -162,7 +170,9 @@ def _steps(
 
 
 def head_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
-    """`image_loss` of the colors inside the mask, and what alpha exceeds the mask by."""
+    """Returns `image_loss` of the colors inside the mask, plus the weighted mean of what alpha
+    exceeds the mask by.
+    """
     rgb = photo.image + photo.mask[..., None] * (image[0] - photo.image)
     return image_loss((rgb, image[1]), photo, config) + EXCESS * jnp.mean(
         jnp.maximum(image[1] - photo.mask, 0)
@@ -170,7 +180,9 @@ def head_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
 
 
 def head_crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) -> Crops | None:
-    """Crops of the photos around the region; None if the body has none or no photo shows it."""
+    """Returns crops of the photos around the region; None if the body has no such region or no
+    photo shows it.
+    """
     # the Gaussians that the joints of the region move; faint ones may lie outside of the crops
     columns = [
         i
@@ -219,12 +231,16 @@ def head_crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) ->
 
 
 def _power(number: int) -> int:
-    """The power of two that is not smaller: few numbers are few programs."""
+    """Returns the least power of two that is not below a number. Fewer different numbers need fewer
+    programs.
+    """
     return 1 << max(0, number - 1).bit_length()
 
 
 def _pixels(avatar: Avatar, views: SubjectViews) -> Float[np.ndarray, "v g 2"]:
-    """Where the views show the centres of the Gaussians; those behind a camera: far outside."""
+    """Returns the pixels at which the views show the centres of the Gaussians; infinity for those
+    behind a camera.
+    """
     found = []
     for rotations, translation, camera in zip(
         views.rotations, views.translations, views.cameras, strict=True
@@ -240,8 +256,8 @@ _projected = jax.jit(project)
 def _squares(
     pixels: Float[np.ndarray, "v g 2"], views: SubjectViews
 ) -> tuple[Int[np.ndarray, " s"], Float[np.ndarray, "v 2"], int]:
-    """The views that show most of the points; (y, x) of the middles of the squares that these fill,
-    and the largest side.
+    """Returns the views that show most of the points, the middles (y, x) of the squares that the
+    points fill in each view, and the largest side of these squares; pixels.
     """
     low, high = np.percentile(np.clip(pixels, -FAR, FAR), (OUTLIERS, 100 - OUTLIERS), axis=1)[
         ..., ::-1

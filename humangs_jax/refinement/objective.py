@@ -1,5 +1,5 @@
-"""What refinement moves and what it minimises: unconstrained Gaussians, and the difference of their
-renderings from the photos.
+"""The parameters that refinement moves and the loss that it minimises: unconstrained Gaussians, and
+the difference of their renderings from the photos.
 
 The Gaussians are skinned to the pose of each photo, so the photos may show different poses. All
 functions are of one photo, pure, and pieces of few programs: a run on the host compiles one
@@ -55,28 +55,30 @@ jax.tree_util.register_static(
 
 @runtime_checkable
 class Compiled(Protocol[P, T_co]):
-    """What `compiled` returns: a function that can also be compiled before it is called."""
+    """The type of what `compiled` returns: a function that can also be compiled before it is
+    called.
+    """
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T_co:
-        """The result."""
+        """Returns the result of the function."""
         ...
 
     def __hash__(self) -> int:
-        """Of the function."""
+        """Returns the hash of the function."""
         ...
 
     def lower(self, *args: Any) -> Any:
-        """The program for such arguments, as the function of `jax.jit` lowers it."""
+        """Returns the program for these arguments, as the function of `jax.jit` lowers it."""
         ...
 
     def eval_shape(self, *args: Any) -> Any:
-        """The shapes of the result."""
+        """Returns the shapes of the result."""
         ...
 
 
 def compiled(function: Callable[P, T]) -> Compiled[P, T]:
-    """Decorator: compiles the function where it is called with arrays; inside of a transformation
-    it becomes a part of that program.
+    """Decorator that compiles a function when it is called with arrays. Inside of a transformation
+    the function becomes a part of the transformed program.
 
     Parameters named config and splat are static.
     """
@@ -111,13 +113,14 @@ def compiled(function: Callable[P, T]) -> Compiled[P, T]:
 
 
 PullBack = Callable[[Image], tuple[UnconstrainedGaussians, Float[Array, " g"]]]
-"""From the gradient with respect to an image to those with respect to the parameters, and to the
-brightness of each Gaussian.
+"""A function from the gradient with respect to an image to the gradients with respect to the
+parameters and to the brightness of each Gaussian.
 """
 
 
 def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """What refinement moves: inverse of `gaussians_of`, as far as `unconstrain` is one.
+    """Returns the parameters that refinement moves. It is the inverse of `gaussians_of`, as far as
+    `unconstrain` has an inverse.
 
     Raises: ValueError for harmonics.
     """
@@ -135,7 +138,7 @@ def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
 def gaussians_of(
     parameters: UnconstrainedGaussians, pixel_footprint: Float[Array, " g"] | None
 ) -> Gaussians:
-    """The Gaussians that the parameters stand for, with a low-pass on top of their scales."""
+    """Returns the Gaussians of some parameters, with a low-pass added to their scales."""
     gaussians = constrain(parameters)
     return replace(
         gaussians,
@@ -145,7 +148,7 @@ def gaussians_of(
 
 
 def avatar_of(parameters: UnconstrainedGaussians, avatar: Avatar) -> Avatar:
-    """The avatar with the Gaussians that the parameters stand for."""
+    """Returns the avatar with the Gaussians of some parameters."""
     return replace(avatar, gaussians=gaussians_of(parameters, avatar.gaussians.pixel_footprint))
 
 
@@ -154,7 +157,7 @@ def avatar_of(parameters: UnconstrainedGaussians, avatar: Avatar) -> Avatar:
 
 
 def posed_gaussians(parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo) -> Gaussians:
-    """The Gaussians in the pose of a photo."""
+    """Returns the Gaussians of some parameters in the pose of a photo."""
     return skin(avatar_of(parameters, avatar), BodyPose(photo.rotations, photo.translation))
 
 
@@ -162,7 +165,9 @@ def posed_gaussians(parameters: UnconstrainedGaussians, avatar: Avatar, photo: P
 def drawn_photo(
     parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo, splat: SplatConfig
 ) -> tuple[Image, PullBack, Rendering]:
-    """The image of a photo, its pull-back, and all that was rendered."""
+    """Draws the avatar as a photo shows it. Returns the image, the pull-back of its gradients, and
+    the whole rendering.
+    """
 
     def draw(parameters, brightness):
         gaussians = posed_gaussians(parameters, avatar, photo)
@@ -176,12 +181,13 @@ def drawn_photo(
 
 @compiled
 def pulled(pull_back: PullBack, image: Image) -> tuple[UnconstrainedGaussians, Float[Array, " g"]]:
-    """`pull_back` of an image, as a program."""
+    """Returns the pull-back of an image, as a compiled program."""
     return pull_back(image)
 
 
 def image_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
-    """Loss of a photo: L1 of colors, structural dissimilarity, L1 of coverage; means over the crop.
+    """Returns the loss of an image against a photo: the weighted sum of the L1 distance of colors,
+    the structural dissimilarity and the L1 distance of coverage. Each is a mean over the crop.
 
     A pixel that does not count takes the photo's value, so that it contributes nothing anywhere.
     """
@@ -196,13 +202,13 @@ def image_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
 
 @compiled
 def loss_gradient(image: Image, photo: Photo, config: RefineConfig) -> Image:
-    """Gradient of `image_loss` with respect to the image."""
+    """Returns the gradient of `image_loss` with respect to the image."""
     return jax.grad(image_loss)(image, photo, config)
 
 
 @pytree_dataclass
 class Comparison:
-    """Comparison of an avatar with a photo (or with each of some, leading axis v)."""
+    """The comparison of an avatar with a photo, or with each of several photos (leading axis v)."""
 
     loss: Float[Array | np.ndarray, "*v"]
     """The loss, see `image_loss`."""
@@ -216,7 +222,9 @@ class Comparison:
     """The (splat, tile) pairs that the buffers had no room for."""
 
     def together(self) -> "Comparison":
-        """With all photos: the mean loss, sums of the errors, the largest visibility."""
+        """Returns one comparison with all photos: the mean loss, the sums of the errors, and the
+        largest visibility.
+        """
         xp: Any = np if isinstance(self.loss, np.ndarray) else jnp
         sums = [xp.sum(x) for x in (self.squared, self.pixels)]
         most = xp.max(self.visibility, axis=0)
@@ -225,7 +233,7 @@ class Comparison:
 
     @property
     def psnr(self) -> Float[Array, "*v"]:
-        """Over the pixels that count, dB."""
+        """The PSNR over the pixels that count, dB."""
         return _psnr(self.squared, self.pixels)
 
 
@@ -241,7 +249,7 @@ def compare(
     config: RefineConfig,
     splat: SplatConfig,
 ) -> Comparison:
-    """Comparison with a photo."""
+    """Returns the comparison of Gaussians with a photo."""
     splat = dataclasses.replace(splat, visibility=True)
     image, _, rendering = drawn_photo(parameters, avatar, photo, splat)
     return compared(image, rendering, photo, config)
@@ -249,7 +257,7 @@ def compare(
 
 @compiled
 def compared(image: Image, rendering: Rendering, photo: Photo, config: RefineConfig) -> Comparison:
-    """`compare`, from the image of the photo."""
+    """Returns the comparison of an image with a photo. rendering: the rendering of this image."""
     squared = jnp.mean(jnp.square(jnp.clip(image[0], 0, 1) - photo.image), axis=-1)
     assert rendering.visibility is not None
     errors = image_loss(image, photo, config), jnp.sum(squared * photo.counted)

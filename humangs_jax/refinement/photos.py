@@ -1,5 +1,5 @@
-"""The photos that refinement compares with: cut to the person, reduced, with the pixels that are
-held out.
+"""Prepares the photos that refinement compares with: they are cut to the person and reduced, and
+some pixels are held out.
 """
 
 from collections.abc import Sequence
@@ -17,11 +17,11 @@ from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 
 MARGIN = 8
-"""Pixels around the mask: the window of structural similarity has 11, and Gaussians beyond the
-silhouette cost alpha there.
+"""Pixels around the mask that a crop contains. The window of structural similarity has 11 pixels,
+and Gaussians beyond the silhouette cost alpha there.
 """
 MULTIPLE = 16
-"""Sides of crops are multiples of it, so that few sizes are compiled."""
+"""Sides of crops are multiples of this number of pixels, so that few sizes are compiled."""
 COVERED = 0.02
 """Coverage from which a pixel counts as the person's."""
 BLOCK = 8
@@ -47,8 +47,8 @@ class Photo(Batchable):
 
 
 def photos_of(views: SubjectViews) -> Photo:
-    """The views of a person as a batch of photos, whose pixels count unless somebody may hide
-    the person there.
+    """Returns the views of a person as a batch of photos. Pixels count unless somebody may hide the
+    person there.
     """
     counted = from_host(np.ones(views.masks.shape, bool))
     if views.unknown is not None:
@@ -58,7 +58,8 @@ def photos_of(views: SubjectViews) -> Photo:
 
 
 def crop_to_person(photos: PreparedCapture, image_size: int | None = None) -> SubjectViews:
-    """The photos, cut to the person by windows of one size, with the cameras that see the windows.
+    """Returns the photos cut to the person by windows of one size, with cameras that see these
+    windows.
 
     Photos whose longer side exceeds `image_size` are reduced to it.
 
@@ -94,8 +95,8 @@ def windows(
     cameras: Camera,
     boxes: Sequence[Sequence[Sequence[int]]],
 ) -> tuple[Float[Array, "v rows columns 3"], Float[Array, "v rows columns"], Camera]:
-    """Windows of one size around a box in each view, ((top, bottom), (left, right)), and the
-    cameras that see them.
+    """Returns windows of one size around the box of each view, for images and masks, and cameras
+    that see the windows. boxes: ((top, bottom), (left, right)) of each view, pixels.
     """
     height, width = masks.shape[1:]
     rows, columns = (
@@ -122,7 +123,9 @@ def windows(
 
 
 def held_out_blocks(shape: tuple[int, ...], share: float, seed: int) -> Bool[np.ndarray, "v h w"]:
-    """Which pixels of (v, h, w) no step sees: random blocks, `share` of all."""
+    """Returns which pixels of masks of shape (v, h, w) are held out: random blocks, in all about
+    the share `share`.
+    """
     v, height, width = shape
     blocks = (
         np.random.default_rng(seed).random((v, -(-height // BLOCK), -(-width // BLOCK))) < share
@@ -131,7 +134,9 @@ def held_out_blocks(shape: tuple[int, ...], share: float, seed: int) -> Bool[np.
 
 
 def photo_order(views: Int[np.ndarray, " v"], steps: int, seed: int) -> Int[np.ndarray, " n"]:
-    """The view of each step: all in a new order, again and again."""
+    """Returns the view of each of `steps` steps. All views are taken in a new random order, again
+    and again.
+    """
     rng = np.random.default_rng(seed)
     return np.concatenate(
         [np.zeros(0, int), *(rng.permutation(views) for _ in range(-(-steps // len(views))))]
@@ -139,7 +144,9 @@ def photo_order(views: Int[np.ndarray, " v"], steps: int, seed: int) -> Int[np.n
 
 
 def _bounds(mask: Float[np.ndarray, "h w"]) -> Sequence[Sequence[int]]:
-    """((top, bottom), (left, right)) of the person; the whole image if nobody is in it."""
+    """Returns ((top, bottom), (left, right)) of the person, pixels; those of the whole image if
+    nobody is in it.
+    """
     box = person_box(mask > COVERED).tolist()
     if any(box[0]):
         return box

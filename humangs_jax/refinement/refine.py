@@ -1,5 +1,5 @@
-"""Refinement: the Gaussians of an avatar are fitted to its photos, by iterations of a learned
-update, then by Adam.
+"""Refinement fits the Gaussians of an avatar to its photos, by iterations of a learned update, then
+by Adam.
 
 The learned update moves what no photo shows, too; Adam leaves it where it is. `refine` crops the
 photos, and keeps the best of what `search` finds until its time is over.
@@ -43,7 +43,7 @@ class Refinement:
     iterations: int
     """Iterations of the learned update; 0 if they were not kept."""
     steps: int
-    """Steps of the optimizer, with those of the trial."""
+    """Steps of the optimizer, including those of the trials."""
     seconds: float
     """The time of the run without compilation."""
     compile_seconds: float
@@ -58,7 +58,8 @@ class Refinement:
     interrupted: bool = False
     """Whether Ctrl-C ended the run."""
     planned: int | None = None
-    """`RefineConfig(steps=planned, seconds=None)` repeats the run exactly; None: it was cut short.
+    """`RefineConfig(steps=planned, seconds=None)` repeats the run exactly. None: the run was cut
+    short.
     """
     left_out: tuple[str, ...] = ()
     """Names of photos that contradict the others, and were not fitted."""
@@ -69,7 +70,7 @@ class Refinement:
     them. Then `loss` and `psnr` compare with the moved photos."""
 
     def summary(self) -> str:
-        """One line."""
+        """Returns the report as one line of text."""
         gain = f"{self.psnr[0]:.1f} -> {self.psnr[1]:.1f} dB on the photos"
         verdict = gain if self.kept else "no improvement: the avatar is unchanged"
         if self.left_out:
@@ -225,8 +226,8 @@ def refine_with_report(
 def calls_of_refine(
     avatar: Avatar, capture: Capture | PreparedCapture, config: RefineConfig
 ) -> Iterator[Call]:
-    """The long programs of a refinement, so that they can be compiled before it begins. There are
-    none without iterations or masks.
+    """Yields the long programs of a refinement, so that they can be compiled before it begins.
+    Yields none without iterations or masks.
     """
     photos = prepare_capture(capture)
     if config.iterations and photos.capture.masks is not None:
@@ -234,7 +235,7 @@ def calls_of_refine(
 
 
 def _crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) -> Crops | None:
-    """Crops of the heads in the photos; None where no steps on the head are to be made."""
+    """Returns crops of the heads in the photos; None if no steps on the head are to be made."""
     unlimited = config.seconds is None or config.steps == 0
     if not (config.head_steps and unlimited and shows_heads(photos.capture, config)):
         return None

@@ -1,7 +1,7 @@
-"""Adam's part of refinement: an explicit state, and a step that makes the next one from a photo.
+"""Adam's part of refinement: a state, and a step that makes the next state from a photo.
 
-Everything is a pure function for one person: on the host a few compiled programs, under `jax.jit`
-and `jax.vmap` one.
+Everything is a pure function for one person. On the host it is a few compiled programs, under
+`jax.jit` and `jax.vmap` a single one.
 """
 
 from collections.abc import Callable
@@ -45,17 +45,17 @@ OPTIMIZERS: dict[str, Callable[[], optax.GradientTransformation]] = {
     "rmsprop": optax.scale_by_rms,
     "sgd": optax.identity,
 }
-"""By `RefineConfig.optimizer`."""
+"""The optimizers by their names in `RefineConfig.optimizer`."""
 
 
 @pytree_dataclass
 class RefineState:
-    """All that steps change, and what they know of the run."""
+    """The state of a run of steps, with all that a step needs to know of the run."""
 
     parameters: UnconstrainedGaussians
     """The parameters of the Gaussians."""
     start: UnconstrainedGaussians
-    """The parameters before the first step, which some are pulled towards."""
+    """The parameters before the first step, towards which those in `PULLED` are pulled."""
     trust: Float[Array, " g"]
     """The share of the rates at which a Gaussian moves, (g,), in [0, 1]."""
     moments: PyTree
@@ -75,8 +75,8 @@ class RefineState:
 def init_state(
     parameters: UnconstrainedGaussians, found: Comparison, config: RefineConfig, splat: SplatConfig
 ) -> RefineState:
-    """The state before the first step. found: comparison of the parameters with the photos;
-    Gaussians that no photo shows get no trust.
+    """Returns the state before the first step. found: the comparison of the parameters with the
+    photos; Gaussians that no photo shows get no trust.
     """
     return started(parameters, _trust(from_host(found.visibility), config), config, splat)
 
@@ -87,7 +87,7 @@ def started(
     config: RefineConfig,
     splat: SplatConfig,
 ) -> RefineState:
-    """`init_state`, with a trust that is known."""
+    """Returns the state before the first step, with a given trust, see `RefineState`."""
     none = from_host(0, jnp.int32)
     return RefineState(parameters, parameters, trust, _moments(parameters, config), none, splat)
 
@@ -103,9 +103,9 @@ def _trust(visibility: Float[Array, " g"], config: RefineConfig) -> Float[Array,
 
 
 def step(state: RefineState, photo: Photo, avatar: Avatar, config: RefineConfig) -> RefineState:
-    """The state after one step on a photo.
+    """Returns the state after one step on a photo.
 
-    Where it overflows, it is not to be used: repeat it with larger buffers.
+    If this state has an overflow, repeat the step with larger buffers.
     """
     image, pull_back, rendering = drawn_photo(state.parameters, avatar, photo, state.splat)
     gradient, _ = pulled(pull_back, loss_gradient(image, photo, config))
@@ -116,7 +116,7 @@ def step(state: RefineState, photo: Photo, avatar: Avatar, config: RefineConfig)
 def update(
     state: RefineState, gradient: UnconstrainedGaussians, config: RefineConfig
 ) -> RefineState:
-    """The optimizer's step, with a rate for each parameter.
+    """Returns the state after one step of the optimizer, which has a rate for each parameter.
 
     Adam's steps do not shrink with the gradient, so the trust multiplies the step and not the loss.
     """
@@ -140,8 +140,8 @@ def update(
 def refine_views(
     avatar: Avatar, views: SubjectViews, config: RefineConfig, splat: SplatConfig, steps: int
 ) -> tuple[Avatar, Int[Array, ""]]:
-    """`steps` steps of one photo each, in turns, on all pixels: `refine` without its decisions, for
-    `jax.jit` and `jax.vmap`.
+    """Make `steps` steps of one photo each, in turns, on all pixels. This is `refine` without its
+    decisions, for `jax.jit` and `jax.vmap`.
 
     Static: config (its limits, iterations, `full_steps` and held-out pixels are not used), splat
     (with `max_pairs`, see `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs

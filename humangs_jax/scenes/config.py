@@ -10,27 +10,27 @@ SCENE_SPLAT = SplatConfig(jacobian_margin=0.3)
 whole images.
 """
 Capacity = Annotated[int, Range(1, 100_000_000)]
-"""Of Gaussians."""
+"""A number of Gaussians."""
 
 
 @configuration
 class SceneRates:
-    """Change of each parameter in a step of Adam; those of Kheradmand et al. but for colors,
-    which are no harmonics here.
+    """The change of each parameter in a step of Adam. The rates are those of Kheradmand et al.
+    except for colors, which are no harmonics here.
     """
 
     means: Spread = 1.6e-4
-    """Times the extent of the cameras, metres."""
+    """Rate of the means, metres; it is multiplied by the extent of the cameras."""
     quats: Spread = 1e-3
-    """Of quaternions of any length."""
+    """Rate of the quaternions, which may have any length."""
     log_scales: Spread = 5e-3
-    """Of natural logarithms."""
+    """Rate of the natural logarithms of the scales."""
     opacity_logits: Spread = 5e-2
-    """Of logits."""
+    """Rate of the logits of the opacities."""
     color_logits: Spread = 1e-2
-    """Of logits, whose slope is a quarter in the middle."""
+    """Rate of the logits of the colors, whose slope is a quarter in the middle."""
     harmonics: Spread = 1e-3
-    """Of coefficients, as colors."""
+    """Rate of the coefficients of the harmonics, which have the unit of colors."""
 
 
 @configuration

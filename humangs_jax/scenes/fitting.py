@@ -1,7 +1,8 @@
-"""`fit_scene`: Gaussians of a scene from posed photos, with Adam and the strategy of `scenes.mcmc`.
+"""`fit_scene` fits Gaussians of a scene to posed photos, with Adam and the strategy of
+`scenes.mcmc`.
 
 A scene is an explicit state, whose steps and relocations are pure functions (`scenes.steps`),
-compiled once for each size of photos. Here is the loop around them.
+compiled once for each size of photos. This module has the loop around them.
 """
 
 import os
@@ -41,28 +42,30 @@ from humangs_jax.scenes.steps import (
 )
 
 MARGIN = 2.0
-"""Buffers hold this many times the pairs of the Gaussians at the time of planning: they grow."""
+"""Factor on the number of pairs at the time of planning, which the buffers hold. The number of
+pairs grows.
+"""
 CHECK_EVERY = 25
-"""Steps after which it is looked at whether all pairs did fit."""
+"""Steps after which a check finds out whether all pairs have fit."""
 SAVE_SECONDS = 60.0
 """Seconds between two checkpoints."""
 MARK = "humangs_jax scene"
-"""Tells a checkpoint, whose name may be any, from other files."""
+"""The text that tells a checkpoint, whose name may be any, from other files."""
 
 
 class SceneFit(NamedTuple):
     """What `fit_scene` returns."""
 
     gaussians: Gaussians
-    """The Gaussians of the slots that are used."""
+    """The Gaussians of the used slots."""
     steps: int
-    """The number of steps, those before a continuation included."""
+    """The number of steps, including those before a continuation."""
     seconds: float
-    """The seconds that this call took."""
+    """The time of this call, seconds."""
     psnr: float
     """The mean PSNR of the photos, dB."""
     interrupted: bool
-    """Whether Ctrl-C ended it; the state is in the checkpoint, if there is one."""
+    """Whether Ctrl-C ended the fit. Then the state is in the checkpoint, if there is one."""
 
 
 @checked_arguments
@@ -163,15 +166,15 @@ def fit_scene(
 
 
 def _photo_of_step(step: int, count: int, seed: int) -> int:
-    """Each photo once in every `count` steps, in an order that only the step and the seed
-    decide.
+    """Returns the number of the photo of a step. Each photo is taken once in every `count` steps,
+    in an order that depends on the step and the seed alone.
     """
     epoch, place = divmod(step, count)
     return int(np.random.default_rng([seed, epoch]).permutation(count)[place])
 
 
 def _kind(camera: Camera) -> tuple[Any, ...]:
-    """Cameras of one kind share programs and buffers."""
+    """Returns the kind of a camera. Cameras of one kind share programs and buffers."""
     shape = None if camera.distortion is None else camera.distortion.shape
     return camera.width, camera.height, camera.lens, shape
 
@@ -179,7 +182,7 @@ def _kind(camera: Camera) -> tuple[Any, ...]:
 def _plans(
     gaussians: Gaussians, views: Sequence[Camera], config: SceneConfig
 ) -> dict[tuple[Any, ...], SplatConfig]:
-    """Buffers for the cameras of each kind."""
+    """Returns how images are drawn, with buffers, for the cameras of each kind."""
     kinds: dict[tuple[Any, ...], list[Camera]] = {}
     for camera in views:
         kinds.setdefault(_kind(camera), []).append(camera)
@@ -210,7 +213,7 @@ def _mean_psnr(
 def _about(
     config: SceneConfig, photos: Sequence[np.ndarray], views: Sequence[Camera], start: SceneState
 ) -> str:
-    """What a run depends on, as a checksum."""
+    """Returns a checksum of all that a run depends on."""
     arrays = {f"photo {i}": photo for i, photo in enumerate(photos)}
     for name, tree in (("cameras", list(views)), ("start", start.parameters)):
         arrays |= {f"{name} {i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(tree))}
@@ -223,9 +226,9 @@ def _save(path: str | os.PathLike[str], state: SceneState, about: str) -> None:
 
 
 def _resumed(path: str | os.PathLike[str] | None, state: SceneState, about: str) -> SceneState:
-    """The state of a checkpoint, if there is one.
+    """Returns the state in a checkpoint; the given state if there is no such file.
 
-    Raises: FileError for one of another run, or another file.
+    Raises: FileError for a checkpoint of another run, or another file.
     """
     if path is None or not os.path.exists(path):
         return state

@@ -37,16 +37,16 @@ from humangs_jax.rendering.gaussians import UnconstrainedGaussians, constrain, c
 DEAD = 0.005
 """Opacity at and below which a Gaussian is moved; the paper's."""
 SHARPNESS = 100.0
-"""Of the sigmoid of the opacity by which noise fades around `DEAD`; the paper's."""
+"""Steepness of the sigmoid of the opacity by which noise fades around `DEAD`; the paper's."""
 STEP = 0.1
-"""Distance of the nodes of the integral. The trapezoidal rule converges exponentially there: tests
-compare it with the double sum.
+"""Distance of the nodes of the integral. The trapezoidal rule converges exponentially at this
+distance; tests compare it with the double sum.
 """
 REACH = 5.0
-"""Where the integral ends: exp(-t^2) is below float32's rounding."""
+"""The upper end of the integral, where exp(-t^2) is below float32's rounding."""
 MOST = 1.0 - 1e-6
-"""Opacity from which on one Gaussian is split as if it had this one: (1 - o)^(1/N) of 0 is no
-number to take logarithms of.
+"""The largest opacity that is split; Gaussians above it are split as if they had it. For an opacity
+of 1, (1 - o)^(1/N) is 0 and has no logarithm.
 """
 
 
@@ -58,15 +58,17 @@ class Relocated(NamedTuple):
     used: Bool[Array, " g"]
     """Which slots hold a Gaussian, (g,)."""
     moved: Bool[Array, " g"]
-    """Whether the Gaussian of each slot is another one than before, (g,); the optimizer forgets
-    what it knew of it.
+    """Which slots hold another Gaussian than before, (g,). The optimizer forgets what it knew of
+    these.
     """
 
 
 def divided(
     opacity_logits: Float[Array, " g"], copies: Float[Array, " g"]
 ) -> tuple[Float[Array, " g"], Float[Array, " g"]]:
-    """Logits of the opacities o' of N = `copies` Gaussians that look as one, and s' / s."""
+    """Returns the logits of the opacities o' of N = `copies` Gaussians that together look as one,
+    and the ratio s' / s of their scales.
+    """
     logits = jnp.minimum(opacity_logits, math.log(MOST / (1 - MOST)))
     depth = jax.nn.softplus(logits) / copies  # -log(1 - o')
     opacity = -jnp.expm1(-depth)
@@ -84,8 +86,8 @@ def mcmc_relocate(
     used: Bool[Array, " g"],
     count: Int[Array, ""] | int | None = None,
 ) -> Relocated:
-    """Move dead Gaussians onto others that are seen, and use more slots, up to `count` of them;
-    nothing changes its look.
+    """Move dead Gaussians onto Gaussians that are seen, and use more slots, up to `count`. The
+    scene looks the same afterwards.
 
     Args:
         key: of `jax.random`.
@@ -129,7 +131,7 @@ def mcmc_relocate(
 
 
 def _like(mask: Bool[Array, " g"], leaf: Array) -> Array:
-    """The mask with the axes of another array."""
+    """Returns the mask with axes added, so that it broadcasts with another array."""
     return mask.reshape(mask.shape + (1,) * (leaf.ndim - 1))
 
 
@@ -140,8 +142,8 @@ def mcmc_noise(
     used: Bool[Array, " g"],
     rate: Float[Array, ""] | float,
 ) -> UnconstrainedGaussians:
-    """Means moved at random: by `rate` times the covariance times normal numbers, fading out above
-    an opacity of 0.005.
+    """Move the means at random, by `rate` times the covariance times normal numbers. The noise
+    fades out above an opacity of 0.005.
 
     Args:
         key: of `jax.random`.
@@ -169,8 +171,8 @@ def mcmc_penalty(
     opacity: Float[Array, ""] | float = 0.01,
     scale: Float[Array, ""] | float = 0.01,
 ) -> Float[Array, ""]:
-    """What is added to the loss: the mean opacity and the mean scale (metres) of the used slots,
-    each times its weight.
+    """Returns the penalty that is added to the loss: the mean opacity and the mean scale (metres)
+    of the used slots, each times its weight.
 
     Args:
         parameters: of all slots.

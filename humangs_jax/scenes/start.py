@@ -1,4 +1,4 @@
-"""What `fit_scene` begins with: photos that fit their cameras, and Gaussians at points."""
+"""Prepares the start of `fit_scene`: photos that fit their cameras, and Gaussians at points."""
 
 import os
 from collections.abc import Sequence
@@ -24,18 +24,23 @@ START_SHARE = 0.5
 points.
 """
 PARALLEL = 1e-3
-"""Squared sine of the angle between axes that meet nowhere."""
+"""Axes of cameras are parallel if the squared sine of the angle between them is below this."""
 CANDIDATES = 16
-"""Random points of which one becomes a Gaussian."""
+"""The number of random points of which one becomes a Gaussian."""
 SMALLEST = 1e-4
-"""Scale of a Gaussian at the start, in extents of the cameras: points may coincide."""
+"""The least scale of a Gaussian at the start, as a share of the extent of the cameras. Points may
+coincide.
+"""
 Points = Gaussians | np.ndarray | Array | tuple[Any, Any] | None
-"""Where Gaussians begin: (n, 3) points, or with their colors (n, 3) in [0, 1], or Gaussians."""
+"""The points where Gaussians begin: (n, 3) points, perhaps with their colors (n, 3) in [0, 1], or
+Gaussians.
+"""
 
 
 def read_photos(images: Any, views: Sequence[Camera], config: SceneConfig) -> list[np.ndarray]:
-    """Raises: ValueError for another number or size than the cameras have, or values beyond [0,
-    1].
+    """Read the photos of `fit_scene`.
+
+    Raises: ValueError for another number or size than the cameras have, or values beyond [0, 1].
     """
     if len(images) != len(views) or not views:
         raise ValueError(
@@ -63,14 +68,16 @@ def read_photos(images: Any, views: Sequence[Camera], config: SceneConfig) -> li
 
 
 def extent_of(views: Sequence[Camera]) -> Float[Array, ""]:
-    """Largest distance of a camera from their middle; 1 if all stand in one place."""
+    """Returns the largest distance of a camera from the middle of all; 1 if all stand in one
+    place.
+    """
     centers = np.stack([np.asarray(camera.center) for camera in views])
     reach = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     return jnp.float32(reach if reach > 0 else 1.0)
 
 
 def first_gaussians(points: Points, views: Sequence[Camera], config: SceneConfig) -> Gaussians:
-    """Gaussians with harmonics of the degree that is wanted."""
+    """Returns the first Gaussians of a scene, with harmonics of the configured degree."""
     gaussians = points
     if not isinstance(gaussians, Gaussians):
         gaussians = _at_points(*_points(points, views, config), float(extent_of(views)))
@@ -83,7 +90,10 @@ def first_gaussians(points: Points, views: Sequence[Camera], config: SceneConfig
 def _points(
     points: Any, views: Sequence[Camera], config: SceneConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points and colors. Raises: ValueError for others than (n, 3)."""
+    """Returns the points and the colors of the first Gaussians.
+
+    Raises: ValueError for points that are not finite or not of shape (n, 3).
+    """
     rng = np.random.default_rng(config.seed)
     if points is None or (isinstance(points, tuple) and len(points[0]) == 0):
         return _seen_points(views, config.start, rng), rng.uniform(0, 1, (config.start, 3))
@@ -104,10 +114,12 @@ def _points(
 def _seen_points(
     views: Sequence[Camera], count: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
-    """Points at random in the cube around the cameras, by how many cameras see them.
+    """Returns `count` random points in the cube around the cameras. Points that more cameras see
+    are likelier.
 
-    The chance is the fourth power of that number. Around an object these lie where it is and not
-    between it and the cameras; in a room they lie everywhere.
+    The chance of a point is the fourth power of the number of cameras that see it. If the cameras
+    stand around an object, the points lie on it and not between it and the cameras. In a room they
+    lie everywhere.
     """
     middle, reach = _middle(views), float(extent_of(views))
     points = middle + rng.uniform(-reach, reach, (CANDIDATES * count, 3))
@@ -122,8 +134,8 @@ def _seen_points(
 
 
 def _middle(views: Sequence[Camera]) -> Float[np.ndarray, "3"]:
-    """The point nearest to the axes of all cameras, or one before the first where they are
-    parallel.
+    """Returns the point nearest to the axes of all cameras. If the axes are parallel, it is a point
+    in front of the first camera.
     """
     poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in views])
     centers, axes = np.stack([np.asarray(camera.center) for camera in views]), poses[:, 2, :3]
@@ -135,7 +147,7 @@ def _middle(views: Sequence[Camera]) -> Float[np.ndarray, "3"]:
 
 
 def _at_points(points: np.ndarray, colors: np.ndarray, extent: float) -> Gaussians:
-    """Round ones, as large as the points are far apart."""
+    """Returns round Gaussians at points, about as large as the points are far apart."""
     near = min(4, len(points))
     distances = np.full((len(points), 1), extent)
     if near > 1:

@@ -1,5 +1,5 @@
-"""The state of a scene that is fitted, and what makes the next one: a step of Adam with the noise
-of `scenes.mcmc`, and the relocation of dead Gaussians. Both are pure functions.
+"""The state of a scene that is fitted, and two pure functions that make the next state: a step of
+Adam with the noise of `scenes.mcmc`, and the relocation of dead Gaussians.
 """
 
 import functools
@@ -27,13 +27,13 @@ from humangs_jax.scenes.config import SceneConfig
 from humangs_jax.scenes.mcmc import mcmc_noise, mcmc_penalty, mcmc_relocate
 
 HIDDEN = -20.0
-"""Logit of the opacity of slots that are not used: none of them meets a tile."""
+"""The logit of the opacity of unused slots; none of them meets a tile."""
 ADAM = optax.scale_by_adam(eps=1e-15)
 
 
 @pytree_dataclass
 class SceneState:
-    """All that steps change."""
+    """The state of a scene between two steps."""
 
     step: Int[Array, ""]
     """The number of steps that are done."""
@@ -42,13 +42,15 @@ class SceneState:
     used: Bool[Array, " g"]
     """Which slots are Gaussians, (g,)."""
     moments: PyTree
-    """The moments of Adam, as the parameters."""
+    """The moments of Adam, in the structure of the parameters."""
     overflow: Int[Array, ""]
-    """The most (splat, tile) pairs of a step that did not fit since the buffers were planned."""
+    """The largest number of (splat, tile) pairs of a step that did not fit, since the buffers were
+    planned.
+    """
 
 
 def begin_scene(gaussians: Gaussians, capacity: int) -> SceneState:
-    """A state whose first slots are these Gaussians.
+    """Returns a state whose first slots are these Gaussians.
 
     Raises: ValueError for more than the capacity.
     """
@@ -65,13 +67,13 @@ def begin_scene(gaussians: Gaussians, capacity: int) -> SceneState:
 
 
 def scene_gaussians(state: SceneState) -> Gaussians:
-    """The Gaussians of the used slots; outside of transformations."""
+    """Returns the Gaussians of the used slots. It works outside of transformations only."""
     used = np.flatnonzero(state.used)
     return jax.tree.map(lambda leaf: leaf[used], constrain(state.parameters))
 
 
 def drawn_gaussians(parameters: UnconstrainedGaussians, used: Bool[Array, " g"]) -> Gaussians:
-    """All slots as Gaussians; those that are not used are transparent."""
+    """Returns all slots as Gaussians; unused slots are transparent."""
     logits = jnp.where(used, parameters.opacity_logits, HIDDEN)
     return constrain(replace(parameters, opacity_logits=logits))
 
@@ -86,7 +88,9 @@ def scene_step(
     config: SceneConfig,
     splat: SplatConfig,
 ) -> SceneState:
-    """One photo, one step of Adam, and noise."""
+    """Returns the state after one step of Adam on one photo, and noise. extent: that of the
+    cameras, see `extent_of`.
+    """
     target = photo.astype(jnp.float32) / (255 if photo.dtype == jnp.uint8 else 1)
 
     # the error of the image, and what MCMC charges for opaque and large Gaussians
@@ -121,7 +125,9 @@ def scene_step(
 
 
 def relocate_scene(state: SceneState, key: Key, growth: Float[Array, ""] | float) -> SceneState:
-    """Dead Gaussians move, more slots are used, and Adam forgets those that are others now."""
+    """Returns the state after a relocation: dead Gaussians are moved, `growth` times as many slots
+    are used, and Adam's moments of changed Gaussians are 0.
+    """
     count = jnp.ceil(growth * jnp.sum(state.used)).astype(jnp.int32)
     found = mcmc_relocate(key, state.parameters, state.used, count)
 
@@ -137,9 +143,9 @@ def relocate_scene(state: SceneState, key: Key, growth: Float[Array, ""] | float
 
 @functools.cache
 def compiled_programs() -> tuple[Callable[..., SceneState], Callable[..., SceneState]]:
-    """The step and the relocation, compiled.
+    """Returns the compiled step and the compiled relocation.
 
-    A state is not donated: Ctrl-C may come before there is the next one.
+    States are not donated, since Ctrl-C may come before there is the next one.
     """
     step = jax.jit(scene_step, static_argnums=(6, 7), compiler_options=compiler_options())
     return step, jax.jit(relocate_scene)
