@@ -1,10 +1,10 @@
-"""Colors as a file encodes them -> sRGB: ICC profiles, the code points of ITU-T H.273, and gamma
-with chromaticities.
+"""Converts colors from a file's encoding to sRGB: ICC profiles, the code points of ITU-T H.273, and
+gamma with chromaticities.
 
-All that is read here is three steps: a curve from levels to light, a matrix from the primaries of
-the file to those of sRGB, and the curve of sRGB. Profiles that are tables (of printers, scanners,
-CMYK) are left to Little CMS. Of high dynamic range the white of a sheet of paper becomes 1, and
-what is brighter is compressed.
+A conversion has three steps: a curve from levels to light, a matrix from the primaries of the file
+to those of sRGB, and the curve of sRGB. Profiles that consist of tables (of printers, scanners,
+CMYK) are left to Little CMS. In images of high dynamic range, the white of a sheet of paper becomes
+1, and brighter light is compressed.
 """
 
 import io
@@ -18,14 +18,14 @@ from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.io.reading import InvalidFileError
 
 Curve = Callable[[Float[np.ndarray, "*shape"]], Float[np.ndarray, "*shape"]]
-"""Levels in [0, 1] -> light, of which 1 is white."""
+"""A function from levels in [0, 1] to light, in which white is 1."""
 
 
 class Encoding(NamedTuple):
-    """How a file encodes colors."""
+    """The way in which a file encodes colors."""
 
     curves: tuple[Curve, ...]
-    """A curve for each channel, or one for all."""
+    """Curves from levels to light, one for each channel or one for all."""
     matrix: Float[np.ndarray, "3 3"]
     """Matrix from light of the file's primaries to light of sRGB's."""
     bright: bool = False
@@ -40,22 +40,22 @@ class Encoding(NamedTuple):
 
 
 def srgb_to_light(levels: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Applies the curve of sRGB, IEC 61966-2-1."""
+    """Returns light of levels by the curve of sRGB, IEC 61966-2-1."""
     return np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
 
 
 def light_to_srgb(light: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Applies the inverse of `srgb_to_light` to light in [0, 1]."""
+    """Returns levels of light in [0, 1], the inverse of `srgb_to_light`."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 def light_to_bt709(light: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Encodes light in [0, 1] as cameras do, ITU-R BT.709."""
+    """Returns levels of light in [0, 1] as cameras encode it, ITU-R BT.709."""
     return np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
 
 
 def _pq_to_light(levels: np.ndarray) -> np.ndarray:
-    """Applies the curve PQ, SMPTE ST 2084."""
+    """Returns light of levels by the curve PQ, SMPTE ST 2084. White paper is 1."""
     root = levels ** (1 / 78.84375)
     nits = 10_000 * (np.maximum(root - 0.8359375, 0) / (18.8515625 - 18.6875 * root)) ** (
         1 / 0.1593017578125
@@ -64,7 +64,9 @@ def _pq_to_light(levels: np.ndarray) -> np.ndarray:
 
 
 def _hlg_to_light(levels: np.ndarray) -> np.ndarray:
-    """Applies the curve HLG, ARIB STD-B67, which gives the light before the camera."""
+    """Returns light in front of the camera, of levels by the curve HLG, ARIB STD-B67. White paper
+    is 1.
+    """
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     light = np.where(levels <= 0.5, levels**2 / 3, (np.exp((levels - c) / a) + b) / 12)
     return light / 0.265  # white paper, the level 0.75 (BT.2408); 1 is the brightest
@@ -75,8 +77,8 @@ def _power(exponent: float) -> Curve:
 
 
 def _compressed(light: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Compresses light so that its largest channel is below 1; all three are scaled alike, so that
-    the hue stays.
+    """Returns light whose largest channel is compressed below 1. All three channels are scaled
+    alike, so the hue stays.
     """
     knee = 0.75  # light up to here stays
     largest = np.maximum(light.max(axis=-1, keepdims=True), 1e-6)
@@ -99,9 +101,8 @@ PRIMARIES = {
     9: ((0.708, 0.292), (0.170, 0.797), (0.131, 0.046)),
     12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
 }
-"""Chromaticities of red, green and blue, by their code point (H.273): BT.2020 and Display P3.
-
-All others are close to sRGB's.
+"""Chromaticities of red, green and blue, by their code point (H.273): BT.2020 and Display P3. All
+other primaries are close to sRGB's.
 """
 CURVES: dict[int, Curve] = {
     4: _power(2.2),
@@ -110,7 +111,9 @@ CURVES: dict[int, Curve] = {
     16: _pq_to_light,
     18: _hlg_to_light,
 }
-"""Curves by their code point (H.273). All programs show files of BT.709 and its kin as sRGB."""
+"""Curves by their code point (H.273). Other curves, of BT.709 and its kin, are read as sRGB, as all
+programs show them.
+"""
 PQ = 16
 """Number of the transfer function PQ in H.273."""
 HLG = 18
@@ -123,8 +126,8 @@ def _xyz(xy: tuple[float, float]) -> np.ndarray:
 
 
 def _to_xyz(primaries: tuple[tuple[float, float], ...], white: tuple[float, float]) -> np.ndarray:
-    """Returns the matrix from light of three primaries to XYZ. White becomes that of ICC profiles,
-    D50.
+    """Returns the matrix (3, 3) from light of three primaries to XYZ. White becomes D50, the white
+    of ICC profiles.
     """
     columns = np.stack([_xyz(each) for each in primaries], axis=1)
     matrix = columns * np.linalg.solve(columns, _xyz(white))
@@ -136,8 +139,8 @@ FROM_XYZ = np.linalg.inv(_to_xyz(SRGB, D65))
 
 
 def of_code_points(primaries: int, transfer: int) -> Encoding | None:
-    """Returns the encoding that two numbers of H.273 name. PNG's cICP, nclx of HEIC and AVIF, and
-    videos have them. None if it is sRGB's.
+    """Returns the encoding that two code points of H.273 stand for, or None if it is sRGB's. PNG's
+    cICP, nclx of HEIC and AVIF, and videos have such numbers.
     """
     if primaries not in PRIMARIES and transfer not in CURVES:
         return None
@@ -170,7 +173,7 @@ def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> E
 
 
 def is_srgb(encoding: Encoding) -> bool:
-    """Says whether the file's values are sRGB already, up to less than half a level of 8 bits."""
+    """Says whether a file's values are sRGB already, to within half a level of 8 bits."""
     steps = np.linspace(0, 1, 9)
     grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     return bool(np.abs(in_srgb(grid, encoding) - grid).max() < 0.5 / 255)
@@ -181,7 +184,7 @@ def is_srgb(encoding: Encoding) -> bool:
 
 
 def in_srgb(levels: Float[np.ndarray, "n 3"], encoding: Encoding) -> Float[np.ndarray, "n 3"]:
-    """Converts a file's levels to colors in sRGB, both in [0, 1]."""
+    """Returns the colors in sRGB of a file's levels, (n, 3), both in [0, 1]."""
     curves = encoding.curves * (3 // len(encoding.curves))
     light = np.stack([curve(levels[:, i]) for i, curve in enumerate(curves)], axis=-1)
     return _encode(encoding)(_light_in_srgb(light, encoding))
@@ -203,8 +206,8 @@ def _encode(encoding: Encoding) -> Curve:
 def pixels_in_srgb(
     levels: UInt[np.ndarray, "h w c"], most: int, encoding: Encoding
 ) -> Float[np.ndarray, "h w 3"]:
-    """Converts whole levels from 0 to `most`, of one channel (grey) or three, to colors in sRGB
-    in [0, 1].
+    """Returns the colors in sRGB, (h, w, 3), in [0, 1], of whole levels from 0 to `most` with one
+    channel (grey) or three.
     """
     height, width, channels = levels.shape
     curves = encoding.curves * (3 // len(encoding.curves))
@@ -225,7 +228,9 @@ def pixels_in_srgb(
 
 
 def cube(encoding: Encoding, side: int = 49) -> str:
-    """Writes a table of `in_srgb` as ffmpeg's filter lut3d reads it (.cube): red changes first."""
+    """Returns a table of `in_srgb` as text that ffmpeg's filter lut3d reads (.cube). Red changes
+    fastest.
+    """
     steps = np.linspace(0, 1, side)
     blue, green, red = (axis.ravel() for axis in np.meshgrid(steps, steps, steps, indexing="ij"))
     rows = in_srgb(np.stack([red, green, blue], axis=-1), encoding)
@@ -250,7 +255,7 @@ class Profile(NamedTuple):
 
 
 def read_profile(data: bytes) -> Profile:
-    """Reads an ICC profile.
+    """Returns the ICC profile in some bytes.
 
     Raises: InvalidFileError if the profile is damaged, or is not one of a photo.
     """
@@ -290,8 +295,8 @@ def read_profile(data: bytes) -> Profile:
 
 
 def _within_white(curve: Curve) -> Curve:
-    """Bounds the values of a curve to [0, 1]. The formula of a file may leave this range, or give
-    no number, between the levels that were tested.
+    """Returns the curve with its values bounded to [0, 1]. A formula of a file may leave this
+    range, or give NaN, between the levels that were tested.
     """
 
     def bounded(levels: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -320,7 +325,7 @@ def _of_colors(tags: dict[bytes, bytes]) -> Encoding:
 
 
 def _curve(tag: bytes) -> Curve:
-    """Reads the curve of an ICC tag. The tag is "curv" (a table, or an exponent) or "para" (the
+    """Returns the curve of an ICC tag. The tag is "curv" (a table, or an exponent) or "para" (the
     numbers g and a to f of a formula).
     """
     # "curv": no entry is the identity, one is an exponent, more are a table
@@ -357,7 +362,7 @@ def _curve(tag: bytes) -> Curve:
 
 
 def by_tables(image: Any, profile: bytes) -> Any:
-    """Converts a PIL.Image to sRGB with its ICC profile, for profiles that consist of tables.
+    """Returns a PIL.Image converted to sRGB with an ICC profile that consists of tables.
 
     Raises: InvalidFileError if the profile cannot be used.
     """

@@ -1,10 +1,10 @@
-"""Meshes: GLB, the binary form of glTF 2.0, parsed within limits and written; textured OBJ files of
-scans by trimesh.
+"""Reads and writes GLB files, the binary form of glTF 2.0, within limits, and reads textured OBJ
+files of scans by trimesh.
 
 GLB is JSON that describes arrays, and one block of their bytes
-(https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#glb-file-format-specification). What
-trimesh would trust is checked before. Textures of an OBJ file are read if they lie in its folder
-and are PNG or JPEG; one that cannot be read is left out, with a warning.
+(https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#glb-file-format-specification).
+Everything that trimesh would trust is checked before. Textures of an OBJ file are read if they lie
+in its folder and are PNG or JPEG. A texture that cannot be read is left out, with a warning.
 """
 
 import io
@@ -44,15 +44,16 @@ COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#accessor-data-types"""
 VERTICES = 34962
-"""Target of a view of a buffer that a graphics card reads as vertices."""
+"""Target of a buffer view that a graphics card reads as vertices."""
 INDICES = 34963
-"""Target of one that it reads as indices."""
+"""Target of a buffer view that a graphics card reads as indices."""
 
 
 def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, Any], bytes]:
-    """Splits a GLB file into its JSON and the bytes that this describes.
+    """Returns the JSON of a GLB file, and the block of bytes that the JSON describes.
 
-    Arguments: limit: of the JSON. By default that of files that nobody needs to be long.
+    Arguments: limit: name of the limit on the JSON's size. The default is that of files that need
+    not be long.
     Raises: InvalidFileError, KeyError, TypeError, ... for sizes that do not fit the file or are
     more than the limits allow.
     """
@@ -77,7 +78,7 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
 
 
 def _view_of(view: dict[str, Any], binary: bytes) -> bytes:
-    """Returns the bytes that a view of the buffer names. Raises: InvalidFileError."""
+    """Returns the bytes of a buffer view. Raises: InvalidFileError."""
     start, size, step = view.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 1)
     if not all(type(n) is int and n >= 0 for n in (start, size)) or start + size > len(binary):
         raise InvalidFileError(f"{size} bytes from {start}, but there are {len(binary)}")
@@ -87,7 +88,7 @@ def _view_of(view: dict[str, Any], binary: bytes) -> bytes:
 
 
 def count_of(accessor: dict[str, Any]) -> int:
-    """Counts how many elements an accessor says that it has. Raises: InvalidFileError."""
+    """Returns the number of elements of an accessor. Raises: InvalidFileError."""
     count, start = accessor["count"], accessor.get("byteOffset", 0)
     if not all(type(n) is int and n >= 0 for n in (count, start)):
         raise InvalidFileError(f"{shown(count)} numbers from {shown(start)}")
@@ -95,10 +96,10 @@ def count_of(accessor: dict[str, Any]) -> int:
 
 
 def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
-    """Reads the array (count, columns) of an accessor; integers that stand for numbers up to 1 are
-    converted.
+    """Returns the array of an accessor, (count, columns), float64. Normalized integers are
+    converted to numbers up to 1.
 
-    Raises: InvalidFileError, KeyError, TypeError, ... for what does not fit the file.
+    Raises: InvalidFileError, KeyError, TypeError, ... for anything that does not fit the file.
     """
     accessor = content["accessors"][_index(index)]
     if "sparse" in accessor or "bufferView" not in accessor:
@@ -121,14 +122,18 @@ def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndar
 
 
 def _index(value: Any) -> int:
-    """Checks an index of JSON: Python would count negative ones from the end."""
+    """Returns an index of JSON, after a check that it is not negative: Python would count it from
+    the end.
+
+    Raises: InvalidFileError.
+    """
     if type(value) is not int or value < 0:
         raise InvalidFileError(f"{shown(value)} is no index")
     return value
 
 
 def _width(accessor: dict[str, Any]) -> int:
-    """Counts the bytes of an element."""
+    """Returns the number of bytes of an accessor's element."""
     return COLUMNS[accessor["type"]] * np.dtype(COMPONENTS[accessor["componentType"]]).itemsize
 
 
@@ -137,13 +142,13 @@ def _width(accessor: dict[str, Any]) -> int:
 
 
 class GlbWriter:
-    """Arrays and other bytes, gathered into one block as they are added."""
+    """Writes a GLB file. Arrays and other bytes are added one by one to its block of bytes."""
 
     def __init__(self) -> None:
         self.data, self.views, self.accessors = bytearray(), [], []
 
     def bytes_(self, data: bytes, target: int | None = None) -> int:
-        """Adds bytes, which start at a multiple of 4; returns the index of their view."""
+        """Adds bytes at a multiple of 4, and returns the index of their buffer view."""
         self.data += bytes(-len(self.data) % 4)
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
         if target is not None:
@@ -155,11 +160,11 @@ class GlbWriter:
     def array(
         self, kind: str, values: np.ndarray, target: int | None = None, bounds: bool = False
     ) -> int:
-        """Adds an array, float32 unless it has unsigned integers; returns the index of its
+        """Adds an array, as float32 unless it has unsigned integers, and returns the index of its
         accessor.
 
-        Arguments: kind: as in COLUMNS. bounds: also tell the least and the largest of each column,
-        as positions and times must.
+        Arguments: kind: a key of COLUMNS. bounds: whether to record the smallest and the largest
+        number of each column, which positions and times need.
         """
         dtype = values.dtype if values.dtype.kind == "u" else "<f4"
         values = np.ascontiguousarray(values, dtype)
@@ -179,8 +184,8 @@ class GlbWriter:
         return len(self.accessors) - 1
 
     def sparse(self, values: np.ndarray) -> int:
-        """Adds an array (n, 3) of which most rows are 0: only the others are in the file. Returns
-        the index of its accessor.
+        """Adds an array (n, 3) of which most rows are 0, and returns the index of its accessor.
+        Only rows that are not 0 are in the file.
         """
         rows = np.flatnonzero(values.any(axis=1))
         accessor = {
@@ -201,9 +206,9 @@ class GlbWriter:
         return len(self.accessors) - 1
 
     def write(self, path: str | os.PathLike[str], document: dict[str, Any]) -> None:
-        """Write the file with a glTF document to which arrays, buffer and `asset` are added.
+        """Writes the file: the glTF document with the arrays, the buffer and `asset` added to it.
 
-        It appears whole or not at all.
+        The file appears whole or not at all.
         """
         self.data += bytes(-len(self.data) % 4)
         document = {"asset": {"version": "2.0", "generator": "humangs_jax"}} | document
@@ -221,13 +226,12 @@ class GlbWriter:
 
 
 def read_obj(path: str | Path) -> list[Any]:
-    """Reads the triangle meshes of an OBJ file with materials and textures, as trimesh.Trimesh; at
-    least one.
+    """Returns the triangle meshes of an OBJ file with materials and textures, at least one, as
+    trimesh.Trimesh.
 
-    Materials and textures that the file names but that cannot be read are left out, which is
-    logged.
-    Raises: FileNotFoundError; FileError if it has no triangles, is damaged, or asks for
-    more than the limits allow.
+    Materials and textures that cannot be read are left out, and a warning is logged.
+    Raises: FileNotFoundError; FileError if the file has no triangles, is damaged, or asks for more
+    than the limits allow.
     """
     import trimesh
 
@@ -277,9 +281,11 @@ def read_obj(path: str | Path) -> list[Any]:
 
 
 def _grouped(text: str) -> str:
-    """Brings the faces of each material together, at the end of an OBJ file. Without materials, and
-    for objects and groups, all faces are one: trimesh takes longer than linear for each change,
-    even for one that it finds in a comment.
+    """Returns the text of an OBJ file with the faces of each material together, at its end.
+
+    Names of objects and groups are removed, and without materials all faces form one part.
+    trimesh's time grows faster than linearly with the number of such changes, even with those that
+    it finds in a comment.
     """
     text = text.replace("\r\n", "\n").replace("\\\n", "")
     faces = re.compile(r"^f[ \t].*\n?", re.MULTILINE)
@@ -308,9 +314,10 @@ def _grouped(text: str) -> str:
 
 
 class _Folder:
-    """What trimesh asks for the files that a mesh names: materials and textures beside it.
+    """A resolver that gives trimesh the files that a mesh names: materials and textures in its
+    folder.
 
-    It goes on without those refused.
+    A file that is refused is reported as missing, and trimesh continues without it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -347,7 +354,7 @@ class _Folder:
             return data
 
     def report(self, path: Path) -> None:
-        """Warn of the first file that could not be read, and say how many there are."""
+        """Logs a warning about the first file that could not be read, with the number of others."""
         if self.faults:
             key, why = next(iter(self.faults.items()))
             more = ""
@@ -357,10 +364,11 @@ class _Folder:
 
 
 def _names_in(text: str) -> list[str]:
-    """Returns what the name of a material or texture may be, the likeliest first.
+    """Returns the file names that the name of a material or texture may stand for, the likeliest
+    first.
 
-    It may be meant as it stands, with spaces; without quotes, options of textures and separators of
-    Windows; and, of several materials in one line, the first may be meant.
+    The name may be meant as it stands, with spaces. It may be meant without quotes, options of
+    textures and Windows separators. Of several materials in one line, the first may be meant.
     """
     # before the name of a texture stand options, as `-s 1 1 1` or `-clamp on`
     options = r"^(?:-\w+(?:\s+(?:on|off|[lrgbmz]|[-+.\deE]+))+\s+)+"

@@ -1,7 +1,7 @@
-"""The authors' released checkpoint to our variables and back: names, layouts, and the configuration
-behind the shapes.
+"""Converts the authors' released checkpoint to our variables and back: names, layouts, and the
+configuration that follows from the shapes.
 
-Files are read by `io.tensors`, without torch. Layouts: linear (out, in) -> (in, out); convolution
+`io.tensors` reads the files, without torch. Layouts: linear (out, in) -> (in, out); convolution
 (out, in, kh, kw) -> (kh, kw, in, out); 1x1 convolution (out, in, 1, 1) -> (in, out); transposed
 convolution (in, out, kh, kw) -> (kh, kw, in, out), unflipped (see `upsampler.UpConvolution`).
 """
@@ -34,38 +34,38 @@ from humangs_jax.network.weights import (
 )
 
 LOSS_PREFIX = "loss_computer."
-"""The release also saves its frozen loss networks; they are not part of the network."""
+"""Prefix of the frozen loss networks in the release, which are not part of the network."""
 SKINNING_WEIGHTS = "tpose_lbs_weights"
-"""(n, j) of the body that the network was trained with; carried along, the network has no use for
-them.
+"""Name of the skinning weights (n, j) of the body that the network was trained with. They are kept
+in `Converted`; the network does not use them.
 """
 UNSUPPORTED = "target_pose_tokenizer.1.weight"
-"""Marks a variant of the network (canonical target maps) that does not exist here."""
+"""Tensor of a variant of the network (canonical target maps) that does not exist here."""
 
 StateDict = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
 class Converted:
-    """What a released checkpoint holds, in the forms of this package."""
+    """The content of a released checkpoint, in the forms of this package."""
 
     variables: Variables
     """Parameters and running statistics of the network."""
     config: HumanGSConfig
-    """The configuration that these variables have."""
+    """The configuration of the network with these variables."""
     skinning_weights: np.ndarray
     """Skinning weights of the body that the checkpoint was made for, (n, j)."""
     skipped: int
-    """How many tensors of the frozen loss networks were left out."""
+    """Number of tensors of the frozen loss networks, which were left out."""
 
 
 class Layout(NamedTuple):
-    """How a tensor lies in the release and here; the two undo each other."""
+    """A conversion of a tensor from the release's layout to ours, and its inverse."""
 
     from_release: Callable[[np.ndarray], np.ndarray]
-    """Turns an array of the release into ours."""
+    """Returns our array of an array of the release."""
     to_release: Callable[[np.ndarray], np.ndarray]
-    """Turns an array of ours into the one of the release."""
+    """Returns the release's array of an array of ours."""
 
 
 SAME = Layout(lambda x: x, lambda x: x)
@@ -125,10 +125,9 @@ FIELDS = {
 
 
 def _release_name(path: str) -> tuple[str, Layout]:
-    """Returns what the release calls one of our variables ("params/encoder/..."), and how it lies
-    there.
+    """Returns the release's name of one of our variables ("params/encoder/..."), and its layout.
 
-    Raises: KeyError if the release has no such thing.
+    Raises: KeyError if the release has no such variable.
     """
     if path in SINGLE_TENSORS:
         return SINGLE_TENSORS[path]
@@ -145,7 +144,7 @@ def _release_name(path: str) -> tuple[str, Layout]:
 
 
 def to_release(variables: Variables) -> StateDict:
-    """Converts variables to the release's state dict, without the body's skinning weights.
+    """Returns the release's state dict of variables, without the body's skinning weights.
 
     Raises: KeyError for a part of a network that the release does not have.
     """
@@ -160,7 +159,7 @@ def to_release(variables: Variables) -> StateDict:
 
 
 def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
-    """Returns the shapes of the state dict that the release has for a configuration, without the
+    """Returns the shapes of the release's state dict for a configuration, by name, without the
     body's skinning weights.
     """
     empty = jax.tree.map(
@@ -170,10 +169,11 @@ def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
 
 
 def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
-    """Reads the tensors of a checkpoint in any format of `io.tensors`, and counts those of the loss
-    networks, which are skipped.
+    """Returns the tensors of a checkpoint in any format of `io.tensors`, and the number of skipped
+    tensors of loss networks.
 
-    Raises: OSError; ValueError if the file is damaged, is none, or holds anything but tensors.
+    Raises: OSError; ValueError if the file is damaged, is no checkpoint, or holds anything but
+    tensors.
     """
     if is_safetensors(path) and read_safetensors(path, lambda _: False)[2].get("format") == FORMAT:
         raise ValueError(f"{path} is a weights file already: nothing to convert")
@@ -181,12 +181,13 @@ def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
 
 
 def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConfig:
-    """Finds the configuration whose sizes are those of the tensors; what shapes do not tell is
-    taken from `presets.published`.
+    """Returns the configuration whose sizes are those of the tensors. Settings that shapes do not
+    show are those of `presets.published`.
 
-    head_width: of a network without normalised queries and keys, where no shape tells it. Of the
-    Gaussians of a vertex one counts as tight. Raises: ValueError for a variant that is not
-    supported, or if a tensor that tells a size is missing or has another number of axes.
+    head_width: width of a head, for a network without normalised queries and keys, where no shape
+    shows it. One Gaussian of each vertex counts as tight.
+    Raises: ValueError for a variant that is not supported, or if a tensor that determines a size is
+    missing or has another number of axes.
     """
     if UNSUPPORTED in state:
         raise ValueError(
@@ -247,7 +248,9 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
 
 
 def _shape(state: StateDict, key: str, axes: int) -> tuple[int, ...]:
-    """Returns the shape of a tensor. Raises: ValueError for another number of axes."""
+    """Returns the shape of a tensor. Raises: ValueError if it is missing or has another number of
+    axes.
+    """
     if key not in state:
         raise ValueError(f"tensor {key!r} is missing")
     if state[key].ndim != axes or 0 in state[key].shape:
@@ -256,7 +259,7 @@ def _shape(state: StateDict, key: str, axes: int) -> tuple[int, ...]:
 
 
 def _count_layers(state: StateDict) -> int:
-    """Counts the blocks of the transformer. Raises: ValueError if one is missing."""
+    """Returns the number of blocks of the transformer. Raises: ValueError if one is missing."""
     indices = {key.split(".")[1] for key in state if key.startswith("transformer_blocks.")}
     for index in range(len(indices)):
         if str(index) not in indices:
@@ -265,7 +268,9 @@ def _count_layers(state: StateDict) -> int:
 
 
 def _infer_heads(state: StateDict, head_width: int | None) -> dict[str, Any]:
-    """Returns the width of a head, which is that of its norms, and whether there are norms."""
+    """Returns the width of a head, which is that of its norms, and whether there are norms, as
+    arguments of `TransformerConfig`.
+    """
     if not any(key.endswith((".attn.q_norm.weight", ".attn.k_norm.weight")) for key in state):
         if head_width is None:
             raise ValueError(
@@ -285,8 +290,9 @@ def _infer_heads(state: StateDict, head_width: int | None) -> dict[str, Any]:
 
 
 def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
-    """Raises ValueError, in the release's names, unless the tensors are exactly those expected, and
-    finite.
+    """Checks that the tensors are exactly those expected, and finite.
+
+    Raises: ValueError, which names the tensor as in the release.
     """
     missing = sorted(set(expected) - set(state))
     if missing:
@@ -312,12 +318,12 @@ def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
 
 
 def load_checkpoint(path: str | os.PathLike[str], head_width: int | None = None) -> Converted:
-    """Reads a released checkpoint as float32 variables, with the configuration that its shapes
-    tell.
+    """Returns a released checkpoint as float32 variables, with the configuration that its shapes
+    show.
 
-    head_width: see `infer_config`. Raises: OSError; ValueError naming file and tensor if the file
-    cannot be read or asks for more than tensors, or if a tensor of the network is missing, unknown,
-    of the wrong shape or not finite.
+    head_width: see `infer_config`. Raises: OSError; ValueError, which names file and tensor, if the
+    file cannot be read or asks for more than tensors, or if a tensor of the network is missing,
+    unknown, of the wrong shape or not finite.
     """
     with reading(path, "checkpoint of the published network"):
         return _load_checkpoint(path, head_width)
@@ -342,7 +348,7 @@ def _load_checkpoint(path: str | os.PathLike[str], head_width: int | None) -> Co
 
 
 def describe(converted: Converted) -> str:
-    """Describes the network in one line."""
+    """Returns a description of the network in one line."""
     config, leaves = converted.config, flatten_variables(converted.variables["params"]).values()
     encoder, _, decoder = paper_parts(config.architecture)
     transformer = encoder.transformer

@@ -1,11 +1,11 @@
-"""UV atlases: a mesh cut into charts that lie flat without folding over, packed into the unit
-square.
+"""Makes UV atlases: a mesh is cut into charts that lie flat without folding over, and the charts
+are packed into the unit square.
 
 A chart is a connected set of faces of one piece that look towards about the same side, projected
-along the mean of their normals. Where a chart folds over itself, the hidden faces become charts of
-their own: they are found by rasterizing the charts front to back and back to front. Charts are
-placed as bitmaps, the largest first, at the first free place. All have one scale, times the density
-that the caller asks for.
+along the mean of their normals. Where a chart folds over itself, the hidden faces become separate
+charts. They are found by rasterizing the charts front to back and back to front. Charts are placed
+as bitmaps, the largest first, each at the first free place. All charts have one scale, times the
+density that the caller asks for.
 
 Texture coordinates follow `rendering.mesh.rasterizer.sample_texture`: u to the right, v up.
 """
@@ -23,21 +23,27 @@ Points = Float[np.ndarray, "n 3"]
 Faces = Int[np.ndarray, "f 3"]
 
 SIDES = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
-"""Directions that charts look towards at first."""
+"""Directions that charts look towards at first, (6, 3)."""
 LEAST_COSINE = 0.45
-"""Least cosine between the normal of a face and the side of a chart that it may join."""
+"""Smallest cosine between the normal of a face and the side of a chart that it may join."""
 PEELINGS = 3
-"""How often charts that overlap themselves are split; the tests count what still overlaps."""
+"""Number of rounds in which charts that overlap themselves are split. The tests count what still
+overlaps.
+"""
 GUTTER = 2
-"""Least number of texels between charts."""
+"""Smallest number of texels between charts."""
 CELLS = 128
-"""Cells a side of the square as it is packed."""
+"""Number of cells along a side of the square in which charts are packed."""
 SHRINKING = 0.97
 """Factor on the scale after a failed attempt to pack."""
 VERTEX_STEP = 32768
-"""The rasterizer gets a multiple of so many vertices: few shapes are compiled."""
+"""The number of vertices is padded to a multiple of this, so that the rasterizer is compiled for
+few shapes.
+"""
 FACE_STEP = 32768
-"""The rasterizer gets a multiple of so many faces: few shapes are compiled."""
+"""The number of faces is padded to a multiple of this, so that the rasterizer is compiled for few
+shapes.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +61,7 @@ class Atlas:
     size: int
     """Side of the texture, texels."""
     texel: float
-    """Metres of (flat) chart per texel where the density is 1."""
+    """Metres of (flat) chart in a texel where the density is 1."""
 
 
 def unwrap(
@@ -65,10 +71,10 @@ def unwrap(
     size: int,
     density: Float[np.ndarray, " f"],
 ) -> Atlas:
-    """Cuts a mesh into charts, none across two `pieces` (a number per face), and packs them into
-    size x size texels.
+    """Cuts a mesh into charts and packs them into a texture of size x size texels.
 
-    density: texels per metre of each face relative to others; the same all over a piece.
+    pieces: number of the piece of each face; no chart extends over two pieces. density: texels per
+    metre of each face relative to others, the same all over a piece.
 
     Raises: ValueError for a size that is no multiple of `CELLS`.
     """
@@ -100,11 +106,11 @@ class _Flat:
     points: np.ndarray
     """Points of all charts, (u, 2), metres from the lower left corner of their chart."""
     heights: np.ndarray
-    """Their heights above the plane of their chart, (u,), metres."""
+    """Heights of the points above the plane of their chart, (u,), metres."""
     faces: np.ndarray
-    """Points of the corners of each face, (f, 3)."""
+    """Indices of the points at the corners of each face, (f, 3)."""
     vertices: np.ndarray
-    """Vertex of the mesh that each point is, (u,)."""
+    """Vertex of the mesh at each point, (u,)."""
     point_charts: np.ndarray
     """Chart of each point, (u,)."""
     charts: np.ndarray
@@ -112,7 +118,7 @@ class _Flat:
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Divides vectors by their lengths along the last axis; those without length stay."""
+    """Returns vectors divided by their lengths along the last axis. Zero vectors stay zero."""
     return vectors / (np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)) + 1e-12)
 
 
@@ -124,7 +130,7 @@ def edges_of(faces: Faces) -> Int[np.ndarray, "e 2"]:
 def fill_gaps(
     image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w c"]:
-    """Replaces every unknown texel of an image by the nearest known one."""
+    """Returns the image with each unknown texel replaced by the nearest known one."""
     from scipy.ndimage import distance_transform_edt
 
     rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
@@ -141,8 +147,8 @@ def _adjacent(faces: np.ndarray) -> np.ndarray:
 
 
 def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Chooses a side for each face, (f,): the one it looks at, unless its neighbours agree on
-    another that it can see as well.
+    """Returns the side of each face, (f,): the one that it faces most, unless its neighbours agree
+    on another side that it also faces.
     """
     cosines = normals @ SIDES.T
     allowed = cosines >= np.minimum(LEAST_COSINE, cosines.max(1, keepdims=True))
@@ -157,7 +163,9 @@ def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _connected(count: int, pairs: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Numbers the connected sets of faces of one label; returns the number for each face, (f,)."""
+    """Returns the number of the connected set that each face belongs to, (f,). A set has one
+    label.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -174,8 +182,8 @@ def _flatten(
     sides: np.ndarray,
     density: np.ndarray,
 ) -> _Flat:
-    """Lays every chart in a plane across its mean normal, turned so that its box is small, as large
-    as its density says.
+    """Returns charts laid into planes across their mean normals. Each is turned so that its box is
+    small, and scaled by its density.
     """
     count = int(charts.max()) + 1
     # a vertex is a point in each chart that it belongs to
@@ -208,9 +216,10 @@ def _flatten(
 
 
 def _turned(flat: np.ndarray, owner: np.ndarray, count: int, angles: int = 8) -> np.ndarray:
-    """Turns every chart by the one of a few angles that makes its bounding box smallest, wide side
-    right.
-    flat: its points (u, 2).
+    """Returns the points (u, 2) with every chart turned by the one of a few angles that makes its
+    bounding box smallest, the wide side to the right.
+
+    flat: points of the charts, (u, 2). owner: chart of each point.
     """
     best_area, best = np.full(count, np.inf), flat
     for angle in np.arange(angles) * (np.pi / angles):
@@ -227,7 +236,7 @@ def _turned(flat: np.ndarray, owner: np.ndarray, count: int, angles: int = 8) ->
 
 
 def _extreme(function: np.ufunc, values: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
-    """Returns the least or greatest values (u, 2) of each chart, (charts, 2)."""
+    """Returns the smallest or the largest values of each chart, (charts, 2), of values (u, 2)."""
     worst = np.inf if function is np.minimum else -np.inf
     result = np.full((count, 2), worst)
     function.at(result, owner, values)
@@ -235,12 +244,14 @@ def _extreme(function: np.ufunc, values: np.ndarray, owner: np.ndarray, count: i
 
 
 def _sizes(flat: _Flat) -> np.ndarray:
-    """Returns widths and heights of the charts, metres."""
+    """Returns widths and heights of the charts, (2, charts), metres."""
     return _extreme(np.maximum, flat.points, flat.point_charts, int(flat.charts.max()) + 1).T
 
 
 def _hidden(flat: _Flat, size: int) -> np.ndarray:
-    """Says which faces, (f,), lie below others of their chart, where charts overlap themselves."""
+    """Returns which faces lie below others of their chart, where charts overlap themselves,
+    (f,).
+    """
     corners, scale = _shelves(flat, size)
     pixels = (flat.points * scale + corners[flat.point_charts]).astype(np.float32)
     span = max(float(np.ptp(flat.heights)), 1e-6)
@@ -253,8 +264,8 @@ def _hidden(flat: _Flat, size: int) -> np.ndarray:
 
 
 def _shelves(flat: _Flat, size: int) -> tuple[np.ndarray, float]:
-    """Places charts roughly, in rows of falling height: places (charts, 2) in texels, and the scale
-    (texels per metre).
+    """Returns rough places of the charts (charts, 2), texels, and the scale, texels per metre.
+    Charts lie in rows of falling height.
     """
     width, height = _sizes(flat)
     order = np.argsort(-height)
@@ -275,8 +286,8 @@ def _shelves(flat: _Flat, size: int) -> tuple[np.ndarray, float]:
 def _rasterize(
     pixels: np.ndarray, depth: np.ndarray | np.floating, faces: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draws the faces: (size, size) face of every texel (-1: none) and (size, size, 3) its weights;
-    y up, row 0 on top.
+    """Returns the face of every texel, (size, size), -1 for none, and the weights of its corners,
+    (size, size, 3). y points up, and row 0 is the top.
     """
     points = np.stack(
         [pixels[:, 0] * depth, (size - pixels[:, 1]) * depth, depth * np.ones(len(pixels))], 1
@@ -291,7 +302,7 @@ def _rasterize(
 
 
 def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s 3"]]:
-    """Returns what every texel shows: its face (-1: none) and the weights of the face's corners.
+    """Returns the face that every texel shows, -1 for none, and the weights of the face's corners.
 
     Row 0 is the top (v = 1).
     """
@@ -299,7 +310,9 @@ def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s
 
 
 def _pack(flat: _Flat, size: int) -> Atlas:
-    """Puts charts as bitmaps of cells at the first free place, shrunk together until all fit."""
+    """Returns the atlas with each chart, as a bitmap of cells, at the first free place. All charts
+    shrink together until they fit.
+    """
     # the boxes alone would fill the square: a start that is too large
     scale = size / np.sqrt(np.prod(_sizes(flat), 0).sum())
     corners = _place(flat, scale, size)
@@ -318,7 +331,7 @@ def _pack(flat: _Flat, size: int) -> Atlas:
 
 
 def _place(flat: _Flat, scale: float, size: int) -> np.ndarray | None:
-    """Returns the corners (charts, 2) in texels, or None if the charts do not fit."""
+    """Returns the corners of the charts (charts, 2), texels. None if the charts do not fit."""
     cell = size // CELLS
     masks = _bitmaps(flat, scale, cell)
     if sum(np.count_nonzero(mask) for mask in masks) > CELLS * CELLS:
@@ -336,7 +349,7 @@ def _place(flat: _Flat, scale: float, size: int) -> np.ndarray | None:
 
 
 def _first_free(free: np.ndarray, mask: np.ndarray) -> tuple[int, int] | None:
-    """Finds the lowest (row, column) at which all cells of a bitmap are free; None if there is
+    """Returns the lowest (row, column) at which all cells of a bitmap are free. None if there is
     none.
     """
     rows, columns = (n - m + 1 for n, m in zip(free.shape, mask.shape, strict=True))
@@ -352,8 +365,8 @@ def _first_free(free: np.ndarray, mask: np.ndarray) -> tuple[int, int] | None:
 
 
 def _bitmaps(flat: _Flat, scale: float, cell: int) -> list[np.ndarray]:
-    """Returns for every chart the cells (rows, columns) that the boxes of its faces touch, half a
-    gutter around them included.
+    """Returns for every chart which cells (rows, columns) the boxes of its faces touch, with half a
+    gutter around them.
     """
     corners = (flat.points * scale)[flat.faces]
     low = np.floor(corners.min(1) / cell).astype(np.int64)
