@@ -1,5 +1,5 @@
-"""Canonical Gaussians -> posed Gaussians, by blend skinning alone: the network is not run again.
-And the low-pass of images as a part of the scales, so that an avatar looks the same in images of
+"""Poses the Gaussians of an avatar by blend skinning alone: the network is not run again. Also
+makes the low-pass of images a part of the scales, so that an avatar looks the same in images of
 every size.
 
 A renderer adds `EPS2D` pixels^2 to the variances of each Gaussian, whatever the size of the image.
@@ -73,12 +73,12 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
 
 
 def _with_expression(avatar: Avatar, pose: BodyPose) -> tuple[Avatar, BodyPose]:
-    """The avatar in T-pose with the face that a pose makes, and the pose without it but with the
-    joints that it turns.
+    """Returns the avatar in T-pose with the face that the pose's expression makes, and the pose
+    without its expression but with the joints that the expression turns.
 
-    Hidden Gaussians become ordinary ones behind the others, which hang on the head. Those of an eye
-    hang on its joint.
-    Raises: ValueError for an avatar without a face, or a pose of other expressions.
+    Hidden Gaussians become ordinary Gaussians behind the others, and follow the head. Gaussians of
+    an eye follow its joint. Raises: ValueError for an avatar without a face, or a pose of other
+    expressions.
     """
     face, expression = avatar.face, pose.expression
     if face is None or expression is None:
@@ -106,8 +106,8 @@ def _with_expression(avatar: Avatar, pose: BodyPose) -> tuple[Avatar, BodyPose]:
 
 
 def with_hidden_among(avatar: Avatar, hidden: Gaussians) -> Avatar:
-    """The avatar with the hidden Gaussians of its face as ordinary ones behind the others, on
-    the head; without the face.
+    """Returns the avatar without its face. The hidden Gaussians of the face become ordinary
+    Gaussians behind the others, and follow the head.
     """
     face, names = avatar.face, avatar.joint_names
     assert face is not None
@@ -181,10 +181,11 @@ def _animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
 
 
 def with_pixel_footprint(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> Avatar:
-    """The avatar whose scales contain the low-pass of images with pixels of this size in metres.
+    """Returns the avatar whose scales contain the low-pass of images with pixels of this size,
+    metres.
 
-    One that is drawn by other conventions than "exact", or has a low-pass already, is returned as
-    it is.
+    An avatar that is drawn by other conventions than "exact", or has a low-pass already, is
+    returned as it is.
     """
     gaussians = avatar.gaussians
     if avatar.rendering != "exact" or gaussians.pixel_footprint is not None:
@@ -203,18 +204,18 @@ def with_pixel_footprint(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> A
 
 
 def without_pixel_footprint(avatar: Avatar) -> Avatar:
-    """The avatar that `with_pixel_footprint` had."""
+    """Returns the avatar that was given to `with_pixel_footprint`."""
     gaussians = avatar.gaussians
     scales = widened(gaussians.scales, gaussians.pixel_footprint, -1)
     return replace(avatar, gaussians=replace(gaussians, scales=scales, pixel_footprint=None))
 
 
 def with_pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Avatar:
-    """The avatar with the low-pass of the photos that it will be fitted to, unless its own is that
-    of smaller pixels.
+    """Returns the avatar with the low-pass of the photos that it will be fitted to, unless its own
+    low-pass is that of smaller pixels.
 
-    It looks as before: by how much its low-pass was larger is now part of the scales, which a fit
-    can reduce.
+    The avatar looks as before. The part by which its own low-pass was larger becomes part of the
+    scales, which a fit can reduce.
     """
     return replace(avatar, gaussians=_pixel_footprint_of(avatar, views))
 
@@ -229,7 +230,8 @@ def _pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Gaussians:
 
 @jax.jit
 def pixel_sizes(avatar: Avatar, views: SubjectViews) -> Float[Array, " g"]:
-    """Metres that a pixel of the photos shows at each Gaussian, in the photo that shows it largest.
+    """Returns the size of a photo's pixel at each Gaussian, metres, in the photo that shows the
+    Gaussian largest.
 
     Gaussians outside of all frames get the largest value of the others.
     """

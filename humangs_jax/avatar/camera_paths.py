@@ -1,4 +1,5 @@
-"""Cameras of a file: as they stand in its world, or as a path along which an avatar is seen.
+"""Reads cameras of a file as they stand in its world, or makes a path of them along which an avatar
+is seen.
 
 The person stands on the floor, at the middle of a world with y up and in metres, as in the motions
 of `motion_views` and in the files of `export`. Formats whose world has another axis up are turned.
@@ -27,8 +28,8 @@ logger = logging.getLogger(__name__)
 
 
 def file_cameras(path: Path, shot: FrameSettings, upright: bool = False) -> dict[str, Camera]:
-    """The cameras of a calibration, in the order of its file, by unique names; lens distortion is
-    left out, which is logged.
+    """Returns the cameras of a calibration by unique names, in the order of its file. Lens
+    distortion is left out, and a line is logged about it.
 
     Images are as large as the file says. Where it does not say, or the shot has a width or a
     height, they are those of the shot.
@@ -59,7 +60,10 @@ def file_cameras(path: Path, shot: FrameSettings, upright: bool = False) -> dict
 
 
 def one_size(path: Path, cameras: Mapping[str, Camera]) -> Camera:
-    """A batch of the cameras of a file. Raises: ValueError if their images differ in size."""
+    """Returns a batch of the cameras of a file.
+
+    Raises: ValueError if their images differ in size.
+    """
     sizes = {(camera.width, camera.height): name for name, camera in cameras.items()}
     if len(sizes) > 1:
         shown = ", ".join(
@@ -72,8 +76,8 @@ def one_size(path: Path, cameras: Mapping[str, Camera]) -> Camera:
 
 
 def camera_path(cameras: Camera, frames: int) -> Camera:
-    """A camera for each frame, from a batch of them: one stands still; several are evenly spread
-    over the frames.
+    """Returns a camera for each of `frames` frames, from a batch of cameras. A single camera stands
+    still; several are evenly spread over the frames.
 
     Between them centres and intrinsics run along a monotone cubic spline (Fritsch and Carlson
     1980), which goes through all of them and does not overshoot; rotations turn about one axis at
@@ -98,7 +102,9 @@ def camera_path(cameras: Camera, frames: int) -> Camera:
 
 
 def standing(avatar: Avatar, pose: BodyPose | None = None) -> BodyPose:
-    """A pose (default: the T-pose) moved so that the person stands on the floor, at x = z = 0."""
+    """Returns a pose (default: the T-pose), moved so that the person stands on the floor, at x = z
+    = 0.
+    """
     if pose is None:
         pose = rest_pose_of(avatar)
     moment = Motion(pose.rotations[None], pose.translation[None], 1.0)
@@ -108,5 +114,5 @@ def standing(avatar: Avatar, pose: BodyPose | None = None) -> BodyPose:
 
 
 def repeated(pose: BodyPose, views: int) -> BodyPose:
-    """A batch of one pose."""
+    """Returns a batch of `views` copies of a pose."""
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (views, *x.shape)), pose)

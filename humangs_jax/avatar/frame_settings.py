@@ -1,5 +1,5 @@
-"""How an avatar is filmed: the size of the images, what is behind the person, where the camera
-stands.
+"""Settings of how an avatar is filmed: the size of the images, the background, and the place of the
+camera.
 
 `FrameSettings` is what `humangs animate` and `humangs render` have in common; their command line is
 made from it, so this module imports nothing heavy. `avatar.frames` draws by it.
@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from humangs_jax.core.configuration import ArgumentError, Range, check_range
 
 LARGEST_SIDE = 8192
-"""Pixels: the largest level of H.264 and VP9."""
+"""The largest side of an image, pixels: that of the largest level of H.264 and VP9."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,20 +53,20 @@ class FrameSettings:
 
     @property
     def resolution(self) -> tuple[int, int]:
-        """Width and height in pixels."""
+        """The width and the height of the images, pixels."""
         return self.width or self.size, self.height or self.size
 
     @property
     def tangents(self) -> tuple[float, float]:
-        """Tangents of half the field of view along x and y; pixels are square."""
+        """The tangents of half the field of view along x and y. Pixels are square."""
         width, height = self.resolution
         tangent = math.tan(math.radians(self.fov) / 2)
         return tangent * width / height, tangent
 
     def color(self) -> tuple[float, float, float] | None:
-        """Red, green and blue of the background in [0, 1]; None: transparent.
+        """Returns red, green and blue of the background in [0, 1]; None for a transparent one.
 
-        Raises: ValueError for what is no color.
+        Raises: ValueError for a text that is no color.
         """
         if self.background == "white":  # without numpy: --help asks for it, too
             return 1.0, 1.0, 1.0

@@ -1,5 +1,5 @@
-"""Images of any Gaussians, those of other programs too: from a circle of cameras, or from the
-cameras of a calibration; large scenes in bands of rows, in bounded memory.
+"""Draws images of any Gaussians, those of other programs too, from a circle of cameras or from the
+cameras of a calibration. Large scenes are drawn in bands of rows, in bounded memory.
 """
 
 from collections.abc import Iterator, Mapping
@@ -30,26 +30,29 @@ from humangs_jax.rendering.splat_config import (
 from humangs_jax.rendering.splatting import Background, Rendering, render
 
 SHOWN = 0.9
-"""Share of the opaque Gaussians that a circle of cameras is made to show: outliers are far away."""
+"""Share of the opaque Gaussians that a circle of cameras shows at least. The others may be
+outliers, far away.
+"""
 NEARLY_ALL = 0.999
-"""Share of the opaque Gaussians whose distance is taken for that of all."""
+"""Share of the opaque Gaussians whose distance stands for that of all."""
 COMPACT = 3.0
-"""Where nearly all are within so many times the distance of `SHOWN`, as of a person, there are no
-outliers: all are shown.
+"""If nearly all Gaussians are within this many times the distance of `SHOWN`, as those of a person
+are, there are no outliers, and all are shown.
 """
 ROOM = 1.1
-"""The distance of the cameras, over the one at which the Gaussians just fit."""
+"""Factor on the distance of the cameras at which the Gaussians just fit."""
 PAIRS = 4_000_000
-"""(splat, tile) pairs that are drawn at once: some hundred megabytes."""
+"""The most (splat, tile) pairs that are drawn at once, in some hundred megabytes."""
 
 
 def circle_cameras(
     gaussians: Gaussians, form: ExportFormat, views: int, shot: FrameSettings
 ) -> dict[str, Camera]:
-    """Cameras around the middle of the Gaussians, by name.
+    """Returns cameras in a circle around the middle of the Gaussians, by name.
 
-    form: of the file that the Gaussians are from. Without an azimuth the first camera sees the
-    front of a person that `export` wrote. Without a distance all of them fit.
+    form: the format of the file that the Gaussians are from. At azimuth 0 the first camera sees the
+    front of a person that `export` wrote. If the shot has no distance, the images hold all
+    Gaussians but outliers.
     """
     means = np.asarray(gaussians.means)[
         np.asarray(gaussians.opacities) >= 0.5 * np.max(gaussians.opacities, initial=0)
@@ -85,8 +88,8 @@ def circle_cameras(
 def splat_images(
     gaussians: Gaussians, cameras: Mapping[str, Camera], shot: FrameSettings
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
-    """One image for each camera, in bounded memory; with alpha where the shot's background is
-    transparent.
+    """Yields one image for each camera, drawn in bounded memory. Images have alpha if the shot's
+    background is transparent.
     """
     preset = "exact" if shot.splat == "as_trained" else shot.splat
     config = SPLAT_PRESETS[preset]
@@ -100,7 +103,8 @@ def splat_images(
 def write_splat_views(
     out: Path, gaussians: Gaussians, cameras: Mapping[str, Camera], shot: FrameSettings
 ) -> int:
-    """Images NAME.png in a folder, which appear together; other files stay. Returns how many.
+    """Write an image NAME.png for each camera into a folder. The images appear together, and other
+    files stay. Returns the number of images.
 
     Raises: OSError.
     """
@@ -125,12 +129,12 @@ def render_in_bands(
     background: Background = None,
     most_pairs: int = PAIRS,
 ) -> Rendering:
-    """The image of `render`, as arrays of numpy, drawn in as many bands as keep each below
-    `most_pairs`; for calls outside of transformations.
+    """Returns the image of `render` in numpy arrays, drawn in as many bands as keep each below
+    `most_pairs` pairs. It works outside of transformations only.
 
-    Bands of one row of tiles may still need more: they get it. Configurations whose image depends
-    on its height (a `jacobian_margin`, or what is asked for of each Gaussian) are drawn whole.
-    Raises: as `render`.
+    Bands of one row of tiles may still need more pairs, and get them. Configurations whose image
+    depends on its height (a `jacobian_margin`, or what is asked for of each Gaussian) are drawn
+    whole. Raises: as `render`.
     """
     whole = (
         config.jacobian_margin is not None or config.visibility or config.means2d or config.radii
@@ -156,8 +160,8 @@ def render_in_bands(
 
 
 def banded(camera: Camera, height: int) -> Camera:
-    """A camera for each band of `height` rows, from the top; the last band may reach beyond the
-    image.
+    """Returns a camera for each band of `height` rows, from the top. The last band may reach beyond
+    the image.
     """
     tops = np.arange(0, camera.height, height)
     shift = (

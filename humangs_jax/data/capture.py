@@ -55,8 +55,8 @@ from humangs_jax.io.images import image_row, png_bytes, resized, write_png
 from humangs_jax.io.reading import FileError, check_limit, reading
 
 DEFAULT_BODY = "makehuman"
-"""Name of the body that comes with the package; any other `body` in body.npz is the path of a model
-file.
+"""The name of the body that comes with the package. Any other `body` in body.npz is the path of a
+model file.
 """
 BODY_KEYS = {"body", "betas", "rotations", "translations"}
 
@@ -84,9 +84,10 @@ class Capture:
     body_file: str = DEFAULT_BODY
     """Where the model comes from, "makehuman" or a path."""
     displacement: Float[np.ndarray, "n 3"] | None = None
-    """Metres by which the vertices of the shaped body move in the T-pose, as another tool
-    registered them (SMPL+D); joints stay. It belongs to `betas`: who changes those leaves it out.
-    None: `reconstruct` finds one by the masks."""
+    """Metres by which the vertices of the shaped body move in the T-pose, (n, 3), as another tool
+    registered them (SMPL+D); joints stay. It belongs to `betas`: code that changes `betas` leaves
+    it out. None: `reconstruct` finds one by the masks.
+    """
     calibrated: bool = True
     """Whether the cameras were calibrated; if not, they were found from the person, and are
     centimetres off.
@@ -104,7 +105,7 @@ class Capture:
     __repr__ = short_repr
 
     def _repr_png_(self) -> bytes:
-        """The photos side by side, for notebooks."""
+        """Returns the photos side by side as a PNG, for notebooks."""
         return png_bytes(image_row(self.images))
 
     @property
@@ -131,7 +132,7 @@ class Capture:
             raise ValueError(f"{owner}: frames: {expected}")
 
     def pose(self, frame: int) -> BodyPose:
-        """The pose of one frame (not of one view: that is `pose(capture.frames[view])`).
+        """Returns the pose of one frame. The pose of a view is `pose(capture.frames[view])`.
 
         Raises: IndexError.
         """
@@ -152,7 +153,7 @@ class Capture:
         )
 
     def resized(self, longest: int) -> "Capture":
-        """The capture with photos whose longest side has that many pixels."""
+        """Returns the capture with photos whose longest side has `longest` pixels."""
         height, width = self.images.shape[1:3]
         size = [max(1, round(side * longest / max(height, width))) for side in (width, height)]
 
@@ -426,7 +427,9 @@ def _load_model(file: object, name: str, folder: Path | None = None) -> BodyMode
 
 
 def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
-    """Model name of body.npz, and what `body_parameters` checks, as it is in the file."""
+    """Read the model's name in body.npz, and the arrays that `body_parameters` checks, as they are
+    in the file.
+    """
     try:
         values, pickled = read_npz(file)
     except FileNotFoundError:
@@ -463,7 +466,10 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
 
 
 def _check_before_writing(capture: Capture) -> None:
-    """Raises: CaptureError for what reading would refuse of a `Capture` that was made by hand."""
+    """Check a `Capture` that was made by hand for faults that reading would refuse.
+
+    Raises: CaptureError.
+    """
     # what the annotations say
     try:
         capture.check("capture")
@@ -515,7 +521,7 @@ def _write_folder(folder: Path, capture: Capture, target: Path) -> None:
 
 
 def capture_parameters(folder: Path, capture: Capture) -> dict[str, np.ndarray]:
-    """The arrays of body.npz of a capture, see `parameter_arrays`."""
+    """Returns the arrays of a capture's body.npz, see `parameter_arrays`."""
     poses = capture.poses
     arrays = parameter_arrays(
         folder, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation
@@ -533,8 +539,8 @@ def parameter_arrays(
     rotations: Any,
     translations: Any,
 ) -> dict[str, np.ndarray]:
-    """The arrays of body.npz of a capture that will be in `folder`; a model file is named relative
-    to it.
+    """Returns the arrays of body.npz of a capture that will be in `folder`. A model file is named
+    relative to this folder.
     """
     if body_file != DEFAULT_BODY:
         body_file = Path(os.path.relpath(Path(body_file).resolve(), folder.resolve())).as_posix()

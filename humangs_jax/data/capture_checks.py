@@ -1,5 +1,5 @@
-"""Values of capture, camera and keypoint files, checked one by one; every fault is a `CaptureError`
-of one line.
+"""Checks the values of capture, camera and keypoint files one by one. Every fault is a
+`CaptureError` of one line.
 """
 
 import functools
@@ -18,25 +18,25 @@ from humangs_jax.io.atomic import check_replaceable
 from humangs_jax.io.reading import FileError, inside, parse_json, read_text, reading, shown
 
 COLOR_SLACK = 1e-3
-"""Resampled images overshoot [0, 1] a little; values further outside have another range, for
-instance 0 to 255.
+"""Resampled images overshoot [0, 1] by less than this. Values further outside have another range,
+such as 0 to 255.
 """
 
 
 LARGEST_TURN = 1e3
-"""Radians of a rotation."""
+"""The largest angle of a rotation, radians."""
 LARGEST_DISTANCE = 1e4
-"""Metres from the origin: farther, float32 loses millimetres, and the numbers are no metres."""
+"""The largest distance from the origin, metres. Farther away float32 loses millimetres, and the
+numbers are hardly metres.
+"""
 LARGEST_BETA = 100.0
-"""Size of a shape coefficient; bodies that exist have less than 10."""
+"""The largest shape coefficient. Bodies that exist have less than 10."""
 LARGEST_DISPLACEMENT = 0.5
-"""Metres that clothes put between a body and its surface."""
+"""The largest distance that clothes put between a body and its surface, metres."""
 
 
 class CaptureError(FileError):
-    """Something is wrong with a capture; the message is one line: file, field, and what was
-    expected.
-    """
+    """A fault in a capture. The message is one line: file, field, and what was expected."""
 
 
 # Files
@@ -44,7 +44,7 @@ class CaptureError(FileError):
 
 
 def checked_text(file: Path, missing: str = "no such file") -> str:
-    """Reads the text of a file. missing: the error text if there is no file."""
+    """Returns the text of a file. missing: the text of the error if there is no file."""
     try:
         return read_text(file)
     except FileNotFoundError:
@@ -54,21 +54,26 @@ def checked_text(file: Path, missing: str = "no such file") -> str:
 
 
 def checked_json(file: Path, text: str | None = None, missing: str = "no such file") -> Any:
-    """The value in a JSON file, or in its text where that is known."""
+    """Returns the value in a JSON file. text: the text of the file, if it is known. missing: the
+    text of the error if there is no file.
+    """
     with reading(file, "JSON file", CaptureError):
         return parse_json(checked_text(file, missing) if text is None else text)
 
 
 def checked_path(folder: Path, name: object, where: object) -> Path:
-    """The path of a photo that a file in a folder names, see `io.reading.inside`. where: what
-    errors name.
+    """Returns the path of a photo that a file in `folder` names, see `io.reading.inside`. where:
+    the place that errors name.
     """
     with reading(where, "path", CaptureError):
         return inside(folder, str(name), photo=True)
 
 
 def check_place(folder: Path, overwrite: bool, inputs: Iterable[Path | None] = ()) -> None:
-    """Whether a capture may be written to a folder, see `io.atomic.check_replaceable`."""
+    """Check that a capture may be written to a folder, see `io.atomic.check_replaceable`.
+
+    Raises: CaptureError.
+    """
     try:
         check_replaceable(folder, overwrite, "capture.json", inputs)
     except ValueError as error:
@@ -76,7 +81,10 @@ def check_place(folder: Path, overwrite: bool, inputs: Iterable[Path | None] = (
 
 
 def required(mapping: Mapping[str, Any], key: str, file: object, prefix: str = "") -> Any:
-    """mapping[key]."""
+    """Returns `mapping[key]`.
+
+    Raises: CaptureError if the key is missing.
+    """
     if key not in mapping:
         raise CaptureError(file, f"{prefix}{key}", "missing")
     return mapping[key]
@@ -89,11 +97,14 @@ KINDS: dict[type, str] = {
     int: "an integer",
     float: "a number",
 }
-"""The types of JSON values, in words."""
+"""The types of JSON values, and their names in errors."""
 
 
 def expect(value: Any, kind: type, file: object, field: str) -> Any:
-    """A JSON value, of one of `KINDS`; names are not empty."""
+    """Returns a JSON value after a check that it is of a type in `KINDS`. Texts must not be empty.
+
+    Raises: CaptureError.
+    """
     allowed = int | float if kind is float else kind
     if not isinstance(value, allowed) or isinstance(value, bool) or value == "":
         raise CaptureError(file, field, f"expected {KINDS[kind]}, got {shown(value)}")
@@ -101,7 +112,11 @@ def expect(value: Any, kind: type, file: object, field: str) -> Any:
 
 
 def members(value: Any, file: object, field: str = "", /, **kinds: type) -> list[Any]:
-    """The members of a JSON object with these names, each of its kind."""
+    """Returns the members of a JSON object with the names in `kinds`, each checked to be of its
+    type.
+
+    Raises: CaptureError.
+    """
     expect(value, dict, file, field)
     prefix = f"{field}." if field else ""
     return [
@@ -111,13 +126,15 @@ def members(value: Any, file: object, field: str = "", /, **kinds: type) -> list
 
 
 def few(names: Sequence[str], most: int = 4) -> str:
-    """Names for an error or a warning; beyond `most` they are counted."""
+    """Returns names for an error or a warning as one text. Names beyond the first `most` are only
+    counted.
+    """
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
 
 
 def counted(number: int, noun: str) -> str:
-    """As in "1 photo" and "2 photos"."""
+    """Returns a number with its noun, as in "1 photo" and "2 photos"."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
@@ -126,15 +143,15 @@ def counted(number: int, noun: str) -> str:
 
 
 file_numbers = functools.partial(arrays.numbers, error=CaptureError)
-"""Float64 numbers of a file, see `io.arrays.numbers`."""
+"""Returns the float64 numbers of a file, see `io.arrays.numbers`."""
 numbers = functools.partial(file_numbers, dtype=np.float32)
-"""Float32 numbers."""
+"""Returns the float32 numbers of a file."""
 
 
 def floats(
     value: Any, file: object, field: str, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "*shape"]:
-    """Finite float64 numbers, however nested, reshaped to `shape` in row-major order."""
+    """Returns finite float64 numbers, nested in any way, reshaped to `shape` in row-major order."""
     array = file_numbers(value, file, field)
     if array.size != np.prod(shape):
         wanted = " x ".join(map(str, shape)) or "one"
@@ -145,7 +162,9 @@ def floats(
 def in_unit_range(
     array: Float[np.ndarray, "*shape"], file: object, field: str
 ) -> Float[np.ndarray, "*shape"]:
-    """Colors or coverage in [0, 1]; what overshoots by less than `COLOR_SLACK` is clipped."""
+    """Returns colors or coverage in [0, 1]. Values that overshoot by less than `COLOR_SLACK` are
+    clipped.
+    """
     low, high = float(array.min()), float(array.max())
     if low < -COLOR_SLACK or high > 1 + COLOR_SLACK:
         raise CaptureError(file, field, f"expected values in [0, 1], got {low:.4g} to {high:.4g}")
@@ -159,7 +178,7 @@ def in_unit_range(
 def checked_camera(
     K: np.ndarray, cam_from_world: np.ndarray, width: int, height: int, file: object, prefix: str
 ) -> Camera:
-    """A camera of a rigid, right-handed pose."""
+    """Returns a camera whose pose is rigid and right-handed."""
     try:
         return Camera.from_opencv(K, cam_from_world, width, height)
     except ValueError as error:
@@ -167,7 +186,7 @@ def checked_camera(
 
 
 def checked_frame(frame: Any, count: int, file: object, field: str) -> int:
-    """An integer that counts one of the poses."""
+    """Returns the number of a pose, an integer from 0 to `count` - 1."""
     if not 0 <= expect(frame, int, file, field) < count:
         raise CaptureError(
             file, field, f"expected 0 to {count - 1} (there are {count} poses), got {frame}"
@@ -189,7 +208,8 @@ def body_parameters(
     Float[np.ndarray, "m 3"],
     Float[np.ndarray, "n 3"] | None,
 ]:
-    """betas, rotations, translations and displacement in float32, of the sizes that the body has.
+    """Returns betas, rotations, translations and displacement in float32, checked to have the sizes
+    that the body has.
 
     Arguments: shape_names: see `shape_coefficients`. displacement: see `Capture`; None: there is
     none.
@@ -228,7 +248,8 @@ def body_parameters(
 def shape_coefficients(
     body: BodyModel, betas: Float[np.ndarray, " s"], names: Sequence[str] | None, file: object
 ) -> Float[np.ndarray, " used"]:
-    """Coefficients of the body's first directions, from numbers whose kind is known.
+    """Returns coefficients of the body's first directions, made of numbers whose directions are
+    known.
 
     Arguments: names: of the directions that the numbers belong to, as in `BodyModel.shape_names`.
     None: the numbers are those of SMPL-X's shape, without expressions, or of all of the body's own
@@ -275,7 +296,7 @@ def shape_coefficients(
 
 
 def check_names(names: Sequence[str], count: int, file: object) -> None:
-    """One per view, different, and harmless as file names."""
+    """Check the names of views: one for each view, all different, and safe as file names."""
     if len(names) != count or len(set(names)) < count:
         raise CaptureError(file, "names", f"expected {count} different names, got {list(names)}")
     for name in names:

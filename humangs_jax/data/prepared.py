@@ -1,5 +1,5 @@
-"""What is decided about the photos of a person before they are used, decided once: which views show
-the person, their exposure, which way is up, and the body that carries the Gaussians.
+"""Makes all decisions about the photos of a person once, before they are used: which views show the
+person, their exposure, which way is up, and the body that carries the Gaussians.
 
 `reconstruct`, `refine` and `check_capture` take a `PreparedCapture` as well as a `Capture`, which
 they prepare themselves.
@@ -34,18 +34,20 @@ from humangs_jax.network.config import HumanGSConfig
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class PreparedCapture:
-    """A capture with all that is decided before its use. `prepare_capture` makes it."""
+    """A capture with all decisions about its use. `prepare_capture` makes it."""
 
     given: Capture
     """The capture as it came: all its views, in its own colors and its own world."""
     capture: Capture
     """The views to use: those that show the person, in equal exposure, in a world with y up."""
     left_out: dict[str, str]
-    """Why views do not show the person, by their names; they are not in `capture`."""
+    """The reasons why views do not show the person, by the names of the views. These views are not
+    in `capture`.
+    """
     up: str
     """The axis that points up in the world of `given`: "y", "z", "-z" and the like."""
     chosen: bool = False
-    """Whether further views were left out, which add little to what the others show."""
+    """Whether further views were left out because they add little to what the others show."""
     body: BodyModel | None = None
     """The body that carries the Gaussians, with a skirt where the photos show one.
 
@@ -76,19 +78,21 @@ class PreparedCapture:
         return self.up != "y"
 
     def select(self, views: Sequence[int] | Int[np.ndarray, " any"]) -> "PreparedCapture":
-        """Some of the views to use, in this order. The body is to be decided by these."""
+        """Returns the capture with some of the views to use, in this order. It has no body, which
+        depends on the views.
+        """
         chosen = self.capture.select(views)
         return PreparedCapture(self.given, chosen, self.left_out, self.up, chosen=True)
 
     def resized(self, longest: int) -> "PreparedCapture":
-        """The same with photos whose longest side has that many pixels; the body is to be decided
-        by these.
+        """Returns the capture with photos whose longest side has `longest` pixels. It has no body,
+        which depends on the photos.
         """
         smaller = self.capture.resized(longest)
         return PreparedCapture(self.given, smaller, self.left_out, self.up, self.chosen)
 
     def with_body(self, config: HumanGSConfig) -> "PreparedCapture":
-        """The same with the body that carries the Gaussians of a network."""
+        """Returns the capture with the body that carries the Gaussians of a network."""
         capture = self.capture
         body = gaussian_body(capture.body, config)
         moved, skirted = None, None
@@ -176,8 +180,8 @@ def prepare_capture(
 
 
 def allows_vertex_offsets(config: HumanGSConfig) -> bool:
-    """Whether the body may be displaced and get a skirt: if the network looks at the person's
-    pixels alone.
+    """Returns whether the body may be displaced and get a skirt. It may if the network looks at the
+    person's pixels alone.
     """
     return config.runtime.displacement is not False and config.conventions.pixels == "person"
 

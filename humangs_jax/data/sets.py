@@ -1,10 +1,10 @@
-"""A set of many that is made bit by bit: one folder, a manifest of what it is made with, a folder
-for each one that is finished.
+"""A set of many items that is made bit by bit: one folder, with a manifest of what the set is made
+with, and a folder for each finished item.
 
-The same call goes on with an interrupted set: what is finished is kept, other settings are refused.
-Several processes may make parts of one set at the same time; each ends by writing the manifest of
-what is there. A name alone does not tell what something was made from: whoever keeps what is
-finished compares contents, too (`avatar.recorded_source`, `files_key`).
+The same call continues an interrupted set: finished items are kept, and other settings are refused.
+Several processes may make parts of one set at the same time. Each ends by writing the manifest of
+what is there. A name alone does not tell what an item was made from, so code that keeps finished
+items compares contents, too (`avatar.recorded_source`, `files_key`).
 """
 
 import functools
@@ -19,19 +19,19 @@ from humangs_jax.io.arrays import checksum
 from humangs_jax.io.reading import shown, write_json
 
 MANIFEST = "manifest.json"
-"""File that says what a folder is."""
+"""The file that says what kind of set a folder is."""
 SETTINGS = "settings"
-"""Its key of what the folder was made with."""
+"""The key of the manifest for the settings that the folder was made with."""
 K = TypeVar("K")
 
 
 class SetFormat(NamedTuple):
-    """The first entries in the manifest of a kind of sets."""
+    """The name and version of a kind of sets, the first entries in its manifest."""
 
     format: str
     """The name of the format."""
     version: int
-    """Its version."""
+    """The version of the format."""
 
 
 SYNTHETIC = SetFormat("humangs-synthetic", 2)
@@ -43,11 +43,14 @@ AVATARS = SetFormat("humangs-avatars", 2)
 SCORES = SetFormat("humangs-scores", 1)
 """Scores of an evaluation."""
 LOOK = 1 << 16
-"""Bytes at the beginning of each file of a data set that `files_key` looks at."""
+"""The number of bytes at the beginning of each file that `files_key` reads."""
 
 
 def read_manifest(folder: Path, kind: SetFormat) -> dict[str, Any]:
-    """The manifest of a set. Raises: CaptureError if there is none of this kind."""
+    """Read the manifest of a set.
+
+    Raises: CaptureError if there is none of this kind.
+    """
     file = Path(folder) / MANIFEST
     content = checked_json(file)
     if not isinstance(content, dict) or content.get("format") != kind.format:
@@ -66,11 +69,11 @@ def read_manifest(folder: Path, kind: SetFormat) -> dict[str, Any]:
 def begin_set(
     folder: Path, kind: SetFormat, made_with: Mapping[str, Any], alone: bool = False
 ) -> None:
-    """Start a set in a folder, or check that the one that is there can be gone on with.
+    """Start a set in a folder, or check that the set in it can be continued.
 
-    Arguments: made_with: what all of it is made with; `SETTINGS` in it is a dictionary. alone: a
-    new set needs an empty folder.
-    Raises: CaptureError for a set that was made with something else; ValueError.
+    Arguments: made_with: what the whole set is made with; its entry `SETTINGS` is a dictionary.
+    alone: whether a new set needs an empty folder. Raises: CaptureError for a set that was made
+    with something else; ValueError.
     """
     if not (folder / MANIFEST).is_file():
         if (
@@ -103,8 +106,8 @@ def _flat(content: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]
 
 
 def files_key(root: Path, files: Iterable[Path]) -> str:
-    """A checksum of the names below `root`, the sizes and the first `LOOK` bytes of files; some may
-    be missing.
+    """Returns a checksum of the names of files below `root`, their sizes and their first `LOOK`
+    bytes. Some of the files may be missing.
 
     It tells data sets apart without reading all of their photos.
     """
@@ -121,9 +124,10 @@ def files_key(root: Path, files: Iterable[Path]) -> str:
 def write_manifest(
     folder: Path, kind: SetFormat, made_with: Mapping[str, Any], **found: Any
 ) -> dict[str, Any]:
-    """Written aside, then renamed, so that it is never half there. found: what is in the set.
+    """Write the manifest of a set, by renaming a finished file, so that it is never half written.
+    found: what is in the set.
 
-    Returns its content.
+    Returns the content of the manifest.
     """
     content = {**kind._asdict(), **made_with, **found}
     write_json(folder / MANIFEST, content)
@@ -131,7 +135,9 @@ def write_manifest(
 
 
 def finished(folder: Path, mark: str) -> list[str]:
-    """Names of the folders that hold the file `mark`, which is written with all of them at once."""
+    """Returns the names of the folders that hold the file `mark`. A folder with this file is
+    complete.
+    """
     return sorted(
         path.parent.name
         for path in folder.glob(f"*/{mark}")
@@ -145,12 +151,13 @@ def made(
     workers: int,
     load: Callable[[], object],
 ) -> Iterator[tuple[K, Exception | None]]:
-    """Yields (name, None or what is wrong with it) of tasks by name, as they end; an OSError ends
-    all: the disk may be full.
+    """Run tasks in parallel. Yields the name of each task as it ends, with None or the error that
+    it raised. An OSError ends all tasks, because the disk may be full.
 
-    Arguments: work: called as work(what `load` has made, *arguments of the task). workers:
-    processes, which use the CPU; `load` is called once in each. All of it is pickled, and the
-    calling script is guarded by `if __name__ == "__main__"`.
+    Arguments: work: called as work(what `load` has returned, *arguments of the task). tasks: the
+    arguments by name. workers: the number of processes, which use the CPU; `load` is called once in
+    each. All of it is pickled, and the calling script has to be guarded by `if __name__ ==
+    "__main__"`.
     """
     once = functools.partial(_attempt, work)
     if workers > 1 and len(tasks) > 1:

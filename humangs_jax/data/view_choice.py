@@ -1,4 +1,4 @@
-"""Which photos of many together show the body best."""
+"""Chooses from many photos those that together show the body best."""
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +16,17 @@ from humangs_jax.network.reader import project_vertices, visible_vertices
 SELECTION_SIZE = 128
 """Pixels a side of the depth maps: enough to know which side of the body a photo shows."""
 SELECTION_VERTICES = 2000
-"""Vertices of the body that is looked at."""
+"""The number of vertices of the body on which photos are compared."""
 LEAST_GAIN = 0.03
-"""A further photo has to add this share to what the chosen ones show.
+"""The least share that a further photo has to add to what the chosen photos show.
 
-Only where no number of photos is given.
+It counts only if no number of photos is given.
 """
 
 
 def best_views(capture: Capture, count: int | None) -> list[int]:
-    """The numbers of `count` photos, in ascending order, that together show the body best; all of
-    them if there are no more.
+    """Returns the numbers of `count` photos, in ascending order, that together show the body best;
+    those of all photos if there are no more.
 
     Greedy: each next photo adds most to the sum, over the vertices, of area times the best
     `view_quality`. The sum is submodular, so the choice reaches at least 63 % of the best one
@@ -54,8 +54,8 @@ def best_views(capture: Capture, count: int | None) -> list[int]:
 
 
 def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0.0) -> list[int]:
-    """Rows of a matrix, one after the other, each of which raises the sum of the columns' maxima
-    most; none after the first that raises it by less than the share `least`.
+    """Returns rows of a matrix, one after the other. Each raises the sum of the columns' maxima
+    most. It stops before a row that raises the sum by less than the share `least`.
     """
     chosen, best = list[int](), np.zeros(quality.shape[1])
     for _ in range(min(count, len(quality))):
@@ -70,10 +70,10 @@ def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0
 
 @jax.jit
 def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
-    """How well every view shows every vertex, in [0, 1].
+    """Returns how well every view shows every vertex, in [0, 1].
 
-    The cosine between normal and line of sight, times pixels per metre over the most of all views;
-    0 where the vertex is hidden or outside of the mask.
+    This is the cosine between normal and line of sight, times the pixels per metre as a share of
+    the most of all views. It is 0 where the vertex is hidden or outside of the mask.
     """
     config = presets.small().with_conventions(pixels="person")
     inputs = prepare_inputs(body, views, config)

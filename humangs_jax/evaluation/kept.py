@@ -1,11 +1,12 @@
-"""Scores of people who are finished, in a folder, so that an interrupted evaluation goes on.
+"""Keeps the scores of finished people in a folder, so that an interrupted evaluation can be
+continued.
 
-folder/manifest.json           what all of it is made with, see `data.sets`
-folder/person_NAME_KEY.json    the scores of one person; KEY: a checksum of all that they depend on
+    folder/manifest.json           what the evaluation is made with, see `data.sets`
+    folder/person_NAME_KEY.json    the scores of one person; KEY: a checksum of all that they
+                                   depend on
 
-The key of a person holds contents, not names: photos, masks, cameras, poses and body, and the
-weights, avatar or images that are compared. Scores of other contents are never taken for those that
-are asked for.
+The key of a person depends on contents, not names: photos, masks, cameras, poses and body, and the
+weights, avatar or images that are compared. Scores of other contents are never reused.
 """
 
 import inspect
@@ -28,15 +29,17 @@ from humangs_jax.io.arrays import SHORT, checksum, file_checksum
 from humangs_jax.io.reading import read_json, write_json
 
 LONGEST_NAME = 40
-"""Characters of a person's name in the name of a file: for readers, the key tells people apart."""
+"""The most characters of a person's name in a file name. The name is for readers; the key tells
+people apart.
+"""
 
 CaseKey = Callable[[Case], str]
-"""What a prediction of a case depends on besides the case."""
+"""A function that returns what the prediction of a case depends on besides the case."""
 
 
 class KeptScores:
-    """The scores in a folder. ordered: those of a person also depend on who comes before, as the
-    images of a page do.
+    """The scores in a folder. ordered: whether the scores of a person also depend on the people
+    before, as the images of a page do.
 
     Raises: CaptureError for a folder of scores that were made with other settings.
     """
@@ -51,8 +54,8 @@ class KeptScores:
     def __call__(
         self, case: Case, score: Callable[[], dict[str, Any]]
     ) -> tuple[dict[str, Any], bool]:
-        """What there is to say of a person, and whether it was kept; `score` is called where it was
-        not.
+        """Returns the results of a person, and whether they were kept. `score` is called for
+        results that were not kept.
         """
         key = checksum({}, self._before, case_key(case), self._method(case))
         if self._ordered:
@@ -68,20 +71,20 @@ class KeptScores:
 
 
 def _tree_key(tree: Any) -> str:
-    """A checksum of the arrays of a pytree, and of its structure."""
+    """Returns a checksum of the arrays of a pytree and of its structure."""
     leaves, structure = jax.tree.flatten(tree)
     return checksum({str(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}, str(structure))
 
 
 def _file_key(file: Path) -> str:
-    """A checksum of the bytes of a file; of one that is not there, that it is not."""
+    """Returns a checksum of the bytes of a file; "none" if there is no such file."""
     if file.is_file():
         return file_checksum(file)
     return "none"
 
 
 def case_key(case: Case) -> str:
-    """A checksum of the name of a case and of all that is in its captures."""
+    """Returns a checksum of the name of a case and of all that is in its captures."""
     inputs = "none"
     if case.inputs is not None:
         inputs = _capture_key(case.inputs)
@@ -104,7 +107,7 @@ def _capture_key(capture: Capture) -> str:
 
 
 def indices_key(indices: Mapping[str, Any] | None) -> str | None:
-    """A short checksum of which views are inputs and targets; None without."""
+    """Returns a short checksum of the choice of inputs and targets; None if there is none."""
     if indices is None:
         return None
     plain = {
@@ -115,7 +118,7 @@ def indices_key(indices: Mapping[str, Any] | None) -> str | None:
 
 
 def body_key(body: BodyModel | str | Path | None) -> str | None:
-    """A short checksum of a body that was given; None for the shipped one."""
+    """Returns a short checksum of a given body; None for the shipped body."""
     if body is None:
         return None
     if isinstance(body, BodyModel):
@@ -124,7 +127,7 @@ def body_key(body: BodyModel | str | Path | None) -> str | None:
 
 
 def networks_key(networks: Mapping[str, Any]) -> list[str]:
-    """Names and short checksums of loss networks, in order."""
+    """Returns the names and short checksums of loss networks, sorted by name."""
     return [f"{name} {_tree_key(network)[:SHORT]}" for name, network in sorted(networks.items())]
 
 
@@ -135,10 +138,10 @@ def method_key(
     predictions: str | Path | None,
     method: Method | None,
 ) -> tuple[str, CaseKey]:
-    """What the predictions of all people depend on, as a short text, and what those of one depend
-    on; see `choose_method`.
+    """Returns a short text of what the predictions of all people depend on, and a function that
+    returns what those of one person depend on; see `choose_method`.
 
-    A `method` is known by its name and source alone: not by the values of variables that it reads.
+    A `method` is known by its name and source alone, not by the values of variables that it reads.
     """
     nothing: CaseKey = lambda case: ""
     if method is not None:

@@ -1,6 +1,8 @@
-"""Means of scores: first over the images of a frame, then over the frames of a person, then over
-people: a person counts once, however often photographed. An interval is of the mean over people;
-with one person, over the frames; with one frame, over the images.
+"""Means of scores, first over the images of a frame, then over the frames of a person, then over
+people. Thus a person counts once, however often photographed.
+
+An interval is that of the mean over people; with one person, over frames; with one frame, over
+images.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -47,7 +49,9 @@ class Mean(NamedTuple):
 
 
 def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
-    """Means of the scores of some images or people. A score that one of them lacks is None."""
+    """Returns the mean of each score over some images or people. A score that one of them lacks is
+    None.
+    """
     listed = list(rows)
     lacking = {name for name in listed[0] for row in listed if row.get(name) is None}
     means = _known_means(listed)
@@ -55,8 +59,8 @@ def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
 
 
 def _known_means(rows: Sequence[Mapping[str, float | None]]) -> Row:
-    """Means of each score over the rows that have it: not all images have patches, for example. A
-    score that no row has is None.
+    """Returns the mean of each score over the rows that have it, since not all images have patches,
+    for example. A score that no row has is None.
     """
     means: Row = {}
     for name in rows[0]:
@@ -67,7 +71,9 @@ def _known_means(rows: Sequence[Mapping[str, float | None]]) -> Row:
 
 
 def _means_by(rows: Iterable[tuple[Any, Row]]) -> dict[Any, Row]:
-    """`_known_means` of the rows that share a key, in the order of first appearance."""
+    """Returns `_known_means` of the rows that share a key, by this key, in the order of first
+    appearance.
+    """
     groups: dict[Any, list[Row]] = {}
     for key, row in rows:
         groups.setdefault(key, []).append(row)
@@ -79,13 +85,13 @@ def _frame_means(rows: Sequence[Scored]) -> dict[tuple[str, int], Row]:
 
 
 def person_means(rows: Sequence[Scored]) -> dict[str, Row]:
-    """Scores by person: means over the images of a frame, then over frames."""
+    """Returns the scores of each person: means over the images of a frame, then over frames."""
     return _means_by((person, row) for (person, _), row in _frame_means(rows).items())
 
 
 def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
-    """The mean of each score with its interval, see the head of this module; None for scores that
-    no image has.
+    """Returns the mean of each score with its interval, as the head of this module says; None for
+    scores that no image has.
     """
     levels = {
         "people": list(person_means(rows).values()),
@@ -105,8 +111,8 @@ def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
 
 
 def bootstrap(values: Sequence[float], seed: int = 0) -> tuple[float | None, float | None]:
-    """The percentile interval of the mean of some values under resampling (Efron, 1979); (None,
-    None) for one value.
+    """Returns the ends of the percentile interval of the mean of some values under resampling
+    (Efron, 1979); (None, None) for one value.
     """
     if len(values) < 2:
         return None, None

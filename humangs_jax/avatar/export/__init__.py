@@ -1,8 +1,8 @@
-"""An avatar in the files that other people's programs open (docs/export.md), and videos of it: the
-tables of their formats.
+"""The tables of the formats in which avatars are exported for other programs (docs/export.md), and
+of the formats of videos.
 
-`gaussians` has what reads and writes, `splats` and `spz` the formats of Gaussians, `mesh` those of
-the body.
+`gaussians` has the functions that read and write, `splats` and `spz` the formats of Gaussians,
+`mesh` those of the body.
 """
 
 import dataclasses
@@ -19,26 +19,26 @@ HERE = "humangs_jax.avatar.export"
 
 @dataclasses.dataclass(frozen=True)
 class ExportFormat(Format):
-    """One format. code: called as code(path, gaussians), of meshes as code(paths, avatar, poses or
-    motion, up, name).
+    """A format of exported files. code: called as code(path, gaussians); formats of meshes as
+    code(paths, avatar, poses or motion, up, name).
     """
 
     up: Up = "y"
     """The axis that the readers of this format take for up."""
     mesh: bool = False
-    """Whether it holds the body as a textured mesh, not Gaussians."""
+    """Whether the format holds the body as a textured mesh, not Gaussians."""
     animated: bool = False
     """Whether one file holds all frames of a motion."""
     rest_fields: bool = False
-    """It may have all 45 `f_rest_*` fields, which some importers (Unity) require: code(path,
-    gaussians, rest_fields).
+    """Whether the format may have all 45 `f_rest_*` fields, which some importers (Unity) require.
+    Then code is called as code(path, gaussians, rest_fields).
     """
     versions: tuple[int, ...] = ()
-    """The versions that are written, where one may be chosen, the usual one first: code(path,
-    gaussians, version).
+    """The versions that can be written, the usual one first; empty where there is no choice. With
+    versions, code is called as code(path, gaussians, version).
     """
     backwards: bool = False
-    """Whether its axes are to the right, up and back: half a turn about y from ours."""
+    """Whether the format's axes point to the right, up and back, half a turn about y from ours."""
     beside: tuple[str, ...] = ()
     """Suffixes of further files, of the same name, that are written with it."""
     reader: str | Callable[[bytes], Any] = ""
@@ -46,7 +46,9 @@ class ExportFormat(Format):
     it; raises `io.reading.InvalidFileError`.
     """
     magic: tuple[bytes, ...] = ()
-    """How files of the format may begin; empty: their beginning does not say."""
+    """The bytes with which files of the format may begin; empty where the beginning does not
+    tell.
+    """
 
 
 EXPORTS = Formats(
@@ -104,7 +106,9 @@ EXPORTS = Formats(
         beside=(".mtl", ".png"),
     ),
 )
-"""By name; a suffix has at most one format of Gaussians and one of meshes."""
+"""The formats that can be written, by name. A suffix has at most one format of Gaussians and one of
+meshes.
+"""
 
 READ_ONLY = Formats(
     sog=ExportFormat(
@@ -142,12 +146,12 @@ OTHERS = {
 
 @dataclasses.dataclass(frozen=True)
 class VideoFormat(Format):
-    """One format. code: called as code(path, frames, fps, shape of a frame)."""
+    """A format of videos. code: called as code(path, frames, fps, shape of a frame)."""
 
     transparent: bool = False
     """Whether frames may have alpha."""
     even_sides: bool = False
-    """Whether its codec wants even sides: odd ones get one more row or column."""
+    """Whether the codec needs even sides. Odd sides get one more row or column."""
 
 
 _VIDEO = "humangs_jax.avatar.video"
@@ -168,17 +172,18 @@ VIDEOS = Formats(
 
 
 def files_beside(path: Path, form: ExportFormat) -> list[Path]:
-    """The further files of an output.
+    """Returns the further files of an output.
 
-    White space of its name becomes "_" in theirs: many readers of `.obj` end names there.
+    White space in the output's name becomes "_" in theirs, because many readers of `.obj` end names
+    there.
     """
     stem = "_".join(path.stem.split())
     return [path.with_name(stem + suffix) for suffix in form.beside]
 
 
 def chosen_format(suffix: str, mesh: bool = False) -> ExportFormat | None:
-    """The format of files with this suffix, None for none. mesh: of meshes alone, else of Gaussians
-    where there is one.
+    """Returns the format of files with this suffix, None if there is none. mesh: whether it has to
+    be a format of meshes; if not, formats of Gaussians come first.
     """
     found = [
         each for each in EXPORTS.values() if suffix.lower() in each.suffixes and each.mesh >= mesh

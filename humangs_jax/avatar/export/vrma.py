@@ -30,13 +30,13 @@ BONES = {
     "left_wrist": "leftHand", "right_collar": "rightShoulder", "right_shoulder": "rightUpperArm",
     "right_elbow": "rightLowerArm", "right_wrist": "rightHand",
 }  # fmt: skip
-"""VRM's names of our joints; jaw and eyes have none in animations."""
+"""VRM's names of our joints. Animations have no jaw and no eyes."""
 VRM_FINGERS = {"pinky": "Little"}
-"""Fingers that VRM calls otherwise."""
+"""The fingers that have another name in VRM."""
 
 
 def _bone_names() -> dict[str, str]:
-    """VRM's name of each joint of ours that it has."""
+    """Returns VRM's name of each of our joints that VRM has."""
     names = dict(BONES)
     for side in ("left", "right"):
         for finger in FINGERS:

@@ -49,9 +49,10 @@ FIT = "smplx_param.pkl"
 FIT_MESH = "mesh_smplx.obj"
 """File of that body's mesh."""
 TOLERANCE = 2e-3
-"""Metres of the body, mean over vertices, up to which a fit reproduces mesh_smplx.obj. Rounding of
-OBJ files is far below; another gender moves vertices by centimetres, a wrong hand convention the
-fingers by as much."""
+"""The largest mean distance of a fit's vertices from mesh_smplx.obj, metres of the body. Rounding
+of OBJ files is far below. Another gender moves vertices by centimetres, and a wrong hand convention
+moves the fingers by as much.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -85,7 +86,7 @@ class Scan:
 
 
 def find_thuman(folder: str | Path) -> tuple[Path, ...]:
-    """The folder, if it holds scans."""
+    """Returns the folder if it holds scans; else nothing."""
     folder = Path(folder)
     if (folder / "model").is_dir() and (folder / "smplx").is_dir():
         return (folder,)
@@ -93,13 +94,13 @@ def find_thuman(folder: str | Path) -> tuple[Path, ...]:
 
 
 def scan_files(folder: Path, name: str) -> tuple[Path, Path]:
-    """The mesh and the fit of a scan."""
+    """Returns the files of the mesh and of the fit of a scan."""
     return folder / "model" / name / f"{name}.obj", folder / "smplx" / name / FIT
 
 
 def open_thuman(folder: str | Path) -> tuple[list[str], dict[str, str]]:
-    """The names of the scans in a folder that holds model/ and smplx/, sorted; and why others
-    cannot be used, by name.
+    """Returns the names of the scans in a folder that holds model/ and smplx/, sorted, and the
+    reasons why others cannot be used, by name.
 
     Raises: CaptureError if there are none.
     """
@@ -193,8 +194,8 @@ _ANGLES = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "
 
 
 def fit_error(fitted: PosedPerson, mesh: Float[np.ndarray, "n 3"], fit: Fit) -> tuple[float, float]:
-    """Mean and largest distance between the vertices of the fitted body and mesh_smplx.obj, metres
-    of the body.
+    """Returns the mean and the largest distance between the vertices of the fitted body and
+    mesh_smplx.obj, metres of the body.
 
     Raises: CaptureError, saying the error, if the mean is above `TOLERANCE` or the numbers of
     vertices differ.
@@ -220,7 +221,8 @@ def fit_error(fitted: PosedPerson, mesh: Float[np.ndarray, "n 3"], fit: Fit) -> 
 
 
 def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]:
-    """Vertices and triangles of an OBJ file, every vertex once and in the order of the file.
+    """Returns the vertices and triangles of an OBJ file. Every vertex occurs once, in the order of
+    the file.
 
     Raises: CaptureError.
     """
@@ -248,7 +250,10 @@ def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.nd
 
 
 def read_scan(file: str | Path) -> Scan:
-    """The mesh of a scan with its texture. Raises: CaptureError naming the file."""
+    """Read the mesh of a scan and its texture.
+
+    Raises: CaptureError naming the file.
+    """
     with reading(file, "scan", CaptureError):
         meshes = read_obj(file)
         if len(meshes) != 1:

@@ -1,12 +1,12 @@
-"""The loader: which people and views a step has is a pure function of (seed, step); a run that
-resumes sees the same batches.
+"""The loader of batches. The people and views of a step are a pure function of (seed, step), so
+that a run that resumes sees the same batches.
 
 A `Source` has examples by number: `CaptureSource` (people on disk: capture folders, written
 synthetic sets, data sets), `GeneratedSource` (people made on the fly from keys) and `Mixture`
-(several of these by weight). `Loader` makes batches of one: each process the rows of its devices,
-some batches ahead of the loop. Several threads make examples in order, one prepares the batches
-that are asked for next. Threads suffice: decoding and jitted functions release the interpreter's
-lock.
+(several of these by weight). `Loader` makes batches of the examples of one source. Each process
+makes the rows of its devices, some batches ahead of the loop. Several threads make examples in
+order, and one thread prepares the batches that are asked for next. Threads suffice, because
+decoding and jitted functions release the interpreter's lock.
 """
 
 import collections
@@ -36,22 +36,22 @@ __all__ = [
 ]
 
 AHEAD = 2
-"""Batches prepared while one is worked on."""
+"""Batches that are prepared while one is worked on."""
 
 
 @dataclasses.dataclass
 class Waiting:
-    """How long a loop waited for its data."""
+    """The time for which a loop waited for its data."""
 
     seconds: float = 0.0
     """The total, seconds."""
     first_seconds: float = 0.0
-    """What the first item took of it, seconds."""
+    """The part of the total for the first item, seconds."""
     items: int = 0
     """How many items the loop waited for."""
 
     def add(self, seconds: float) -> None:
-        """One more item."""
+        """Count one more item, and add the time for which the loop waited for it, seconds."""
         if self.items == 0:
             self.first_seconds = seconds
         self.seconds += seconds
@@ -63,18 +63,18 @@ class Loader:
     """Batches from a source."""
 
     source: Source
-    """What makes the examples."""
+    """The source of the examples."""
     batch_size: int = 1
-    """Subjects of the global batch, over all processes."""
+    """The number of subjects in the global batch, over all processes."""
     seed: int = 0
-    """The seed of order and views."""
+    """The seed of the order of subjects and of the choice of views."""
     sharding: jax.sharding.Sharding | None = None
-    """How a batch lies on the devices (only its first axis may be split); a process makes the rows
-    that its own devices hold, so that replicas hold equal rows. None: everything on the default
+    """How a batch lies on the devices. Only its first axis may be split. A process makes the rows
+    that its devices hold, so that replicas hold equal rows. None: everything is on the default
     device.
     """
     first_step: int = 0
-    """The step that the numbering of examples starts at: steps before it had other batches."""
+    """The step at which the numbering of examples starts. Steps before it had other batches."""
     first_example: int = 0
     """The number of the first example of that step."""
     threads: int = 4
@@ -82,7 +82,7 @@ class Loader:
 
     @property
     def rows(self) -> tuple[int, ...]:
-        """Rows of the global batch that this process makes."""
+        """The rows of the global batch that this process makes."""
         if self.sharding is None:
             return tuple(range(self.batch_size))
         parts = self.sharding.addressable_devices_indices_map((self.batch_size,)).values()
@@ -98,36 +98,38 @@ class Loader:
         )
 
     def input_count(self, step: int) -> int:
-        """Number of input views of a step."""
+        """Returns the number of input views of a step."""
         return input_count_at(self.seed, step, self.source.input_counts)
 
     def example_at(self, step: int, row: int) -> Example:
-        """Row `row` of the global batch of a step."""
+        """Returns row `row` of the global batch of a step."""
         return self.source.example(self.seed, self._number(step, row), self.input_count(step))
 
     def describe_at(self, step: int, row: int) -> str:
-        """Names the person and views of that row, in words."""
+        """Returns in words the person and the views of row `row` of the global batch of a step."""
         return self.source.describe(self.seed, self._number(step, row), self.input_count(step))
 
     def _number(self, step: int, row: int) -> int:
         return self.first_example + (step - self.first_step) * self.batch_size + row
 
     def batch_at(self, step: int) -> Example:
-        """The batch of a step on the devices: an `Example` with a leading batch axis on every leaf.
+        """Returns the batch of a step on the devices: an `Example` with a leading batch axis on
+        every leaf.
 
-        With a sharding, global arrays; without one, the rows of this process.
+        With a sharding, the leaves are global arrays; without one, they hold the rows of this
+        process.
         """
         return self._place([self.example_at(step, row) for row in self.rows])
 
     def batches(
         self, start: int, stop: int, waiting: Waiting | None = None
     ) -> Generator[tuple[int, Example], None, None]:
-        """(step, batch) for start <= step < stop; `AHEAD` batches are made and put on the devices
-        by threads meanwhile.
+        """Yields (step, batch) for start <= step < stop. Meanwhile threads make `AHEAD` further
+        batches and put them on the devices.
 
         Errors of the threads are raised here, in their turn. Closing the generator (or leaving the
-        loop over it) ends them.
-        waiting: the time that the loop waited for batches is added to it.
+        loop over it) ends the threads. waiting: the time for which the loop waited for batches is
+        added to it.
         """
         rows, begun = self.rows, collections.deque[list[Future]]()
         # one thread places batches on the devices, so that they get there in order
@@ -164,7 +166,7 @@ class Loader:
                     future.cancel()
 
     def _place(self, examples: list[Example]) -> Example:
-        """Stack the rows of this process and put them on the devices."""
+        """Stack the rows of this process, and put them on the devices."""
         batch = jax.tree.map(_stack, *examples)
         sharding = self.sharding
         if sharding is None:
@@ -182,7 +184,7 @@ class Loader:
 
 
 def _stack(*leaves: Array | np.ndarray) -> Array | np.ndarray:
-    """Leaves that are all on a device stay there."""
+    """Returns stacked leaves. Leaves that are all on a device stay there."""
     on_device = all(isinstance(leaf, jax.Array) for leaf in leaves)
     if on_device:
         return jnp.stack(leaves)

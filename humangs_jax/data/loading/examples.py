@@ -1,9 +1,9 @@
-"""Examples to learn from: some views of a subject are the input, others the targets; their order,
-and mixtures of sources.
+"""Makes the examples to learn from: some views of a subject are the input, others the targets. Also
+has the order of examples, and mixtures of sources.
 
-All of it is numpy, and pure functions of (seed, number): example e = step * batch + i is the i-th
-of its batch, so that a run resumes from its step alone. Each purpose draws from a stream of its
-own.
+All of it is numpy, and pure functions of (seed, number). Example e = step * batch + i is the i-th
+of its batch, so that a run resumes from its step alone. Each purpose draws from a separate stream
+of random numbers.
 """
 
 import dataclasses
@@ -21,8 +21,8 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import resized
 
 WINDOW = (25, 59)
-"""Rule "window": least and greatest distance of the two ends of a window, in views of a subject
-that has `WINDOW_OF`.
+"""Least and greatest distance of the two ends of a window in the rule "window", in views of a
+subject that has `WINDOW_OF` views.
 """
 WINDOW_OF = 60
 
@@ -42,11 +42,12 @@ class ViewSampling:
     mixed_pose_share: Share = 0.3
     """The share of examples whose inputs may each show another pose (frame)."""
     rule: Literal["random", "window"] = "random"
-    """"random": inputs stand around the subject, targets are drawn from all other views, of any
-    pose. "window": the release's. Of a random window in the order of the views, whose ends are 25
-    to 59 views apart where a subject has 60 (in proportion for other counts), take the two ends,
-    then random views inside; the first of these are input, the last targets. jitter,
-    scattered_share and mixed_pose_share are not used."""
+    """How inputs and targets are drawn. "random": inputs stand around the subject, targets are
+    drawn from all other views, of any pose. "window": the rule of the release. The two ends of a
+    random window in the order of the views are taken, then random views inside of it. The ends are
+    25 to 59 views apart where a subject has 60 (in proportion for other counts). The first of these
+    views are input, the last targets. jitter, scattered_share and mixed_pose_share are not used.
+    """
 
 
 class StoredSubject(NamedTuple):
@@ -80,8 +81,8 @@ class StoredSubject(NamedTuple):
         frames: np.ndarray,
         *body: np.ndarray,
     ) -> "StoredSubject":
-        """A subject of no photos yet, of that height and width. body: rotations, translations,
-        betas.
+        """Returns a subject without photos yet, whose photos will have this height and width. body:
+        rotations, translations, betas.
         """
         centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
         offsets = centers - centers.mean(axis=0)
@@ -105,8 +106,8 @@ class Example:
 
 @runtime_checkable
 class Source(Protocol):
-    """Examples by number: capture folders, written sets, people made on the fly, and mixtures of
-    these.
+    """Examples by number. A source may be capture folders, written sets, people made on the fly, or
+    a mixture of these.
 
     `example` is a pure function of its arguments and of the files behind the source: the same on
     every host, in every thread, in any order. Its leaves are numpy arrays, or arrays on a device if
@@ -120,16 +121,16 @@ class Source(Protocol):
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """What was left out so far: name -> what is wrong with it."""
+        """The people left out so far: what is wrong with each, by name."""
         ...
 
     def __len__(self) -> int:
-        """Examples in one pass (subjects)."""
+        """Returns the number of examples (subjects) in one pass."""
         ...
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
-        """The index-th example that a run of this seed takes from this source, with `input_count`
-        input views.
+        """Returns the index-th example that a run of this seed takes from this source, with
+        `input_count` input views.
 
         Raises: ValueError if nothing of the source can be used.
         """
@@ -141,7 +142,9 @@ class Source(Protocol):
 
 
 def nearest_view(subject: StoredSubject, azimuth: float, allowed: np.ndarray) -> int:
-    """The allowed view (bool, (v,)) whose camera stands closest to an azimuth."""
+    """Returns the allowed view whose camera stands closest to an azimuth (radians). allowed: bool,
+    (v,).
+    """
     away = np.abs(np.angle(np.exp(1j * (subject.azimuths - azimuth))))
     return int(np.argmin(np.where(allowed, away, np.inf)))
 
@@ -149,10 +152,10 @@ def nearest_view(subject: StoredSubject, azimuth: float, allowed: np.ndarray) ->
 def sample_views(
     generator: np.random.Generator, subject: StoredSubject, input_count: int, sampling: ViewSampling
 ) -> tuple[list[int], list[int]]:
-    """Disjoint indices of input and target views.
+    """Returns the indices of the input and of the target views, which are disjoint.
 
-    Raises: ValueError if the subject has too few views for the largest of the input counts,
-    whichever this one is: a subject is usable or not, independent of the step.
+    Raises: ValueError if the subject has too few views for the largest of the input counts, even if
+    `input_count` is smaller. So a subject is usable or not, independent of the step.
     """
     count, needed = len(subject.frames), max(sampling.input_counts) + sampling.target_count
     if count < needed:
@@ -181,7 +184,9 @@ def sample_views(
 
 
 def _draw_from_window(generator: np.random.Generator, count: int, wanted: int) -> list[int]:
-    """The two ends of a random window and random views inside, `wanted` in all."""
+    """Returns `wanted` of `count` views: the two ends of a random window, then random views inside
+    of it.
+    """
     smallest, largest = (min(count - 1, round(count * views / WINDOW_OF)) for views in WINDOW)
     distance = int(generator.integers(max(smallest, wanted - 1), max(largest, wanted - 1) + 1))
     first = int(generator.integers(count - distance))
@@ -190,9 +195,9 @@ def _draw_from_window(generator: np.random.Generator, count: int, wanted: int) -
 
 
 def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray, "v size size *c"]:
-    """Bytes averaged by area to size x size, in [0, 1].
+    """Returns bytes averaged by area to size x size pixels, in [0, 1].
 
-    Raises: ValueError unless they are squares of at least that size.
+    Raises: ValueError unless the images are squares of at least that size.
     """
     height, width = images.shape[1:3]
     if not size <= height == width:
@@ -206,7 +211,7 @@ def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray
 def subject_views(
     subject: StoredSubject, indices: Sequence[int], size: int, depths: bool = False
 ) -> SubjectViews:
-    """Gives some views of a stored subject at size x size pixels, with numpy leaves.
+    """Returns some views of a stored subject at size x size pixels, with numpy leaves.
 
     depths: whether the views get depths, all of them unknown.
 
@@ -235,7 +240,9 @@ def subject_views(
 
 
 def _on_host(cls: type, **fields: Any) -> Any:
-    """A pytree of numpy leaves; its constructor would insist on arrays of a device."""
+    """Returns a pytree of numpy leaves. The constructor of `cls` would insist on arrays on a
+    device.
+    """
     tree = object.__new__(cls)
     for name, value in fields.items():
         object.__setattr__(tree, name, value)
@@ -246,41 +253,42 @@ def _on_host(cls: type, **fields: Any) -> Any:
 # --------------------------------------------------------------------------------------------------
 
 ORDER_STREAM = 0
-"""First entry of a seed says what a generator is for, so that no two purposes share random numbers:
-the order of an epoch.
+"""The first entry of the seed for the order of an epoch. Each purpose has another first entry, so
+that no two purposes share random numbers.
 """
 VIEW_STREAM = 1
-"""The views of an example."""
+"""The first entry of the seed for the views of an example."""
 BATCH_STREAM = 2
-"""The number of views of a batch."""
+"""The first entry of the seed for the number of views of a batch."""
 MIX_STREAM = 3
-"""The order of mixed sources."""
+"""The first entry of the seed for the order of mixed sources."""
 SUBJECT_STREAM = 4
-"""The people that are made while training."""
+"""The first entry of the seed for the people that are made while training."""
 
 MIX_BLOCK = 256
-"""Examples over which the shares of mixed sources are exact; smaller shares than one in a block are
-made one.
+"""Examples over which the shares of mixed sources are exact. A share of less than one example in a
+block becomes one example.
 """
 
 
 def subject_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " count"]:
-    """The order of subjects in one pass over them."""
+    """Returns the order of subjects in one pass over them."""
     return np.random.default_rng([ORDER_STREAM, seed, epoch]).permutation(count)
 
 
 def view_generator(seed: int, index: int) -> np.random.Generator:
-    """The random generator for the views of the index-th example of a source."""
+    """Returns the random generator for the views of the index-th example of a source."""
     return np.random.default_rng([VIEW_STREAM, seed, index])
 
 
 def input_count_at(seed: int, step: int, counts: Sequence[int]) -> int:
-    """Number of input views of a step."""
+    """Returns the number of input views of a step."""
     return counts[int(np.random.default_rng([BATCH_STREAM, seed, step]).integers(len(counts)))]
 
 
 def block_counts(weights: Sequence[float | int]) -> Int[np.ndarray, " sources"]:
-    """How many of `MIX_BLOCK` examples come from each source; every source has at least one.
+    """Returns how many of `MIX_BLOCK` examples come from each source; every source has at least
+    one.
 
     Raises: ValueError unless the weights are positive and finite.
     """
@@ -303,7 +311,8 @@ def block_counts(weights: Sequence[float | int]) -> Int[np.ndarray, " sources"]:
 
 
 def source_at(seed: int, index: int, counts: Int[np.ndarray, " sources"]) -> tuple[int, int]:
-    """(which source the index-th example comes from, its number among the examples of that source).
+    """Returns which source the index-th example comes from, and its number among the examples of
+    that source.
 
     Blocks of `MIX_BLOCK` examples are permutations of the same multiset: shares are exact over
     every block, and each source provides its own examples 0, 1, 2, ... without a gap.
@@ -348,7 +357,7 @@ class Mixture:
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """What is left out so far, of all sources."""
+        """The people left out so far, of all sources: what is wrong with each, by name."""
         return {name: problem for source in self.sources for name, problem in source.broken.items()}
 
     def __len__(self) -> int:

@@ -36,19 +36,19 @@ from humangs_jax.rendering.mesh.rasterizer import (
 T = TypeVar("T")
 
 PELVIS = 0
-"""Number of the joint that bodies are centred on."""
+"""The number of the joint in the middle of bodies."""
 NECK = 12
 """Number of the joint of the neck."""
 VERTICAL_FOV = np.deg2rad(60.0)
 ELEVATIONS = (-5.0, 15.0)
-"""Degrees, uniform."""
+"""The range of the cameras' elevations, degrees, uniform."""
 FACTORS = (1.0, 1.75)
-"""Camera distance in bounding radii, uniform, as the paper has it.
+"""The range of the cameras' distances in bounding radii, uniform, as the paper has it.
 
-At 60 degrees below 1.7 the frame cuts heads and feet.
+At a field of view of 60 degrees, distances below 1.7 cut heads and feet.
 """
 NEAR_FACTORS = (2.0, 2.0)
-"""The paper's "near" test set; also what the release uses for all sets."""
+"""The distances of the paper's "near" test set, which the release uses for all sets."""
 VIEWS = 60
 """Views of every scan."""
 SIZE = 512
@@ -62,21 +62,21 @@ SPLIT_SEED = 42
 EVALUATION_SEED = 777
 """Seed of the views of an evaluation, as published."""
 CAMERA_SEED = 2026
-"""Seed of the cameras; ours, for how the release drew them is not known."""
+"""Seed of the cameras. It is ours, since the release does not say how it drew them."""
 INPUT_COUNTS = (1, 2, 4, 6)
 """Numbers of input views that are evaluated."""
 TARGETS = 4
-"""Number of views that are compared with each."""
+"""Number of target views that are compared for each number of inputs."""
 EVERY = 10
-"""Every how many frames of a video are taken."""
+"""Every how many frames one is taken from a video."""
 
 
 def smallest_rotation(
     start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """The rotation about start x end that takes the direction of `start` to that of `end`.
+    """Returns the rotation about start x end that takes the direction of `start` to that of `end`.
 
-    Raises: ValueError for a zero.
+    Raises: ValueError if a vector is zero.
     """
     lengths = np.linalg.norm(start), np.linalg.norm(end)
     if not min(lengths) > 0:
@@ -85,22 +85,22 @@ def smallest_rotation(
 
 
 def _box_middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """Middle of the bounding box."""
+    """Returns the middle of the bounding box."""
     return 0.5 * (points.min(axis=0) + points.max(axis=0)).astype(np.float64)
 
 
 def moved(
     matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Points through a rigid transform."""
+    """Returns points after a rigid transform."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def scan_alignment(
     scan: Float[np.ndarray, "n 3"], pelvis: Float[np.ndarray, "3"], neck: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """`mesh_transform` of a scan, R @ T: first the middle of its bounding box to the origin, then
-    upright.
+    """Returns the `mesh_transform` R @ T of a scan: first the middle of its bounding box goes to
+    the origin, then the scan is turned upright.
     """
     R = smallest_rotation(neck - pelvis, np.asarray([0.0, 1.0, 0.0]))
     return calibration.pose_matrix(R, -R @ _box_middle(scan))
@@ -109,15 +109,15 @@ def scan_alignment(
 def video_alignment(
     body: Float[np.ndarray, "n 3"], pelvis: Float[np.ndarray, "3"], neck: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """`mesh_transform` of a video, T @ R: upright first, then the middle of the turned body of
-    frame 0 to the origin.
+    """Returns the `mesh_transform` T @ R of a video: first the body is turned upright, then the
+    middle of its bounding box in frame 0 goes to the origin.
     """
     R = smallest_rotation(neck - pelvis, np.asarray([0.0, 1.0, 0.0]))
     return calibration.pose_matrix(R, -_box_middle(body @ R.T))
 
 
 def intrinsics(size: int) -> Float[np.ndarray, "3 3"]:
-    """K of square images, field of view `VERTICAL_FOV`."""
+    """Returns the camera matrix of square images with the field of view `VERTICAL_FOV`."""
     focal = 0.5 * size / np.tan(0.5 * VERTICAL_FOV)
     return calibration.intrinsics(focal, focal, 0.5 * size, 0.5 * size)
 
@@ -125,11 +125,11 @@ def intrinsics(size: int) -> Float[np.ndarray, "3 3"]:
 def scan_cameras(
     number: int, radius: float, views: int, factors: tuple[float, float]
 ) -> Float[np.ndarray, "v 4 4"]:
-    """cam_from_world of cameras that look at the origin, y up; azimuth, elevation and distance are
-    drawn uniformly.
+    """Returns cam_from_world of cameras that look at the origin, with y up. Azimuth, elevation and
+    distance are drawn uniformly.
 
-    number: of the scan, so that its cameras depend on nothing else. Equal factors: all at that
-    distance.
+    number: the number of the scan; its cameras depend on no other scan. factors: the range of the
+    distances, in units of `radius`.
     """
     rng = np.random.default_rng([CAMERA_SEED, number])
     azimuths = np.deg2rad(rng.uniform(0, 360, views))
@@ -149,8 +149,8 @@ def scan_cameras(
 
 
 def split_ids(names: Sequence[T], train: int = TRAIN, test: int = TEST) -> tuple[list[T], list[T]]:
-    """numpy's shuffle of seed 42 of all sorted names: the first `train` of them, and the next
-    `test`.
+    """Returns the first `train` names, and the next `test` names, of all sorted names after numpy's
+    shuffle of seed 42.
     """
     order = sorted(names)  # ty: ignore[invalid-argument-type]  strings
     np.random.RandomState(SPLIT_SEED).shuffle(order)  # the published one
@@ -158,11 +158,11 @@ def split_ids(names: Sequence[T], train: int = TRAIN, test: int = TEST) -> tuple
 
 
 def evaluation_indices(counts: Mapping[str, int], inputs: int) -> dict[str, dict[str, list[int]]]:
-    """{scene: {"context": [...], "target": [...]}} of scenes in file order with their numbers of
-    views.
+    """Returns {scene: {"context": [...], "target": [...]}}. counts: the number of views of each
+    scene, in file order.
 
-    Python's generator of seed 777: `inputs` views, then `TARGETS` of the others. Raises: ValueError
-    for a scene of too few.
+    Python's generator of seed 777 draws `inputs` views, then `TARGETS` of the others. Raises:
+    ValueError for a scene with too few views.
     """
     generator, found = random.Random(EVALUATION_SEED), {}
     for name, count in counts.items():
@@ -185,12 +185,14 @@ AMBIENT = 0.3
 HEADLIGHT = 0.7
 """Share of the light that comes from the camera."""
 STEP = 1 << 15
-"""Vertices and faces are padded to a multiple of this: few shapes are compiled for many scans."""
+"""Vertices and faces are padded to a multiple of this number, so that few shapes are compiled for
+many scans.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ScanRenderer:
-    """A scan on the device, aligned, with a texture for each view's distance."""
+    """An aligned scan on the device, with a texture for each view's distance."""
 
     vertices: Float[Array, "n 3"]
     """The aligned vertices, (n, 3), padded."""
@@ -205,11 +207,11 @@ class ScanRenderer:
     texel: float
     """The side of a texel on the surface, scan units."""
     textures: dict[int, Float[Array, "th tw 3"]] = dataclasses.field(default_factory=dict)
-    """The texture by the number of times it was halved; each is made when it is first used."""
+    """The textures by the number of times they were halved. Each is made when it is first used."""
 
     @classmethod
     def of(cls, scan: Scan, vertices: Float[np.ndarray, "n 3"]) -> "ScanRenderer":
-        """A scan with its vertices moved."""
+        """Returns the renderer of a scan whose vertices are `vertices`."""
         spare, spare_faces = -len(vertices) % STEP, -len(scan.faces) % STEP
 
         def pad(x):
@@ -232,7 +234,7 @@ class ScanRenderer:
     def render(
         self, cam_from_world: Float[np.ndarray, "4 4"], size: int, supersample: int
     ) -> tuple[UInt8[np.ndarray, "size size 3"], UInt8[np.ndarray, "size size"]]:
-        """Image on white and coverage."""
+        """Returns the image on white and the coverage, as bytes."""
         sample = 2 * np.tan(0.5 * VERTICAL_FOV) * cam_from_world[2, 3] / (size * supersample)
         level = max(0, int(np.floor(np.log2(max(sample / self.texel, 1e-9)))))
         K, pose = (jnp.asarray(x, jnp.float32) for x in (intrinsics(size), cam_from_world))
@@ -242,7 +244,7 @@ class ScanRenderer:
         return to_uint8(np.asarray(image)), to_uint8(np.asarray(mask))
 
     def texture(self, level: int) -> Float[Array, "th tw 3"]:
-        """The texture halved `level` times, in [0, 1]."""
+        """Returns the texture halved `level` times, in [0, 1]."""
         level = min(level, min(self.scan.texture.shape[:2]).bit_length() - 1)
         if level not in self.textures:
             step = 1 << level
@@ -257,7 +259,7 @@ class ScanRenderer:
 def smooth_normals(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Unit normals; vertices at one place, which texture seams double, share theirs.
+    """Returns unit normals. Vertices at one place, which texture seams double, share their normal.
 
     Zero where there is no face.
     """
