@@ -1,4 +1,5 @@
-"""Photos -> patches -> tokens of all views -> transformer -> feature maps and a global token.
+"""The paper's encoder: photos -> patches -> tokens of all views -> transformer -> feature maps and
+a global token.
 
 Channel order of a pixel: 2 rgb - 1 (3), moment (3), direction (3), texture planes xy, xz, yz.
 Channels run fastest inside a pixel, pixels row-major inside a patch, patches row-major inside a
@@ -37,8 +38,8 @@ from humangs_jax.rendering.mesh.rasterizer import BACKGROUND
 TEXTURE_STD = 0.1
 """Standard deviation of the neural texture before training."""
 NOWHERE = 3.0
-"""Numbers of the pixels of slots without a patch: as positions they lie outside of the neural
-texture, whose gradient they then cost nothing.
+"""Number in the pixels of slots without a patch. As positions these lie outside of the neural
+texture, whose gradient then costs nothing.
 """
 
 
@@ -55,8 +56,8 @@ class TriplaneConfig:
 def sample_triplane(
     texture: Float[Array, "3 r r c"], positions: Float[Array, "*p 3"]
 ) -> Float[Array, "*p 3*c"]:
-    """Returns the features of canonical positions (normalised units): those of plane xy, then
-    xz, then yz.
+    """Returns the features of the neural texture at canonical positions (normalised units): those
+    of plane xy, then xz, then yz.
     """
     # indices from the middle have a third of the rounding of (positions + 1) * middle
     middle = (texture.shape[1] - 1) / 2
@@ -78,7 +79,9 @@ def sample_triplane(
 
 
 def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p pixels c"]:
-    """Cut maps into square patches. Raises ValueError unless the patch size divides both sides."""
+    """Returns square patches of maps, (p, pixels, c). Raises: ValueError unless the patch size
+    divides both sides.
+    """
     views, height, width, channels = maps.shape
     if height % patch or width % patch:
         raise ValueError(
@@ -89,7 +92,7 @@ def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p pixel
 
 
 def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
-    """Lists the foreground patches in a static number of slots; those beyond the capacity are
+    """Returns the foreground patches in `capacity` slots. Patches beyond the capacity are
     left out.
     """
     indices = jnp.nonzero(foreground, size=capacity, fill_value=foreground.shape[0])[0]
@@ -99,7 +102,7 @@ def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
 def _unpack_tokens(
     tokens: Float[Array, "l d"], packing: Packing, patches: int
 ) -> Float[Array, "p d"]:
-    """Puts tokens back at their patches, zeros elsewhere."""
+    """Returns tokens at their patches, (p, d), and zeros at patches without a token."""
     return (
         jnp.zeros((patches, tokens.shape[1]), tokens.dtype)
         .at[packing.indices]
@@ -108,8 +111,8 @@ def _unpack_tokens(
 
 
 class Tokenizer(nn.Module):
-    """Patches of pixels (l, pixels, 12: rgb, rays, canonical position) -> tokens (l, d); owns the
-    neural texture.
+    """Makes tokens (l, d) from patches of pixels (l, pixels, 12: rgb, rays, canonical position). It
+    holds the neural texture.
     """
 
     width: int
@@ -117,7 +120,7 @@ class Tokenizer(nn.Module):
     texture: TriplaneConfig
     """Size of the neural texture."""
     dtype: Any = None
-    """Type of the matrix product; None: that of the parameters."""
+    """Type of the matrix product; None: the type of the parameters."""
 
     @nn.compact
     def __call__(self, patches: Float[Array, "l pixels 12"]) -> Float[Array, "l d"]:
@@ -134,15 +137,17 @@ class Tokenizer(nn.Module):
 
 @part
 class PatchTransformer(Encoder):
-    """The paper's encoder: one token per patch of every view, attention over all of them, an
+    """The paper's encoder: one token per patch of every view, attention over all tokens, and an
     upsampler.
     """
 
     patch_size: Patch = 8
     """Side of a token's patch, pixels."""
     geometry: Literal["rays_and_positions", "place"] = "rays_and_positions"
-    """What a pixel knows besides its color: its ray and the canonical position seen there, or only
-    its place in the photo, for systems whose photos have neither cameras nor poses."""
+    """What the encoder knows of a pixel besides its color. This is its ray and the canonical
+    position seen there, or only its place in the photo, for systems whose photos have neither
+    cameras nor poses.
+    """
     texture: TriplaneConfig = TriplaneConfig()
     """Size of the neural texture that every pixel looks up."""
     transformer: TransformerConfig = TransformerConfig()
@@ -165,7 +170,7 @@ class PatchTransformer(Encoder):
 
     @nn.compact
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
-        """Makes feature maps and a global token of the photos, see `parts.Encoder`.
+        """Returns feature maps and a global token of the photos, see `parts.Encoder`.
 
         Raises: ValueError if images and cameras differ in size, or are not made of whole patches.
         """
@@ -225,10 +230,10 @@ class PatchTransformer(Encoder):
 
 
 def encoder_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
-    """Returns what the encoder sees of every pixel: rgb, ray (moment, direction), canonical
-    position.
+    """Returns the encoder's input at every pixel, (v, h, w, 12): rgb, ray (moment, direction),
+    canonical position.
 
-    Raises ValueError if images and cameras differ in size.
+    Raises: ValueError if images and cameras differ in size.
     """
     height, width = inputs.images.shape[1:3]
     if (inputs.cameras.width, inputs.cameras.height) != (width, height):
@@ -245,8 +250,10 @@ def encoder_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "
 
 
 def _photo_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
-    """Returns what an encoder without cameras and poses sees of every pixel: rgb, then its place
-    (x, y) in [-1, 1] and waves of it where rays would be, and zeros for the canonical position.
+    """Returns the input at every pixel, (v, h, w, 12), of an encoder without cameras and poses.
+
+    It is rgb, then the pixel's place (x, y) in [-1, 1] and waves of it in place of rays, then zeros
+    in place of the canonical position.
     """
     height, width = inputs.images.shape[1:3]
 
@@ -262,8 +269,8 @@ def _photo_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v
 def touched_patches(
     foreground: Bool[Array, "v h w"], view_count: Int[Array, ""] | None, patch_size: int
 ) -> Bool[Array, " p"]:
-    """Says which patches of all views the foreground touches; views beyond `view_count` are
-    padding.
+    """Returns which patches of all views the foreground touches, (p,). Views beyond `view_count`
+    are padding.
     """
     if view_count is not None:
         foreground = foreground & (jnp.arange(len(foreground)) < view_count)[:, None, None]
@@ -274,9 +281,8 @@ def touched_patches(
 def needed_tokens(
     foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, patch_size: int
 ) -> Int[Array, ""]:
-    """Counts the patches that the foreground touches: the token capacity that photos need.
-
-    Of a batch, the largest.
+    """Returns the number of patches that the foreground touches, which is the token capacity that
+    photos need. For a batch, it is the largest number.
     """
 
     def count(*subject):

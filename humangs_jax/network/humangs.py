@@ -37,10 +37,11 @@ from humangs_jax.network.parts import (
 
 
 class HumanGS(nn.Module):
-    """The parts as one module, whose variables are those of the parts under their names here.
+    """The encoder, reader and decoder as one module, whose variables have the names of these
+    fields.
 
-    Linen's means to look inside, such as interceptors, work on it. The driver is no part of the
-    pass.
+    Linen's tools to look inside a module, such as interceptors, work on it. The driver is not
+    included.
     """
 
     encoder: Encoder
@@ -53,7 +54,7 @@ class HumanGS(nn.Module):
     """Whether a driver works from the features."""
 
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> HumanGSOutputs:
-        """Runs the pass."""
+        """Returns the Gaussians of one subject."""
         encoding = self.encoder(inputs, ctx)
         features = self.reader(encoding, inputs, ctx)
         outputs = self.decoder(features, inputs, ctx)
@@ -76,11 +77,11 @@ def apply_humangs(
     train: bool = False,
     axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[HumanGSOutputs, Parameters]:
-    """Runs the whole network for one subject: outputs and batch statistics.
+    """Returns the outputs of the whole network for one subject, and its batch statistics.
 
     train: normalise by this subject's statistics and return updated running ones. Under a vmap over
-    subjects give the vmap's `axis_name` to share the statistics over the batch; without it each
-    subject has its own, to be averaged.
+    subjects, give the vmap's `axis_name` to share the statistics over the batch. Without it each
+    subject has separate statistics, to be averaged.
 
     Raises: ValueError if images and cameras differ in size, the patch size does not divide it, or
     inputs lack normals that the configuration needs.
@@ -99,8 +100,8 @@ def apply_humangs(
 def intermediates(
     variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> dict[str, Any]:
-    """Returns what every module of the pass returns, by its path, as "encoder.transformer.block_0",
-    in the order of the pass.
+    """Returns the results of every module of the network by its path, such as
+    "encoder.transformer.block_0", in the order of the computation.
     """
     found = {}
 
@@ -118,7 +119,7 @@ def intermediates(
 @jax.jit
 @checked_arguments
 def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
-    """Makes fresh variables of a network, float32.
+    """Returns fresh variables of a network, float32.
 
     Args:
         key: of JAX's random numbers.
@@ -165,7 +166,10 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
 
 @functools.partial(jax.jit, static_argnames="config")
 def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -> Encoding:
-    """Runs the first part of `apply_humangs`, with the running batch statistics. Raises: as it."""
+    """Returns the encoding of photos, the first step of `apply_humangs`, with the running batch
+    statistics.
+    Raises: as `apply_humangs`.
+    """
     return cast(
         Encoding,
         config.architecture.encoder.apply(
@@ -178,7 +182,9 @@ def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -
 def read(
     variables: Variables, encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> PyTree:
-    """Runs the second part of `apply_humangs`: features of the body. Raises: as it."""
+    """Returns features of the body, the second step of `apply_humangs`. Raises: as
+    `apply_humangs`.
+    """
     return config.architecture.reader.apply(
         part_variables(variables, "reader"), encoding, inputs, config.forward_context()
     )
@@ -188,8 +194,8 @@ def read(
 def decode(
     variables: Variables, features: PyTree, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> HumanGSOutputs:
-    """Runs the third part of `apply_humangs`: canonical Gaussians, metres; `dropped_tokens` is 0
-    (it belongs to the encoding).
+    """Returns canonical Gaussians, metres, the third step of `apply_humangs`. `dropped_tokens` is
+    0, because it belongs to the encoding.
     """
     own = part_variables(variables, "decoder")
     return cast(
@@ -199,14 +205,16 @@ def decode(
 
 
 def part_variables(variables: Variables, part: str) -> Variables:
-    """Returns the {"params": ..., "batch_stats": ...} of one part; what it does not have is
-    absent.
+    """Returns the variables {"params": ..., "batch_stats": ...} of one part. A kind that the part
+    does not have is absent.
     """
     return {kind: cast(Parameters, tree[part]) for kind, tree in variables.items() if part in tree}
 
 
 def _example_inputs(parts: Architecture) -> HumanGSInputs:
-    """Makes inputs of one view of two by two patches with one vertex: enough to find shapes."""
+    """Returns inputs of one view of two by two patches with one vertex, which are enough to find
+    shapes.
+    """
     side, wanted = 2 * parts.encoder.patch_size, parts.surface_map
     grid, vertex = jnp.zeros((1, side, side)), jnp.zeros((1, 1, 3))
     texels = None

@@ -35,10 +35,12 @@ from humangs_jax.core.array_types import Array, Float
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 KERNEL = 3
 REACH = KERNEL // 2 + 1
-"""Texels of padding: a position may lie half outside, and its neighbours one texel further."""
+"""Texels of padding around a map. A position may lie half a texel outside, and its neighbours one
+texel further.
+"""
 OUTSIDE = -4.0
-"""A texel index outside of every map, with its neighbourhood: reading there gives zeros, and costs
-its gradient nothing.
+"""A texel index outside of every map, also with its neighbourhood. Reading there gives zeros, and
+its gradient costs nothing.
 """
 PixelGrid = Literal["half_pixel", "mixed"]
 
@@ -49,8 +51,8 @@ def texel_indices(
     grid_size: tuple[int, int],
     convention: PixelGrid,
 ) -> Float[Array, "*p 2"]:
-    """Turns positions in pixels of an image into texel indices of a grid that covers it; sizes are
-    (width, height).
+    """Returns texel indices in a grid that covers an image, of positions in pixels of the image.
+    Sizes are (width, height).
     """
     image, grid = jnp.asarray(image_size, pixels.dtype), jnp.asarray(grid_size, pixels.dtype)
     if convention == "half_pixel":
@@ -61,9 +63,10 @@ def texel_indices(
 def sample_bilinear(
     grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"], origin: float = 0.0
 ) -> Float[Array, "*p c"]:
-    """Interpolates bilinearly between texel centres; texels outside of the grid count as zeros.
+    """Returns the grid's values at texel indices, interpolated bilinearly between texel centres.
+    Texels outside of the grid count as zeros.
 
-    origin: the texel index, in both axes, that `indices` are relative to; counted from the middle,
+    origin: texel index, in both axes, that `indices` are relative to. Relative to the middle,
     float32 positions keep more digits of their fractions. Positions that are outside by a texel or
     more, infinite or NaN give zero with zero gradient.
     """
@@ -95,8 +98,8 @@ def sample_bilinear(
 
 
 def sample_nearest(grid: Float[Array, "h w"], indices: Float[Array, "*p 2"]) -> Float[Array, "*p"]:
-    """Returns the texel nearest to each position, halves to the even index; zero outside of the
-    grid.
+    """Returns the value of the texel nearest to each position; zero outside of the grid. Halves are
+    rounded to the even index.
     """
     height, width = grid.shape
     nearest = jnp.round(indices)
@@ -157,8 +160,9 @@ def convolve_neighborhoods(
     bias: Float[Array, " d"],
     dtype: Any = None,
 ) -> Float[Array, "n d"]:
-    """Applies the kernel to the neighbourhoods of n positions, or to means of several: the products
-    in `dtype`, the result in that of the coverages.
+    """Returns the products of the kernel and the neighbourhoods of n positions, or of means of
+    several neighbourhoods, (n, d). The products are in `dtype`, the result in the type of the
+    coverages.
     """
     x, kernel = promote_dtype(neighborhoods, kernel, dtype=dtype)
     products = jnp.matmul(
@@ -170,7 +174,9 @@ def convolve_neighborhoods(
 def convolve(
     x: Float[Array, "v h w c"], kernel: Float[Array, "k k c d"]
 ) -> Float[Array, "v h w d"]:
-    """Multiplies every pixel's 3x3 neighbourhood, zeros outside of the map, by the kernel."""
+    """Returns the product of every pixel's 3x3 neighbourhood, with zeros outside of the map, and
+    the kernel.
+    """
     return lax.platform_dependent(x, kernel, cpu=_convolve_on_cpu, default=_convolve)
 
 
@@ -215,7 +221,7 @@ class Convolution(nn.Module):
     kernel_init: nn.initializers.Initializer
     """Initializer of the kernel."""
     dtype: Any = None
-    """Type of the arithmetic; None: that of input and parameters."""
+    """Type of the arithmetic; None: the type of input and parameters."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v h w d"]:

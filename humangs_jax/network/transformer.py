@@ -1,5 +1,5 @@
-"""Pre-norm transformer over all tokens of all views; position is in the tokens themselves (rays and
-pose features).
+"""Pre-norm transformer over all tokens of all views. The tokens themselves contain their position
+(rays and pose features).
 
     x += attention(norm1(x));  x += mlp(norm2(x))
 
@@ -35,7 +35,7 @@ NORM_EPSILON = 1e-5
 PRODUCT = "product"
 """Name of the arrays of a block that `Runtime.remat` "dots" may keep for the backward pass."""
 QUERIES = 1024
-"""Queries that "chunked" takes at once."""
+"""Number of queries that "chunked" takes at once."""
 XLA_TOKENS = 8192
 """Largest number of tokens for "xla": the L x L logits of all heads fit beside a model on any
 accelerator (12 heads, float32: 3 GB a layer).
@@ -43,7 +43,9 @@ accelerator (12 heads, float32: 3 GB a layer).
 
 
 def resolve_implementation(implementation: str, tokens: int, dtype: Any) -> AttentionKernel:
-    """Returns what "auto" stands for on the default backend, for that many tokens of that dtype."""
+    """Returns the implementation that "auto" stands for on the default backend, for this number of
+    tokens and dtype. Another name is returned unchanged.
+    """
     if implementation != "auto":
         return cast(AttentionKernel, implementation)
     backend = jax.default_backend()
@@ -62,8 +64,8 @@ def chunked_attention(
     count: Int[Array, ""] | None,
     query_chunk: int = QUERIES,
 ) -> Float[Array, "m h e"]:
-    """Computes exact attention, head by head and one block of queries after the other; softmax
-    statistics are in float32 at least.
+    """Returns exact attention, computed head by head and one block of queries after the other.
+    Softmax statistics are float32 at least.
     """
     # queries of each head in blocks of equal length
     length, heads, width = q.shape
@@ -107,7 +109,7 @@ def attention(
     count: Int[Array, ""] | None = None,
     implementation: str = "auto",
 ) -> Float[Array, "m h e"]:
-    """Attends from every query to the first `count` tokens (None: to all)."""
+    """Returns the attention of every query to the first `count` tokens (None: to all tokens)."""
     resolved = resolve_implementation(implementation, max(len(q), len(k)), q.dtype)
     if resolved == "chunked":
         return chunked_attention(q, k, v, count)
@@ -166,15 +168,15 @@ class TransformerConfig:
     width: Width = 768
     """Features per token."""
     layers: Layers = 12
-    """Blocks."""
+    """Number of blocks."""
     mlp_ratio: Ratio = 4
-    """Hidden width of the MLP over the width."""
+    """Hidden width of the MLP, divided by the width."""
     class_token: bool = True
-    """A learned global token in front of all others."""
+    """Whether there is a learned global token in front of all others."""
     head_width: Width = 64
     """Features per attention head."""
     qk_norm: bool = True
-    """RMSNorm over the head on q and k."""
+    """Whether queries and keys are normalised by an RMSNorm over the head."""
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
@@ -199,7 +201,7 @@ class Block(nn.Module):
     runtime: Runtime
     """How the network runs here."""
     index: int
-    """Number of the block, from 0: deeper ones start smaller."""
+    """Number of the block, from 0. Deeper blocks start with smaller weights."""
 
     @nn.compact
     def __call__(
@@ -221,8 +223,8 @@ class Block(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Tokens (l, d) -> outputs after layers L/4, L/2, 3L/4 (raw) and L (after the final norm), each
-    (l, d).
+    """Maps tokens (l, d) to outputs after layers L/4, L/2, 3L/4 (raw) and L (after the final norm),
+    (l, d) each.
     """
 
     config: TransformerConfig
@@ -254,8 +256,8 @@ class Transformer(nn.Module):
     def _scan_blocks(
         self, x: Float[Array, "l d"], count: Int[Array, ""] | None, quarters: tuple[int, ...]
     ) -> tuple[Float[Array, "l d"], list[Float[Array, "l d"]]]:
-        """Runs the blocks as one loop over their stacked parameters: (output, outputs at the
-        quarters).
+        """Returns the output of the blocks and the outputs at the quarters. The blocks run as one
+        loop over their stacked parameters.
         """
         config, remat = self.config, self.runtime.remat
         block = Block(config, self.runtime, 0, parent=None)

@@ -47,38 +47,39 @@ from humangs_jax.rendering.splat_rows import (
 from humangs_jax.rendering.tiling import TileGrid, expand
 
 CHUNK = 64
-"""Splats of a list in one chunk.
-
-The triangular product costs 2 CHUNK flops per pair; half a chunk per list is padding.
+"""Number of splats of a list in one chunk. The triangular product costs 2 CHUNK flops per pair, and
+half a chunk per list is padding.
 """
 STEP_BYTES = 64 << 20
-"""Largest size of one of the arrays (B, k, p) of a step; the backward pass holds five of them."""
+"""Largest size of one of the arrays (B, k, p) of a step, bytes. The backward pass holds five of
+them.
+"""
 STEP_CHUNKS = 2048
-"""Largest B: the product over earlier chunks costs 2 B / k flops per pair, half of the triangular
-one at this B.
+"""Largest B. The product over earlier chunks costs 2 B / k flops per pair, at this B half of the
+triangular product.
 """
 
 
 class Chunks(NamedTuple):
-    """All lists cut into chunks of at most `CHUNK`, list by list; chunks that are not needed have
-    tile t and count 0.
+    """All lists cut into chunks of at most `CHUNK` splats, list by list. Unused chunks have tile t
+    and count 0.
     """
 
     tiles: Int[Array, " s"]
     """Tile of each chunk, (s,)."""
     starts: Int[Array, " s"]
-    """Place of each chunk's first item in the array of items, (s,)."""
+    """Index of each chunk's first item in the array of items, (s,)."""
     counts: Int[Array, " s"]
     """Number of items in each chunk, (s,), 0 to `CHUNK`."""
     ends: Int[Array, " s"]
-    """How many items of its list come up to the end of each chunk, (s,)."""
+    """Number of items of the chunk's list up to the end of the chunk, (s,)."""
     steps: Int[Array, ""]
     """Number of steps of B chunks each that hold any item."""
 
 
 def cut(starts: Int[Array, " t"], counts: Int[Array, " t"], capacity: int, step: int) -> Chunks:
-    """Cuts lists, of `capacity` items at most together, into chunks; their number is a multiple of
-    `step`.
+    """Returns the chunks of lists that have at most `capacity` items together. The number of chunks
+    is a multiple of `step`.
     """
     t = counts.shape[0]
     most = _most_chunks(capacity, t)
@@ -94,7 +95,7 @@ def cut(starts: Int[Array, " t"], counts: Int[Array, " t"], capacity: int, step:
 
 
 class _Tail(NamedTuple):
-    """A sum along the list that runs on from one step into the next."""
+    """A sum along a list that continues from one step into the next."""
 
     tile: Int[Array, ""]
     """Tile of the list."""
@@ -106,9 +107,9 @@ class _Step(NamedTuple):
     """What one step of the forward pass hands to the next."""
 
     sums: Float[Array, "t n+1 p"]
-    """Sums of w f, and behind them that of log(1 - alpha), the final log T."""
+    """Sums of w f, and behind them the sum of log(1 - alpha), which is the final log T."""
     lengths: Int[Array, " t"]
-    """How many splats of each list have been read, as in `Composited`."""
+    """Number of splats of each list that have been read, as in `Composited`."""
     peaks: Float[Array, " g"]
     """The largest w of each splat so far, as in `Composited`."""
     medians: Float[Array, "t p"] | None
@@ -119,7 +120,7 @@ class _Step(NamedTuple):
 
 @functools.lru_cache
 def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Composited]:
-    """Makes the same function as `forward_by_blocks`."""
+    """Returns a function with the arguments and results of that of `forward_by_blocks`."""
     log_stop = _log_stop(config)
 
     @joined_over_batch
@@ -173,7 +174,7 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Comp
 
 @functools.lru_cache
 def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Array]:
-    """Makes the same function as `backward_by_blocks`."""
+    """Returns a function with the arguments and results of that of `backward_by_blocks`."""
     log_stop = _log_stop(config)
 
     @joined_over_batch
@@ -224,12 +225,16 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
 
 
 def _most_chunks(capacity: int, t: int) -> int:
-    """Returns how many chunks t lists can have: full ones, and for each list one that is not."""
+    """Returns the largest number of chunks of t lists: full chunks, and one chunk per list that is
+    not full.
+    """
     return capacity // CHUNK + min(t, capacity)
 
 
 def _chunks_per_step(grid: TileGrid, dtype: np.dtype | type, capacity: int, t: int) -> int:
-    """Returns B: what `STEP_BYTES` and `STEP_CHUNKS` allow, and no more than there are chunks."""
+    """Returns B, the number of chunks in a step. `STEP_BYTES`, `STEP_CHUNKS` and the number of
+    chunks limit it.
+    """
     fitting = STEP_BYTES // (CHUNK * grid.pixels * np.dtype(dtype).itemsize)
     return max(1, min(fitting, STEP_CHUNKS, _most_chunks(capacity, t)))
 
@@ -257,8 +262,8 @@ def _fading(raw: Array, config: SplatConfig) -> tuple[Array, Array]:
 def _sums_before(
     x: Float[Array, "b k p"], tiles: Int[Array, " b"], tail: _Tail
 ) -> tuple[Array, Array]:
-    """Returns the sums of x (B, k, p) along its lists: of all that comes before each chunk, (B, p),
-    and from there to the splat before each one, (B, k, p).
+    """Returns sums of x (B, k, p) along its lists: the sum of all that comes before each chunk, (B,
+    p), and the sum from there to before each splat, (B, k, p).
     """
     b, k, _ = x.shape
     triangle = jnp.broadcast_to(jnp.asarray(np.tri(k, k=-1), x.dtype), (b, k, k))
@@ -270,10 +275,10 @@ def _sums_before(
 
 
 def _tail(tiles: Array, before: Array, through: Array) -> _Tail:
-    """Returns the sum of the step's last list: before its chunk, and through the chunk."""
+    """Returns the sum of the step's last list, up to the end of its chunk in this step."""
     return _Tail(tiles[-1], before[-1] + through[-1, -1])
 
 
 def _no_tail(t: int, p: int, dtype: np.dtype | type) -> _Tail:
-    """Returns the tail that the first step gets: no list has its tile."""
+    """Returns the tail for the first step. Its tile is that of no list."""
     return _Tail(jnp.asarray(t, jnp.int32), jnp.zeros(p, dtype))

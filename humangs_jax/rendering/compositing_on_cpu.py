@@ -34,7 +34,7 @@ from humangs_jax.rendering.tiling import TileGrid, blocks_by_length
 
 
 class _Chain(NamedTuple):
-    """What a block carries from one chunk of its lists to the next."""
+    """The values that a block carries from one chunk of its lists to the next."""
 
     chunk: Array | int
     """Number of the chunk."""
@@ -43,7 +43,7 @@ class _Chain(NamedTuple):
     features: Float[Array, "block n p"]
     """Sum of w f so far."""
     lengths: Int[Array, " block"]
-    """How many splats of each list have been read."""
+    """Number of splats of each list that have been read."""
     live: Bool[Array, " block"]
     """Whether a list has splats left and some pixel of its tile has not ended."""
     peaks: Float[Array, " g"]
@@ -54,7 +54,7 @@ class _Chain(NamedTuple):
 
 @functools.lru_cache
 def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Composited]:
-    """Makes the function (splats, items, starts, counts) -> `Composited`."""
+    """Returns the function (splats, items, starts, counts) -> `Composited`."""
     block, k, stop = config.block, config.chunk, config.transmittance_stop
 
     @joined_over_batch
@@ -137,7 +137,9 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Comp
 
 
 class _BackwardChain(NamedTuple):
-    """What a block carries from one chunk of its lists to the next, in the backward pass."""
+    """The values that a block carries from one chunk of its lists to the next, in the backward
+    pass.
+    """
 
     chunk: Array | int
     """Number of the chunk."""
@@ -146,12 +148,12 @@ class _BackwardChain(NamedTuple):
     seen: Float[Array, "block p"]
     """Sum of w g . f so far."""
     sums: Float[Array, "g width"]
-    """What is returned, of all splats so far."""
+    """The sums to return, of all splats so far."""
 
 
 @functools.lru_cache
 def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Array]:
-    """Makes the function (splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums over
+    """Returns the function (splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums over
     pixels for each splat, (g, 6 + n).
 
     Columns: the moments of e = dL/d log alpha about the splat's centre (1, dx, dy, dx^2, dx dy,
@@ -218,5 +220,5 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
 
 
 def _lists_of(tile: Array, starts: Array, counts: Array) -> Iterator[Array]:
-    """Gives starts and lengths of the lists of some tiles; padding has empty lists."""
+    """Returns starts and lengths of the lists of some tiles. Padding has empty lists."""
     return (v.at[tile].get(mode="fill", fill_value=0) for v in (starts, counts))
