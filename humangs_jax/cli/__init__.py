@@ -1,9 +1,8 @@
-"""The `humangs` command: a dataclass per command, whose fields are its options; `run` does the
-work.
+"""The `humangs` program: a dataclass for each command. Its fields are options, `run` does the work.
 
-Modules here import nothing heavy, so that `--help` is fast: what a command needs is imported when
-it runs, after its options and the places that it will write to were checked. --quiet, --verbose and
---version are for all commands.
+Modules here import nothing heavy, so that `--help` is fast. A command imports what it needs when it
+runs, after its options and the places that it writes to were checked. All commands take --quiet,
+--verbose and --version.
 
 Exit codes: 0; 1 for bad data (a capture, a file that cannot be read); 2 for bad usage (an option, a
 place that cannot be written to); 130 after Ctrl-C; 141 where the reader of a pipe has gone. Errors
@@ -37,10 +36,10 @@ class Command(Protocol):
     """
 
     examples: ClassVar[tuple[str, ...]]
-    """Lines that --help ends with."""
+    """Examples of command lines, which end --help."""
 
     def run(self) -> None:
-        """Do the work. Raises: ValueError or OSError for wrong input."""
+        """Does the work of the command. Raises: ValueError or OSError for wrong input."""
         ...
 
 
@@ -73,7 +72,7 @@ GROUPS = {
         "convert": "training.Convert",
     },
 }
-"""Commands by purpose: module and class of each, imported when it is asked for."""
+"""Commands by purpose, with the module and class of each, which are imported when needed."""
 COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items()}
 EVERYWHERE = """Options of every command:
   --help       its options, with examples
@@ -84,7 +83,7 @@ Completion for bash, zsh or tcsh: humangs --tyro-print-completion SHELL"""
 
 
 def main() -> None:
-    """Entry point of the console script. What takes time is imported where Ctrl-C is heard."""
+    """Runs the console script. Slow imports happen after Ctrl-C is handled."""
     try:
         _prepare("--verbose" in sys.argv)
         code = execute(sys.argv[1:])
@@ -99,7 +98,10 @@ def main() -> None:
 
 
 def execute(arguments: Sequence[str]) -> int:
-    """Run a command line in this process. Returns the exit code. Raises: SystemExit for --help."""
+    """Runs a command line in this process and returns the exit code.
+
+    Raises: SystemExit for --help.
+    """
     from humangs_jax.cli import screen
     from humangs_jax.cli.options import check_options
     from humangs_jax.core import progress
@@ -142,7 +144,7 @@ def execute(arguments: Sequence[str]) -> int:
 
 
 def _prepare(verbose: bool) -> None:
-    """What a whole program needs before JAX is imported: Ctrl-C, silence, memory and caches."""
+    """Sets up Ctrl-C, logs, memory and caches of the process, before JAX is imported."""
     from humangs_jax.cli.screen import end_within_seconds, silence
 
     end_within_seconds()
@@ -157,15 +159,15 @@ RENAMED = {
     "fit": {"--bare": "--tight-clothes", "--refine": "--to-masks"},
     "refine": {"--limit": "--refine"},
 }
-"""Options of commands by the names that they had: an error says what they are called now."""
+"""For each command, old names of options and the new ones, which errors about old names show."""
 
 
 def _parsed(arguments: list[str]) -> Command:
-    """The command with its options. Only its own module is imported, and only its options are
-    looked at: that is faster.
+    """Parses a command line into a command with its options.
 
-    Raises: SystemExit after --help; UsageError for an unknown command, or words that it does not
-    take.
+    Only the module of that command is imported, which is faster.
+
+    Raises: SystemExit after --help; UsageError for an unknown command or option, or a wrong value.
     """
     from humangs_jax.core.progress import say
 
@@ -212,13 +214,13 @@ def _parsed(arguments: list[str]) -> Command:
 
 
 def summary(command: type[Any]) -> str:
-    """The first paragraph of a command's docstring, on one line."""
+    """Returns the first paragraph of a command's docstring on one line."""
     paragraph, _, _ = (command.__doc__ or "").partition("\n\n")
     return " ".join(paragraph.split())
 
 
 def overview() -> str:
-    """What `humangs --help` prints: all commands by purpose, a line for each."""
+    """Returns what `humangs --help` prints: all commands by purpose, a line for each."""
     lines = ["usage: humangs COMMAND [OPTIONS]", ""]
     lines.append("Animatable 3D Gaussian humans from a few photos with body poses.")
     for group, commands in GROUPS.items():
@@ -233,7 +235,10 @@ def _command(name: str) -> type[Any]:
 
 
 def _failed(error: Exception, verbose: bool) -> int:
-    """One line. An argument of the library is an option here."""
+    """Shows an error in one line, and returns the exit code.
+
+    An argument of the library that the error names is shown as an option.
+    """
     from humangs_jax.cli import screen
     from humangs_jax.cli.options import UsageError, option_of
     from humangs_jax.core.configuration import ArgumentError

@@ -1,5 +1,6 @@
-"""`humangs animate`, `render`, `view`: videos and images of an avatar, and the avatar in the
-browser.
+"""The commands `humangs animate`, `render` and `view`, which show an avatar.
+
+They write videos and images, and show the avatar in the browser.
 """
 
 import dataclasses
@@ -34,11 +35,11 @@ if TYPE_CHECKING:
 _RATE = Range(0.01, 1000.0)
 """Range of frames per second."""
 _FINITE = at_least(-LARGEST)
-"""Range of any number."""
+"""Range of all finite numbers."""
 _VIDEO = OutputPath(VIDEOS.suffixes, folder=True)
-"""Where images or a video go."""
+"""Annotation of an option for a video, or for a folder of images."""
 _FROM_THE_SIDE = FrameSettings(azimuth=20.0)
-"""What `humangs animate` shows by default."""
+"""Settings of the frames of `humangs animate` by default."""
 _SPLATS = {
     suffix: each
     for each in (*EXPORTS.values(), *READ_ONLY.values())
@@ -155,7 +156,10 @@ class Animate:
         )
 
     def _motion(self, avatar: "Avatar") -> "Motion":
-        """The motion of a file, or of a video."""
+        """Reads the motion of a file, or finds that of a video.
+
+        Raises: UsageError for options that a video does not take.
+        """
         from humangs_jax.data.folders import is_video
 
         if self.motion is None or not is_video(self.motion):
@@ -415,7 +419,7 @@ def _drawn_by(shot: FrameSettings, preset: Preset | None, config: Path | None) -
 def _pruned(
     avatar: "Avatar", poses: "BodyPose", cameras: "Camera", shot: FrameSettings
 ) -> "Avatar":
-    """The avatar without what no image shows, if that is asked for; the count is printed."""
+    """Removes Gaussians that are in no image, if --prune is given, and prints their number."""
     from humangs_jax.avatar.frames import splatting_of, without_unseen
 
     if not shot.prune:
@@ -430,10 +434,12 @@ def _pruned(
 def _require_no_circle(
     option: str, shot: FrameSettings, usual: FrameSettings, given: list[str]
 ) -> None:
-    """Refuse options of a circle of cameras beside an option that brings cameras. given: names of
-    further options that do not go with it.
+    """Refuses options of a circle of cameras beside an option that brings cameras.
 
-    Raises: UsageError naming the first.
+    option: the option that brings cameras. usual: settings of frames that no option has changed.
+    given: names of further given options that do not go with it.
+
+    Raises: UsageError, which names the first refused option.
     """
     where = ("azimuth", "elevation", "distance", "fov")
     refused = [name for name in where if getattr(shot, name) != getattr(usual, name)] + given
@@ -447,7 +453,10 @@ def _counted(count: int, word: str) -> str:
 
 
 def _size(path: Path, camera: "Camera") -> str:
-    """The size of the file, which may have another row or column than what is drawn."""
+    """Returns the size of the images in the file as text.
+
+    A video may have one row or column more than the images that are drawn.
+    """
     from humangs_jax.avatar.video import video_size
 
     width, height = video_size(path, camera.width, camera.height)

@@ -1,4 +1,4 @@
-"""`humangs demo`, `reconstruct`, `refine`, `tune`: from photos to an avatar."""
+"""The commands `humangs demo`, `reconstruct`, `refine` and `tune`: avatars from photos."""
 
 import dataclasses
 import functools
@@ -222,9 +222,12 @@ class Reconstruct:
     def _unmade(
         self, out: Path, captures: dict[str, Path], part: int, parts: int
     ) -> dict[str, Path]:
-        """The captures of a part of a set whose avatars are not there.
+        """Returns those captures of one part of a set that have no avatar yet.
 
-        Raises: CaptureError for an avatar of other contents, or a set that was made in other ways.
+        part, parts: index of the part, and number of parts.
+
+        Raises: CaptureError if an avatar was made from other contents than its capture has now, or
+        if the set was made with other settings.
         """
         self._begin_set(out)
         done = {name for name in captures if (out / f"{name}.npz").exists()}
@@ -236,7 +239,10 @@ class Reconstruct:
         return captures
 
     def _begin_set(self, out: Path) -> None:
-        """Avatars that were made in other ways are not mixed. Raises: CaptureError."""
+        """Checks that the set in `out` was made with these settings, and records them if it is new.
+
+        Raises: CaptureError if it was made with other settings.
+        """
         from humangs_jax import __version__
         from humangs_jax.data.sets import AVATARS, SETTINGS, begin_set
         from humangs_jax.io.arrays import SHORT, file_checksum
@@ -254,9 +260,9 @@ class Reconstruct:
         begin_set(out, AVATARS, {SETTINGS: made_with})
 
     def _read(self, folder: Path, views: int | str | None) -> "PreparedCapture":
-        """The views of a capture that are used.
+        """Reads the views of a capture that the network is to use.
 
-        Raises: ValueError; UsageError for --refine without masks.
+        Raises: ValueError if none shows the person; UsageError for --refine without masks.
         """
         prepared = _read_capture(folder, self.check, self.fit_masks, views)
         if self.refine not in (None, "0") and prepared.capture.masks is None:
@@ -314,9 +320,9 @@ class Refine:
 
 
 def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
-    """Capture folders by name, those inside of given folders too.
+    """Returns the capture folders by name: those given, and those inside of other given folders.
 
-    Raises: UsageError for two of one name.
+    Raises: UsageError if two of them have the same name.
     """
     folders = []
     for path in given:
@@ -336,9 +342,9 @@ def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
 
 
 def _check_source(avatar: Path, capture: Path) -> None:
-    """An avatar of a set that is kept was made from what the capture holds now.
+    """Checks that an avatar was made from what its capture has now.
 
-    Raises: CaptureError, naming both.
+    Raises: CaptureError, which names both, if it was not.
     """
     from humangs_jax.avatar.avatar import recorded_source
     from humangs_jax.data.capture import capture_checksum
@@ -355,10 +361,12 @@ def _check_source(avatar: Path, capture: Path) -> None:
 def _read_capture(
     path: Path, check: bool, fit_masks: bool = True, views: int | str | None = None
 ) -> "PreparedCapture":
-    """The views of a capture that show the person, or the best of them, after warnings about what
-    looks wrong.
+    """Reads the views of a capture that show the person, and warns about what looks wrong.
 
-    Raises: ValueError for none.
+    check: whether photos, cameras and poses are checked. views: as --views of `reconstruct`. None:
+    all views that show the person.
+
+    Raises: ValueError if no view shows the person.
     """
     with stage("reading the capture"):
         from humangs_jax.data.capture import load_capture
@@ -403,12 +411,12 @@ def _refine_and_save(
     unfinished: bool = True,
     made_from: str | None = None,
 ) -> None:
-    """Refine with a progress bar if asked, write the result, say what it
-    took.
+    """Refines an avatar with a progress bar, and writes it.
 
-    unfinished: whether an avatar is written whose refinement was interrupted. made_from: a checksum
-    to write with it.
-    Raises: KeyboardInterrupt, after that, if one ended it.
+    how: None for no refinement. unfinished: whether the avatar is written if its refinement was
+    interrupted. made_from: checksum of the capture that is written into the file.
+
+    Raises: KeyboardInterrupt, at the end, if the refinement was interrupted.
     """
     if how is None:
         _save(avatar, out, f"from {prepared.capture.view_count} photos", made_from)

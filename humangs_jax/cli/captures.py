@@ -1,5 +1,6 @@
-"""`humangs detect`, `import`, `synth`: who is in photos; capture folders from calibrated photos,
-and of synthetic people.
+"""The commands `humangs detect`, `import` and `synth`.
+
+They find people in photos, and make capture folders from calibrated photos or of synthetic people.
 """
 
 import dataclasses
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
-    """Say which photos are without the person, and what was repaired."""
+    """Warns about photos without the person, and about what was repaired."""
     from humangs_jax.apps.detect import remarks
 
     for line in remarks(photos, person):
@@ -33,11 +34,10 @@ def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
 
 
 def found_here(capture: Path, person: int | None) -> Path:
-    """The file of keypoints in a capture folder. What it lacks is found in its photos: keypoints,
-    and masks if there are none.
+    """Returns the file of keypoints in a capture folder.
 
-    Arguments: person: the number on the sheet, where several may be meant; then they are found
-    again.
+    Keypoints and masks that the folder lacks are found in its photos and written there. person: the
+    number on the sheet, if several people are in the photos; keypoints are then found again.
     """
     from humangs_jax.apps import detect
     from humangs_jax.data.photos import capture_folder, load_photos
@@ -105,7 +105,7 @@ class Detect:
 
 
 SIZES = (128, 256, 512)
-"""Sides of photos that `humangs synth` writes: those that training reads."""
+"""Sides of photos, in pixels, that `humangs synth` can write; training reads these."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -178,8 +178,9 @@ class Export:
         return None if self.motion is None else self.motion.stem
 
     def _frames(self, count: int, animated: bool) -> range:
-        """Numbers of the frames that are written, of a motion of `count` frames; animated: whether
-        the file holds motions.
+        """Returns the numbers of the frames that are written.
+
+        count: number of frames of the motion. animated: whether the file can hold a motion.
         """
         from humangs_jax.avatar.export.gaussians import frame_range
 

@@ -1,6 +1,6 @@
-"""`humangs fit` and `humangs check`: find the body in one's own photos, and look at the result.
+"""The commands `humangs fit` and `humangs check`: find the body in photos, and check the result.
 
-Everything is checked before the work begins, and written after it.
+Options and places are checked before the work begins. Results are written after it.
 """
 
 import dataclasses
@@ -38,7 +38,7 @@ class Detections:
     """
 
     def read(self, views: Any) -> Any:
-        """The keypoints of the views of a `Photos` or `Capture`, None if there is no file.
+        """Reads the keypoints of the views of a `Photos` or `Capture`; None if there is no file.
 
         Raises: see `read_keypoints`.
         """
@@ -50,8 +50,9 @@ class Detections:
         return read_keypoints(self.keypoints, views.names, width, height, person=self.person)
 
     def read_or_recorded(self, capture: Path, views: Any) -> tuple[Any, Any]:
-        """Reads the keypoints of the views from --keypoints, else from the fit in the capture's
-        folder, whose record comes with them.
+        """Reads the keypoints of the views, from --keypoints or from an earlier fit of the capture.
+
+        Returns: the keypoints, and the record of the earlier fit. Each is None if there is none.
         """
         from humangs_jax.capture.fitting.files import FIT_FILE, read_fit_record
         from humangs_jax.data.photos import capture_folder
@@ -120,7 +121,7 @@ class Fit:
     """Replace what is there."""
 
     def run(self) -> None:
-        """Fit in the way that was asked for."""
+        """Fits to masks or to keypoints, as the options say."""
         way: _Way = "--to-masks" if self.mask_fit.to_masks else "--keypoints"
         for option in self._given():
             if option not in WAYS[way] and option_of(option) != way:
@@ -135,9 +136,7 @@ class Fit:
             self._fit_keypoints()
 
     def _given(self) -> Iterator[str]:
-        """Options of the ways of fitting whose value is not the default, in the order of the
-        help.
-        """
+        """Yields the names of options of fitting whose value is not the default."""
         for part in (self.mask_fit, self.detections, self):
             for field in dataclasses.fields(part):
                 value = getattr(part, field.name)
@@ -146,8 +145,9 @@ class Fit:
                     yield field.name
 
     def _check_places(self) -> None:
-        """Whether the result can be written; the whole of it is checked again where the capture is
-        known.
+        """Checks whether the result can be written, as far as is known before the capture is read.
+
+        Raises: UsageError if it cannot.
         """
         inputs = (self.capture, self.detections.keypoints, self.body)
         in_place = self.out is None or self.out.resolve() == self.capture.resolve()
@@ -251,7 +251,7 @@ class Fit:
 
 
 _DEFAULT_SHEET = Path("check.png")
-"""What `humangs check` writes."""
+"""File that `humangs check` writes by default."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -321,8 +321,9 @@ class Check:
             suggest("humangs reconstruct", self.capture, "--out avatar.npz")
 
     def _found(self, capture: Any, keypoints: Any) -> tuple[Any, Any]:
-        """The capture and its keypoints, with what is found in the photos where either is missing;
-        in memory only.
+        """Returns capture and keypoints, with missing masks and keypoints found in the photos.
+
+        Nothing is written to files.
         """
         import numpy as np
 

@@ -1,10 +1,12 @@
-"""Options that several commands share: checks, which raise an error of one line that names the
-option, and parsing.
+"""Options that several commands share, checks of options, and parsing of their values.
 
-Where results go is checked before the work begins, and before anything heavy is imported. One rule
-for all commands: a single file that exists is replaced, whole, once the work is done; an .npz by
-its own kind only, and none that the command reads. The folder of a capture or of a fit to a scan is
-replaced with --overwrite only; `demo`, `render`, `synth`, `train` add to theirs.
+Checks raise an error of one line that names the option.
+
+Places of results are checked before the work begins, and before anything heavy is imported. All
+commands have the same rules. A single file that exists is replaced as a whole, once the work is
+done. The file of an avatar replaces only an avatar, and no command replaces a file that it reads.
+The folder of a capture or of a fit to a scan is replaced only with --overwrite. `demo`, `render`,
+`synth` and `train` add files to their folders.
 """
 
 import dataclasses
@@ -39,19 +41,20 @@ if TYPE_CHECKING:
     from humangs_jax.core.array_types import Array
 
 Side = Annotated[int, Range(16, 8192)]
-"""Pixels along a side of what is drawn: the largest image takes a gigabyte while it is drawn."""
+"""Pixels along a side of an image. The largest image takes a gigabyte while it is drawn."""
 Workers = Annotated[int | None, at_least(1)]
 Preset = Literal["realtime", "balanced", "quality", "best"]
 """Names of `humangs_jax.PRESETS`."""
 
 
 class UsageError(ValueError):
-    """A command line that cannot be meant; the exit code is 2. The message names the option."""
+    """Says what is wrong with a command line, and names the option. The exit code is 2."""
 
 
 def option_of(argument: str) -> str:
-    """The option that an argument of the library comes from: "frame_ms" is --frame-ms; files are
-    written to --out.
+    """Returns the option for an argument of the library: "frame_ms" is --frame-ms.
+
+    The argument "path" is --out.
     """
     if argument == "path":
         return "--out"
@@ -60,7 +63,7 @@ def option_of(argument: str) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class PartOfMotion:
-    """What of the file of --motion is played."""
+    """Options that say which part of the file of --motion is played, and how."""
 
     motion_fps: Annotated[float | None, Range(0.01, 1000.0)] = None
     """Frames per second of the motion, where its file says none. Default: those of the file."""
@@ -75,7 +78,10 @@ class PartOfMotion:
     """Name or number of the animation, in a .glb of several. Default: the first."""
 
     def options(self, path: Path | None) -> tuple[str | Path, ...]:
-        """What another command says to play the same; of a file, or nothing."""
+        """Returns the words with which another command plays the same motion.
+
+        path: file of the motion. None: there are no words.
+        """
         if path is None:
             return ()
         words: list[str | Path] = ["--motion", path]
@@ -87,11 +93,14 @@ class PartOfMotion:
         return tuple(words)
 
     def given(self) -> dict[str, Any]:
-        """The fields that are not None, by name."""
+        """Returns the fields that are not None, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
-        """The motion of a file; None: the shipped walk. Raises: MotionError."""
+        """Reads the motion of a file, or the shipped walk if `path` is None.
+
+        Raises: MotionError; UsageError for options without a file.
+        """
         from humangs_jax.motion import load_motion
 
         given = self.given()
@@ -130,19 +139,19 @@ AVATAR = OutputPath((".npz",), avatar=True)
 
 
 def off(what: str) -> Any:
-    """Annotation of a switch that is on: what --no-SWITCH does not do.
+    """Returns the annotation of a switch that is on by default.
 
-    `--help` shows this, since that is what can be typed.
+    `--help` then shows what --no-SWITCH does: "Do not" and the words of `what`.
     """
     return arg(help=f"Do not {what}.")
 
 
 @functools.cache
 def described(command: type[Any]) -> type[Any]:
-    """The dataclass of a command with what --help shows of its options: positional arguments by
-    name, no default that is None.
+    """Annotates the options of a command for --help, and returns the command's dataclass.
 
-    tyro alone shows `PATH` for every positional argument, `{None}|PATH`, and `(default: None)`.
+    Positional arguments are shown by name, and defaults that are None are not shown. tyro alone
+    shows `PATH` for every positional argument, `{None}|PATH`, and `(default: None)`.
     """
     for field, hint, kind, positional in _options(command):
         if dataclasses.is_dataclass(kind):
@@ -161,7 +170,10 @@ def described(command: type[Any]) -> type[Any]:
 
 
 def option_names(command: type[Any]) -> set[str]:
-    """The options of a command as they are typed; a flag that is on has its negative only."""
+    """Returns the options of a command as they are typed.
+
+    A switch that is on by default has only its --no- form.
+    """
     names = set()
     for field, _, kind, positional in _options(command):
         if dataclasses.is_dataclass(kind):
@@ -172,7 +184,7 @@ def option_names(command: type[Any]) -> set[str]:
 
 
 def _options(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any, Any, bool]]:
-    """Each field, its annotation, what that annotates, and whether it is a positional argument."""
+    """Yields each field, its annotation, the annotated type, and whether it is positional."""
     hints = get_type_hints(command, include_extras=True)
     for field in dataclasses.fields(command):
         hint = hints[field.name]
@@ -184,7 +196,7 @@ def _options(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any, Any, 
 
 
 def fields_of(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any]]:
-    """Each field of a command with its annotation, those of groups of options among them."""
+    """Yields each field of a command and of its groups of options, with the annotation."""
     for field, hint, kind, _ in _options(command):
         if dataclasses.is_dataclass(kind) and isinstance(kind, type):
             yield from fields_of(kind)
@@ -193,7 +205,7 @@ def fields_of(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any]]:
 
 
 def types_in(kind: Any) -> list[Any]:
-    """The types that a type may be: those of unions, what is annotated, and the items of tuples."""
+    """Returns the types inside of annotations, unions and tuples, or the type itself."""
     if get_origin(kind) is Annotated:
         return types_in(get_args(kind)[0])
     if get_origin(kind) in (Union, UnionType, tuple):
@@ -202,7 +214,7 @@ def types_in(kind: Any) -> list[Any]:
 
 
 def _value_shown(kind: Any) -> str | None:
-    """How --help shows the values of a type, without `None`; None: as tyro does."""
+    """Returns how --help shows the values of a type, without None. None: as tyro shows them."""
     if get_origin(kind) is tuple:
         return None
     names = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
@@ -218,8 +230,9 @@ def _value_shown(kind: Any) -> str | None:
 
 
 def check_options(command: Any) -> None:
-    """Before the work: are options in the ranges of their annotations, can their places be written
-    to? Raises: UsageError.
+    """Checks that options are in the ranges of their annotations, and that outputs can be written.
+
+    Raises: UsageError if one is not.
     """
     cls = type(command)
     hints = {
@@ -247,9 +260,11 @@ def check_options(command: Any) -> None:
 
 
 def require_place(path: Path, option: str, place: OutputPath, read: Iterable[Path] = ()) -> None:
-    """Checks that results of a kind can be written to a path. read: what the command reads.
+    """Checks that results of a kind can be written to a path.
 
-    Raises: UsageError.
+    read: files and folders that the command reads.
+
+    Raises: UsageError if they cannot.
     """
     if not place.suffixes or (place.folder and not path.suffix):
         require_folder(path, option)
@@ -272,10 +287,11 @@ def require_place(path: Path, option: str, place: OutputPath, read: Iterable[Pat
 def require_file(
     path: Path, suffixes: tuple[str, ...], option: str = "--out", read: Iterable[Path | None] = ()
 ) -> None:
-    """A file with one of the suffixes can be written to that path, whose folder is made if it does
-    not exist.
+    """Checks that a file with one of the suffixes can be written to a path.
 
-    read: what the command reads. Raises: UsageError.
+    Its folder need not exist. read: files that the command reads.
+
+    Raises: UsageError if it cannot.
     """
     if path.suffix.lower() not in suffixes:
         raise UsageError(f"{option} {path}: expected a name ending in {alternatives(suffixes)}")
@@ -294,9 +310,9 @@ def require_file(
 
 
 def require_folder(path: Path, option: str = "--out") -> None:
-    """Files can be written into that folder, which is made if it does not exist.
+    """Checks that files can be written into a folder, which need not exist.
 
-    Raises: UsageError.
+    Raises: UsageError if they cannot.
     """
     if path.exists() and not path.is_dir():
         raise UsageError(f"{option} {path}: is a file: expected the name of a folder")
@@ -306,8 +322,11 @@ def require_folder(path: Path, option: str = "--out") -> None:
 def require_replaceable(
     folder: Path, overwrite: bool, mark: str, inputs: Iterable[Path | None] = ()
 ) -> None:
-    """A folder of the kind that holds the file `mark` can be made there, or replaced with
-    --overwrite. Raises: UsageError.
+    """Checks that a folder can be made at a path, or replaced with --overwrite.
+
+    mark: name of a file that all folders of this kind have. inputs: what the command reads.
+
+    Raises: UsageError if it cannot.
     """
     from humangs_jax.io.atomic import check_replaceable, remove_abandoned_lock
 
@@ -329,8 +348,9 @@ def _require_writable(path: Path, option: str) -> None:
 
 
 def tell_deleted(folder: Path, unless: Path | None = None) -> None:
-    """Say what --overwrite will delete in a folder that is replaced; nothing where it is the folder
-    `unless`, or empty.
+    """Shows what --overwrite will delete in a folder that is replaced.
+
+    Shows nothing if the folder is empty, or if it is the folder `unless`.
     """
     from humangs_jax.io.atomic import contents
 
@@ -342,8 +362,11 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
 
 
 def refine_limits(text: str) -> dict[str, Any]:
-    """Fields of `RefineConfig` for --refine "15s", "15" (seconds), "100steps", or "0steps"
-    (iterations only). Raises: UsageError.
+    """Parses --refine into fields of `RefineConfig`.
+
+    text: "15s", "15" (seconds), "100steps", or "0steps" (iterations only).
+
+    Raises: UsageError for another text.
     """
     match = re.fullmatch(r"(?P<number>\d+(\.\d*)?)(?P<unit>s|steps)?", text.strip())
     number = float(match["number"]) if match else 0.0
@@ -358,8 +381,9 @@ def refine_limits(text: str) -> dict[str, Any]:
 
 
 def first_refinement(text: str | None) -> RefineConfig | None:
-    """How a new avatar is refined after --refine: as `refine_limits`, None for "0", and by default
-    by iterations alone.
+    """Parses --refine of a new avatar, as `refine_limits` does.
+
+    Returns: None for "0", which means no refinement; without --refine, iterations alone.
     """
     if text is None:
         return ITERATIONS_ALONE
@@ -369,9 +393,9 @@ def first_refinement(text: str | None) -> RefineConfig | None:
 
 
 def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings | None":
-    """The settings that --preset names or that --config holds, None without either.
+    """Returns the settings of --preset or of the file of --config; None without either.
 
-    Raises: UsageError for both; FileError.
+    Raises: UsageError if both are given; FileError for a wrong file.
     """
     if preset is not None and config is not None:
         raise UsageError(
@@ -389,7 +413,7 @@ def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings |
 
 
 def shard_of(text: str) -> tuple[int, int]:
-    """(I, N) of "I/N": the I-th of N parts, counted from 0. Raises: UsageError."""
+    """Parses "I/N", part I of N parts, counted from 0, into (I, N). Raises: UsageError."""
     match = re.fullmatch(r"(\d+)/(\d+)", text)
     if match is None or not int(match[1]) < int(match[2]):
         raise UsageError(f"--shard {text}: expected I/N with I from 0 to N - 1, as in 0/8")
@@ -397,7 +421,7 @@ def shard_of(text: str) -> tuple[int, int]:
 
 
 def cores(workers: int | None) -> int:
-    """That many processes, by default one for each core that this one may use."""
+    """Returns the number of processes: `workers`, or if None one for each core that may be used."""
     if hasattr(os, "sched_getaffinity"):
         available = len(os.sched_getaffinity(0))
     else:

@@ -1,6 +1,6 @@
-"""Words of a command line to a command with its options.
+"""Parses the words of a command line into a command with its options.
 
-What tyro refuses in a box with its help is one line here.
+tyro reports an error in a box of many lines; here it becomes one line.
 """
 
 import contextlib
@@ -16,9 +16,9 @@ from humangs_jax.cli.options import UsageError, fields_of, option_of, types_in
 
 
 def parsed(command: type[Any], name: str, words: Sequence[str]) -> Any:
-    """The command with its options. name: as it is typed.
+    """Parses words into a command with its options. name: of the command, as it is typed.
 
-    Raises: UsageError; SystemExit after --help.
+    Raises: UsageError for wrong words; SystemExit after --help.
     """
     import tyro
 
@@ -37,7 +37,7 @@ def parsed(command: type[Any], name: str, words: Sequence[str]) -> Any:
 
 
 def _inside(box: str) -> list[str]:
-    """The lines with words, without the box around them; their indents stay."""
+    """Returns the lines inside of a box that have words; their indents stay."""
     # characters that boxes are drawn with, or rules where the terminal knows ASCII only
     frame = "[\u2500-\u257f]+|-{3,}"
     lines = [re.sub(frame, "", line).rstrip() for line in box.splitlines()]
@@ -46,7 +46,7 @@ def _inside(box: str) -> list[str]:
 
 @contextlib.contextmanager
 def _wide_screen() -> Generator[None]:
-    """So many columns while tyro parses that its messages are not broken into lines."""
+    """Sets the width of the screen so high that tyro does not wrap its messages."""
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "10000"
     try:
@@ -59,7 +59,7 @@ def _wide_screen() -> Generator[None]:
 
 
 def _one_line(command: type[Any], name: str, words: Sequence[str], lines: list[str]) -> str:
-    """What is wrong with the words, after what tyro says in these lines."""
+    """Returns one line about what is wrong with the words. lines: tyro's message."""
     text = " ".join(line.strip() for line in lines)
     example = f"as in `{command.examples[0]}`"
     match = re.search(r"[Ii]nvalid choice '(?P<given>.*?)' for argument '(?P<option>.*?)'", text)
@@ -85,9 +85,7 @@ def _one_line(command: type[Any], name: str, words: Sequence[str], lines: list[s
 
 
 def _missing(lines: Sequence[str]) -> list[str]:
-    """The arguments that tyro lists with their help: those that are indented least below the first
-    line.
-    """
+    """Returns the missing arguments that tyro's message lists: the lines with the least indent."""
     start = next(i for i, line in enumerate(lines) if "Missing from" in line)
     rows = lines[start + 1 :]
     indents = [len(row) - len(row.lstrip()) for row in rows]
@@ -100,7 +98,7 @@ def _missing(lines: Sequence[str]) -> list[str]:
 
 
 def _value_after(words: Sequence[str], option: str) -> str:
-    """What was given to an option, or the text of a positional argument that is not known."""
+    """Returns the value that was given to an option; "" if the words do not have the option."""
     for i, word in enumerate(words):
         typed, _, value = word.partition("=")
         if typed.replace("_", "-") == option:
@@ -109,7 +107,7 @@ def _value_after(words: Sequence[str], option: str) -> str:
 
 
 def _wrong_value(command: type[Any], option: str, given: str) -> str:
-    """A value that an option does not take: what it takes, and the nearest word or the default."""
+    """Returns the line about a wrong value: what is expected, and the nearest word or default."""
     choices = _choices(_kind(command, option))
     near = difflib.get_close_matches(given, choices, n=1)
     if near:
@@ -120,8 +118,9 @@ def _wrong_value(command: type[Any], option: str, given: str) -> str:
 
 
 def _no_value(command: type[Any], option: str, words: Sequence[str]) -> str:
-    """An option without a value; what follows it looks like an option, as negative numbers and axes
-    do.
+    """Returns the line about an option without a value.
+
+    A value that begins with "-", such as a negative number or an axis, has to be joined with "=".
     """
     following = []
     if option in words:
@@ -133,7 +132,7 @@ def _no_value(command: type[Any], option: str, words: Sequence[str]) -> str:
 
 
 def _usual(command: type[Any], option: str) -> str:
-    """The default of an option that is a number."""
+    """Returns words about the default of an option, if it is a number, else ""."""
     usual = next(
         (field.default for field, _ in fields_of(command) if option_of(field.name) == option), None
     )
@@ -147,7 +146,7 @@ def _shown(option: str) -> str:
 
 
 def _expected(command: type[Any], option: str) -> str:
-    """What the values of an option may be, in words."""
+    """Returns in words what the values of an option may be."""
     kind = _kind(command, option)
     names = {int: "a whole number", float: "a number"}
     numbers = [names[part] for part in types_in(kind) if part in names]
@@ -161,7 +160,7 @@ def _expected(command: type[Any], option: str) -> str:
 
 
 def _kind(command: type[Any], option: str) -> Any:
-    """The type of an option, as it is annotated; None for one that is not known."""
+    """Returns the annotated type of an option; None for an unknown option."""
     plain = option.lstrip("-").replace("_", "-").lower()
     for field, kind in fields_of(command):
         if option_of(field.name).lstrip("-") == plain:
@@ -170,6 +169,6 @@ def _kind(command: type[Any], option: str) -> Any:
 
 
 def _choices(kind: Any) -> list[str]:
-    """The words that an option may be, in their order."""
+    """Returns the words that a value of a type may be, in their order."""
     literals = [part for part in types_in(kind) if get_origin(part) is Literal]
     return [str(word) for literal in literals for word in get_args(literal)]

@@ -1,9 +1,9 @@
-"""What a command shows: stages while it works, warnings, what it wrote, how long its stages took,
-and what to do next. Ctrl-C.
+"""Shows a command's stages, warnings and results on the screen, and handles Ctrl-C.
 
-Commands use `stage`, `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls
-`finish` and `fail`. Results go to stdout, everything else to stderr. --quiet leaves results and
-errors, --verbose shows what libraries log as well.
+At its end a command shows how long its stages took, and what to do next. Commands use `stage`,
+`tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `finish` and `fail`. Results
+go to stdout, everything else to stderr. --quiet leaves results and errors, --verbose shows what
+libraries log as well.
 """
 
 import atexit
@@ -31,26 +31,24 @@ from humangs_jax.core.progress import stage as stage
 # destructors, Python drops the KeyboardInterrupt with a note, and the command would go on. And
 # extensions crash where it comes while they are imported.
 heard = threading.Event()
-"""Whether Python has heard of Ctrl-C in this command."""
+"""Is set when Python has received Ctrl-C in this command."""
 PATIENCE = 2.0
-"""Seconds that Python gets to hear of it and to tidy up; files are written by calls that are
-shorter.
-"""
+"""Seconds that Python has to receive Ctrl-C and to tidy up. Calls that write files are shorter."""
 
 
 def end_within_seconds() -> None:
-    """From now on Ctrl-C ends this process by a KeyboardInterrupt or, if that is not heard in time,
-    at once.
+    """Makes Ctrl-C end this process within seconds; the console script calls this.
 
-    For the console script. So does what asks a process to end (`timeout`, a terminal that is
-    closed). Where a command handles the signal itself, as training does to save its state, nothing
-    is forced.
+    Ctrl-C raises KeyboardInterrupt. If Python does not receive the signal in time, the process ends
+    at once. Signals that ask a process to end (from `timeout`, or a terminal that is closed) do the
+    same. While a command handles Ctrl-C itself, as training does to save its state, nothing is
+    forced.
     """
     if sys.platform == "win32" or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return  # there, wake-up descriptors are sockets; or somebody else handles it
 
     def again():
-        """Repeat an interrupt that was dropped, or came at a bad time, 20 ms later."""
+        """Repeats after 20 ms an interrupt that was dropped, or that came at a bad time."""
         threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT)).start()
 
     def interrupt(number, frame):
@@ -61,7 +59,7 @@ def end_within_seconds() -> None:
         signal.default_int_handler(number, frame)
 
     def end(number, frame):
-        """Heard by `watch`."""
+        """Does nothing: `watch` receives the signal."""
 
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -104,8 +102,9 @@ def end_within_seconds() -> None:
 
 
 def _importing(frame: FrameType | None) -> bool:
-    """Whether a module is being imported: extensions that are interrupted while they begin crash,
-    or raise other errors.
+    """Whether a module is being imported.
+
+    Extensions that are interrupted while they are imported crash, or raise other errors.
     """
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
@@ -115,7 +114,7 @@ def _importing(frame: FrameType | None) -> bool:
 
 
 class _Handler(logging.Handler):
-    """What libraries log, through the one door."""
+    """Shows what libraries log by `say`, as everything else."""
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
@@ -125,8 +124,10 @@ class _Handler(logging.Handler):
 
 
 def silence(verbose: bool) -> None:
-    """Keep what libraries log, and errors in their threads, off the screen of a whole program (not
-    of a test). Call it before JAX is imported.
+    """Keeps what libraries log, and errors in their threads, off the screen.
+
+    Call it before JAX is imported, in a whole program, not in a test. verbose: whether logs are
+    shown.
     """
     # 3 leaves fatal errors: XLA logs its boxes about slow compilation as errors, and real errors
     # of a program arrive as exceptions
@@ -165,25 +166,23 @@ def silence(verbose: bool) -> None:
 
 
 def tell(text: object) -> None:
-    """A result that was asked for, such as a report: shown with --quiet too."""
+    """Shows a result that the user asked for, such as a report; with --quiet too."""
     say(text)
 
 
 def wrote(path: str | Path, what: str) -> None:
-    """A file or folder was written."""
+    """Shows that a file or folder was written, and what it has."""
     if not progress.current().quiet:
         say(f"{path}: {what}")
 
 
 def warn(text: object) -> None:
-    """Something looks wrong, and the command goes on."""
+    """Shows a warning about something that looks wrong; the command goes on."""
     say(f"humangs: warning: {text}", error=True, lines=False)
 
 
 def fail(error: BaseException, verbose: bool) -> None:
-    """The command ends with this error: one line below what is on the screen, with --verbose the
-    traceback above it.
-    """
+    """Shows the error that ends the command, in one line; if verbose, its traceback before."""
     progress.end()
     if verbose:
         say("".join(traceback.format_exception(error)).rstrip(), error=True)
@@ -191,15 +190,19 @@ def fail(error: BaseException, verbose: bool) -> None:
 
 
 def suggest(*command: str | Path) -> None:
-    """What to do next: the parts of a command line; paths are quoted, text is not."""
+    """Adds a command line to what `finish` suggests to do next.
+
+    command: the parts of the command line; paths are quoted, text is not.
+    """
     progress.current().next.append(
         " ".join(quoted(part) if isinstance(part, Path) else part for part in command)
     )
 
 
 def quoted(path: Path) -> str:
-    r"""A path as a shell takes it, even where the terminal cannot show it: then as $'f\xc3\xbcr',
-    which bash and zsh read.
+    r"""Quotes a path for a shell.
+
+    A path that the terminal cannot show is written like $'f\xc3\xbcr', which bash and zsh read.
     """
     text = str(path)
     encoding = getattr(sys.stdout, "encoding", None) or "utf-8"

@@ -1,6 +1,4 @@
-"""`humangs preprocess`, `train`, `convert`, `evaluate`: data sets, weights of one's own and the
-authors', scores.
-"""
+"""The commands `humangs preprocess`, `train`, `convert`, `evaluate`: data sets, weights, scores."""
 
 import dataclasses
 import hashlib
@@ -17,7 +15,7 @@ from humangs_jax.core.configuration import at_least
 from humangs_jax.data.formats import DATASETS
 
 _RAW = DATASETS.where(lambda each: not each.lists)
-"""Data sets that are preprocessed."""
+"""Data sets that `humangs preprocess` takes."""
 if TYPE_CHECKING:
     Kind = str
 else:
@@ -459,8 +457,9 @@ class Evaluate:
                 )
 
     def _kept(self) -> Path | None:
-        """A folder in the user's cache, that of the same command on the same files; None where
-        nothing can be written.
+        """Returns the folder in the user's cache that keeps the scores of this command.
+
+        The same command on unchanged files has the same folder. None: the cache cannot be written.
         """
         from humangs_jax import __version__
         from humangs_jax.core.processes import user_cache

@@ -1,10 +1,10 @@
-"""Motions of files and their skeletons, by a table of readers: one body pose per frame.
+"""Reads and writes motions: one pose of the body per frame.
 
-`load_motion` reads any of them.
-
-In memory (`body.motion.Motion`): SMPL-X's 55 joints, axis-angle in radians, metres, y up. Readers
-(`data.formats.MOTIONS` is their table): `arrays`, by key; `clips`, skeletons of other programs,
-which `skeleton` brings to our joints. `rules`: what all of them and the page know, as tables.
+`load_motion` reads any format of the table `data.formats.MOTIONS`. A motion in memory
+(`body.motion.Motion`) has SMPL-X's 55 joints, as axis-angles in radians; lengths are in metres, and
+y is up. The readers are in `arrays`, for files of arrays by key, `clips`, for skeletons of other
+programs, which `skeleton` converts to our joints, and `face_files`. `rules` has the tables that all
+readers and the page share.
 """
 
 import logging
@@ -33,7 +33,7 @@ __all__ = ["Motion", "MotionError", "load_motion", "save_motion"]
 
 logger = logging.getLogger(__name__)
 _MADE_FROM = "made_from"
-"""Key of what a motion was made from."""
+"""Key of the text that says what a motion was made from."""
 OTHERS = {
     **dict.fromkeys(
         (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".gif"),
@@ -45,17 +45,15 @@ OTHERS = {
         " .bvh"
     ),
 }
-"""Hints about files that are not read, by suffix."""
+"""Hints about files that cannot be read, by suffix."""
 
 
 class MotionError(FileError):
-    """Something is wrong with a motion file; the message is one line: file, key, and what was
-    expected.
-    """
+    """Says what is wrong with a motion file, in one line: file, key, and what was expected."""
 
 
 class Reading(NamedTuple):
-    """What `load_motion` was asked, as readers need it; see there."""
+    """The arguments of `load_motion` that readers need."""
 
     fps: float | None = None
     """Frames per second in place of those in the file."""
@@ -66,7 +64,7 @@ class Reading(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """What a reader finds: poses and their rate, in the world of the file."""
+    """Poses and their rate as a reader returns them, in the world of the file."""
 
     rotations: Float[np.ndarray, "m j 3"]
     """Rotation vectors of the joints, (m, 55, 3), radians."""
@@ -77,11 +75,11 @@ class Poses(NamedTuple):
     up: str = "y"
     """The axis of the world that is up."""
     fixed: bool = False
-    """Whether `up` holds whatever the poses look like, see `rules.up_axis`."""
+    """Whether `up` is certain, so that poses are not asked, see `rules.up_axis`."""
     also: tuple[str, ...] = ()
     """Other axes that are up in some files of the format, see `rules.up_axis`."""
     frames: np.ndarray | None = None
-    """Numbers of the frames, (m,), whose gaps are filled; None: consecutive."""
+    """Numbers of the frames, (m,); gaps between them are filled. None: they are consecutive."""
     note: str = ""
     """Lines for the user about the file."""
     face: FaceTrack | None = None
@@ -138,11 +136,11 @@ def load_motion(
 
 
 def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array | None) -> Motion:
-    """The motion of a file that is there, checked. Raises: MotionError and what readers raise."""
+    """Reads and checks the motion of a file. Raises: MotionError, and what readers raise."""
     read = _reader(path)
 
     def body():
-        """The joints that will move; the shipped ones are read where they are needed."""
+        """Returns the joints that will move; the shipped body is read only if it is needed."""
         if rest_joints is None:
             return skeleton.shipped_joints()
         return np.asarray(rest_joints, np.float64)
@@ -203,9 +201,11 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
 
 
 def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motion, str]:
-    """Fills the frames in which nobody was seen between those before and after.
+    """Fills frames in which nobody was seen, by interpolation between the frames around them.
 
-    Also gives the line about them, "" for none.
+    Returns: the motion, and a note about filled frames, "" for none.
+
+    Raises: MotionError if the numbers of the frames do not increase.
     """
     steps = np.diff(np.asarray(frames, float))
     if not len(steps):
@@ -223,9 +223,9 @@ def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motio
 
 
 def _reader(path: Path) -> MotionFormat:
-    """The format of a file, of its suffix or, of archives of arrays, of its content.
+    """Returns the format of a file, by its suffix or, for archives of arrays, by its content.
 
-    Raises: MotionError.
+    Raises: MotionError if there is no such file, or if its format is unknown.
     """
     if not path.exists():
         raise MotionError(path, "", "no such file")
@@ -247,7 +247,10 @@ def _reader(path: Path) -> MotionFormat:
 
 
 def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
-    """The axis that is up in the world of poses, and a note about it, see `rules.up_axis`."""
+    """Returns the axis that is up in the world of poses, and a note, see `rules.up_axis`.
+
+    body: returns the joints of the body at rest.
+    """
     rotations, translations, usual = poses.rotations, poses.translations, poses.up
     stands = None
     if not poses.fixed:
@@ -263,9 +266,9 @@ def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
 
 
 def save_motion(path: str | Path, motion: Motion, *, made_from: str | None = None) -> None:
-    """Write our own format, compressed; the file appears whole or not at all.
+    """Writes a motion in the package's format, compressed, whole or not at all.
 
-    Arguments: made_from: what the motion was made from, for `made_from_of`.
+    made_from: what the motion was made from, for `made_from_of`.
     """
     arrays: dict[str, Any] = {
         "rotations": motion.rotations,
@@ -281,7 +284,10 @@ def save_motion(path: str | Path, motion: Motion, *, made_from: str | None = Non
 
 
 def made_from_of(path: Path) -> str | None:
-    """What a motion of ours was made from, as `save_motion` recorded it; None for other files."""
+    """Returns what a motion was made from, as `save_motion` recorded it.
+
+    None: the file has no such record.
+    """
     try:
         arrays, _ = read_npz(path)
     except (ValueError, OSError):

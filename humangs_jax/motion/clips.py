@@ -1,4 +1,4 @@
-"""Skeletons in motion of other programs: BVH files, and the animations of GLB files.
+"""Reads moving skeletons of other programs: BVH files, and animations of GLB files.
 
 BVH (https://research.cs.wisc.edu/graphics/Courses/cs-838-1999/Jeff/BVH.html): a tree of joints with
 offsets and channels, then one line of numbers per frame. Rotations are degrees about the axes of
@@ -50,7 +50,7 @@ _MOTION = re.compile(r"(?<!\S)MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)")
 
 
 def read_bvh(path: Path, options: object = None) -> Clip:
-    """The skeleton of a file in motion.
+    """Reads the moving skeleton of a BVH file.
 
     Raises: OSError; InvalidFileError or FileError, which say what was expected.
     """
@@ -88,9 +88,9 @@ def read_bvh(path: Path, options: object = None) -> Clip:
 def _tree(
     text: str,
 ) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "s 3"], list[list[str]]]:
-    """Names, parents, offsets and channels of the joints that a file begins with.
+    """Reads names, parents, offsets (s, 3) and channels of the joints from a BVH file's HIERARCHY.
 
-    Raises: InvalidFileError.
+    Raises: InvalidFileError if the text is not a whole tree of joints.
     """
     # each word, and the name behind ROOT, JOINT and End
     found = _WORD.finditer(text, len("HIERARCHY") + text.index("HIERARCHY"))
@@ -137,9 +137,9 @@ def _tree(
 
 
 def _channels(words: Iterator[tuple[str, str | None]], joint: str) -> list[str]:
-    """The channels of a joint, in lower case, from the words behind CHANNELS.
+    """Reads the channels of a joint, in lower case, from the words that follow CHANNELS.
 
-    Raises: InvalidFileError; StopIteration where the words end.
+    Raises: InvalidFileError for unknown channels; StopIteration if the words end too early.
     """
     amount = _number(next(words)[0])
     channels = [next(words)[0].lower() for _ in range(int(min(max(amount, 0), 7)))]
@@ -149,7 +149,7 @@ def _channels(words: Iterator[tuple[str, str | None]], joint: str) -> list[str]:
 
 
 def _number(word: str) -> float:
-    """A finite number. Raises: InvalidFileError."""
+    """Converts a word to a finite number. Raises: InvalidFileError if it is none."""
     try:
         value = float(word)
     except ValueError:
@@ -160,7 +160,7 @@ def _number(word: str) -> float:
 
 
 def _numbers(text: str) -> Float[np.ndarray, " n"]:
-    """All numbers of the frames. Raises: InvalidFileError."""
+    """Reads the numbers of all frames. Raises: InvalidFileError if one is not a finite number."""
     try:
         values = np.fromstring(text, np.float64, sep=" ")
     except ValueError as error:
@@ -178,7 +178,10 @@ def _posed(
     channels: list[list[str]],
     numbers: Float[np.ndarray, "m n"],
 ) -> tuple[Float[np.ndarray, "m s 3 3"], Float[np.ndarray, "m s 3"]]:
-    """Rotations (m, s, 3, 3) and places (m, s, 3) of the joints in the world."""
+    """Returns rotations (m, s, 3, 3) and places (m, s, 3) of the joints in the world.
+
+    numbers: a row for each frame, with the channels of all joints one after the other.
+    """
     frames = len(numbers)
     turns, moves = np.empty((frames, len(parents), 3, 3)), np.empty((frames, len(parents), 3))
     at = 0
@@ -203,10 +206,11 @@ def _posed(
 
 
 def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
-    """The skeleton of a GLB file in motion, with its face; the face alone of one that turns
-    nothing.
+    """Reads the moving skeleton of a GLB file, with its face.
 
-    Raises: OSError; InvalidFileError and what damaged numbers raise.
+    An animation that turns no joint, but moves a face, gives poses with the face alone.
+
+    Raises: OSError; InvalidFileError, and what damaged numbers raise.
     """
     data = read_bytes(path, "mesh_bytes")
     content, binary = parse_glb(data, "text_bytes")
@@ -243,13 +247,15 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
 
 
 _SHOWN = 12
-"""Names of animations in a line."""
+"""Largest number of animations' names in a note or an error."""
 
 
 def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[str, Any], str]:
-    """Gives the animation of a name or number, else the first, and a note about the others.
+    """Returns an animation, and a note about the others.
 
-    Raises: InvalidFileError.
+    clip: the name or number of the animation. None: the first.
+
+    Raises: InvalidFileError if there is no such animation.
     """
     names = [str(each.get("name", i)) for i, each in enumerate(animations)]
     listed = ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
@@ -268,8 +274,9 @@ def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[st
 
 
 def _humanoid(content: dict[str, Any]) -> dict[int, str]:
-    """Names of the bones by node, of files that say them (VRM and its animations): nodes may be
-    called anything.
+    """Returns the names of bones by node, which VRM files and their animations have.
+
+    Nodes themselves may have any names. Empty for other files.
     """
     extensions = content.get("extensions")
     if not isinstance(extensions, dict):
@@ -293,8 +300,10 @@ def _humanoid(content: dict[str, Any]) -> dict[int, str]:
 def _joints(
     content: dict[str, Any], binary: bytes, nodes: Nodes
 ) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
-    """Nodes that are joints, and the matrices (4, 4) of their places when they were bound, as far
-    as the file tells.
+    """Returns the nodes that are joints, and the matrices of the joints when the skin was bound.
+
+    The matrices (4, 4) are by node. There are none if the file has no skin with such matrices; all
+    nodes are joints if it has no skin.
     """
     skins = [skin for skin in content.get("skins", []) if skin.get("joints")]
     if not skins:
@@ -314,7 +323,7 @@ def _joints(
 
 
 def _next_joint(parents: Sequence[int], joint: int, joints: Container[int]) -> int:
-    """The nearest of the joints above a joint; -1 for none."""
+    """Returns the nearest node above a joint that is a joint too; -1 if there is none."""
     joint = parents[joint]
     while joint != -1 and joint not in joints:
         joint = parents[joint]
@@ -324,7 +333,10 @@ def _next_joint(parents: Sequence[int], joint: int, joints: Container[int]) -> i
 def _tracks(
     content: dict[str, Any], binary: bytes, animation: dict[str, Any], wanted: Container[int]
 ) -> Tracks:
-    """What moves the wanted nodes, by node and path. Raises: InvalidFileError."""
+    """Returns the tracks that move the wanted nodes, by node and path.
+
+    Raises: InvalidFileError if they are damaged, or if none turns a node.
+    """
     tracks: dict[tuple[int, str], Any] = {}
     for channel in animation["channels"]:
         node, path = channel["target"].get("node"), channel["target"]["path"]
@@ -352,7 +364,10 @@ def _tracks(
 
 
 def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
-    """Times of the frames in seconds, as close as those of the densest track, and their rate."""
+    """Returns evenly spaced times of frames (m,), seconds, and their rate in frames per second.
+
+    The rate is that of the track with most times.
+    """
     first, last = (
         pick(times[end] for times, _, _ in tracks.values()) for pick, end in ((min, 0), (max, -1))
     )
@@ -367,9 +382,9 @@ def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
 
 
 def _rotations(matrices: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3 3"]:
-    """The rotations in matrices of rotation and scale.
+    """Returns the rotations in matrices of rotation, scale and position.
 
-    Raises: InvalidFileError where there is none.
+    Raises: InvalidFileError if a matrix mirrors or has no size.
     """
     linear = matrices[..., :3, :3]
     lengths = np.linalg.norm(linear, axis=-2, keepdims=True)

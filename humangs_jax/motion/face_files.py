@@ -1,8 +1,7 @@
-"""Files of faces: tables of ARKit's shapes (Live Link Face), scores of MediaPipe, expressions in
-animations of GLB and VRMA.
+"""Reads expressions from tables of ARKit's shapes, scores of MediaPipe, and animations.
 
-Tables and scores have no body: the person stands with the arms down, and the head turns where the
-file says how.
+Tables are those of Live Link Face, animations those of GLB and VRMA files. Tables and scores have
+no body: the person stands with the arms down, and the head turns if the file has its rotations.
 
 A table (.csv) has a line of names, then a line of numbers for each frame. Columns may be in any
 order; names are compared without case ("EyeBlinkLeft", "eyeBlinkLeft", "eyeBlink_L"). `HeadYaw`,
@@ -43,13 +42,13 @@ from humangs_jax.motion.face_tracks import (
 from humangs_jax.motion.rules import NO_RATE
 
 _ARMS_DOWN = 1.15
-"""Radians by which the arms of a person hang down who has a face and no motion."""
+"""Angle by which the arms hang down, radians, for a person with a face and no motion."""
 _FEWEST = 5
-"""Shapes of ARKit that make a table or an object one of faces."""
+"""Least number of ARKit's shapes in a table or an object of a face."""
 _MOST_COLUMNS = 1000
-"""Names in a file."""
+"""Largest number of names in a file."""
 _DEEPEST = 5
-"""Objects and lists within each other, down to the scores of a frame."""
+"""Largest number of objects and lists within each other around the scores of a frame."""
 
 
 # Tables
@@ -57,7 +56,10 @@ _DEEPEST = 5
 
 
 def read_table(path: Path, options: Reading) -> Poses:
-    """A face in a table. Raises: MotionError or InvalidFileError, naming the column or the line."""
+    """Reads a face from a table.
+
+    Raises: MotionError or InvalidFileError, which name the column or the line.
+    """
     # the line of names tells which columns are shapes
     rows = csv.reader(io.StringIO(read_text(path)))
     try:
@@ -112,7 +114,10 @@ def _number(row: Sequence[str], index: int, name: str, line: int) -> float:
 
 
 def _times(codes: Sequence[str], asked: float | None) -> tuple[float, np.ndarray | None, str]:
-    """Frames per second, the numbers of the frames (None: consecutive), and a note ("": none)."""
+    """Returns frames per second, numbers of the frames (None: consecutive), and a note ("": none).
+
+    codes: the timecode of each frame. asked: the rate that the user gave, or None.
+    """
     parts = [re.fullmatch(r"\s*(\d+):(\d+):(\d+)[:;.](\d+(?:\.\d+)?)\s*", code) for code in codes]
     if not parts or any(part is None for part in parts):
         note = NO_RATE.format(DEFAULT_FPS) + ", which --motion-fps (in Python fps=) changes"
@@ -145,7 +150,10 @@ def _standing(
     frames: np.ndarray | None = None,
     note: str = "",
 ) -> Poses:
-    """A person with this face who stands with the arms down. head: rotations, axis-angle."""
+    """Makes poses of a person with this face, who stands with the arms down.
+
+    values: coefficients of ARKit's shapes. head: rotations, axis-angle, radians.
+    """
     track = FaceTrack(ARKIT, clipped(values))
     checked_track(track, len(values))
     if not np.isfinite(head).all():
@@ -169,7 +177,7 @@ def has_scores(path: Path) -> bool:
 
 
 def read_scores(path: Path, options: Reading) -> Poses:
-    """A face in scores. Raises: MotionError, naming what is wrong."""
+    """Reads a face from scores. Raises: MotionError, which says what is wrong."""
     with reading(path, "scores of a face", MotionError):
         content = read_json(path)
         frames = _frames_of(content)
@@ -196,8 +204,9 @@ def read_scores(path: Path, options: Reading) -> Poses:
 
 
 def _frames_of(content: Any) -> list[dict[str, float]] | None:
-    """The scores of each frame, empty where nobody was seen; None if there are none in the
-    content.
+    """Returns the scores of each frame by name, empty where nobody was seen.
+
+    None: the content has no scores.
     """
     if isinstance(content, dict):
         lists = [value for value in content.values() if isinstance(value, list)]
@@ -211,8 +220,9 @@ def _frames_of(content: Any) -> list[dict[str, float]] | None:
 
 
 def _scores_of(frame: Any, depth: int) -> dict[str, float]:
-    """Scores by ARKit's names in one frame: an object of them, or a list of categories, however
-    deep.
+    """Returns the scores of one frame by ARKit's names; empty if there are none.
+
+    They may be an object of scores or a list of categories, at most `_DEEPEST` levels down.
     """
     if depth > _DEEPEST:
         return {}
@@ -259,8 +269,10 @@ def animated_face(
     animation: Mapping[str, Any],
     times: Float[np.ndarray, " m"],
 ) -> tuple[FaceTrack | None, str]:
-    """Gives the expressions in an animation of a GLB or VRMA file at some times as ARKit's shapes,
-    and a note about unknown ones.
+    """Returns the expressions of a GLB or VRMA file's animation as ARKit's shapes, and a note.
+
+    The note lists shapes that are not ARKit's, "" for none. The face is None if the animation has
+    no expressions. times: of the frames, seconds.
     """
     tracks = _expression_tracks(content, binary, animation) or _weight_tracks(
         content, binary, animation
@@ -282,15 +294,15 @@ def animated_face(
 
 
 Weights = dict[str, tuple[np.ndarray, np.ndarray]]
-"""By the name of a shape: seconds, increasing, and the weight at each."""
+"""For each name of a shape, increasing times in seconds (k,) and the weights at them (k,)."""
 
 
 def _keys_of(
     content: dict[str, Any], binary: bytes, animation: Mapping[str, Any], channel: Mapping[str, Any]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds (k,) and values (k, c) of a channel.
+    """Reads the times (k,), seconds, and the values (k, c) of a channel.
 
-    Raises: InvalidFileError unless there is a row for each of increasing times.
+    Raises: InvalidFileError if times do not increase, or if there is not one row for each.
     """
     sampler = animation["samplers"][channel["sampler"]]
     times = read_accessor(content, binary, sampler["input"])[:, 0]
@@ -309,7 +321,7 @@ def _keys_of(
 def _expression_tracks(
     content: dict[str, Any], binary: bytes, animation: Mapping[str, Any]
 ) -> Weights:
-    """Of a VRMA file: the weight of an expression is how far its node is moved along x."""
+    """Reads the weights of expressions in a VRMA file: the x of each expression's node."""
     extension = (content.get("extensions") or {}).get("VRMC_vrm_animation", {})
     expressions = {}
     if isinstance(extension, dict):
@@ -334,8 +346,9 @@ def _expression_tracks(
 
 
 def _weight_tracks(content: dict[str, Any], binary: bytes, animation: Mapping[str, Any]) -> Weights:
-    """Of a GLB file: the weights of the targets of a mesh, by their names; of the mesh with most
-    names that are ARKit's.
+    """Reads the weights of a mesh's morph targets in a GLB file, by the targets' names.
+
+    The mesh is the one with most names of ARKit's shapes.
     """
     found: list[Weights] = []
     channels = [each for each in animation["channels"] if each["target"]["path"] == "weights"]
@@ -357,7 +370,7 @@ def _weight_tracks(content: dict[str, Any], binary: bytes, animation: Mapping[st
 
 
 def _target_names(mesh: Mapping[str, Any], count: int) -> list[str]:
-    """Names of the targets of a mesh; numbers where it has none."""
+    """Returns the names of a mesh's morph targets, or their numbers if they have no names."""
     places = [mesh, *mesh.get("primitives", [])]
     for place in places:
         names = (place.get("extras") or {}).get("targetNames")
@@ -369,7 +382,7 @@ def _target_names(mesh: Mapping[str, Any], count: int) -> list[str]:
 def face_alone(
     content: dict[str, Any], binary: bytes, animation: Mapping[str, Any], note: str
 ) -> Poses | None:
-    """The motion of an animation that turns nothing and moves a face; None if it does not."""
+    """Reads an animation that moves a face and turns no node; None for any other animation."""
     if any(channel["target"]["path"] == "rotation" for channel in animation["channels"]):
         return None
     inputs = [

@@ -1,6 +1,4 @@
-"""Expressions over time, as files have them: their names, and which of ARKit's shapes stand for
-the presets of others.
-"""
+"""Expressions over time, and the conversion of files' names of expressions to ARKit's shapes."""
 
 import dataclasses
 import re
@@ -23,7 +21,7 @@ ARKIT = (
     "mouthStretchRight", "mouthUpperUpLeft", "mouthUpperUpRight", "noseSneerLeft",
     "noseSneerRight", "tongueOut",
 )  # fmt: skip
-"""The names of the 52 shapes, in the order of the alphabet."""
+"""The names of ARKit's 52 shapes, in alphabetical order."""
 PRESETS = {
     "happy": {"mouthSmile": 0.8, "cheekSquint": 0.5},
     "angry": {"browDown": 1.0, "mouthPress": 0.5, "noseSneer": 0.4},
@@ -55,11 +53,11 @@ PRESETS = {
     "blink_l": {"eyeBlinkLeft": 1.0},
     "blink_r": {"eyeBlinkRight": 1.0},
 }  # fmt: skip
-"""Shapes of ARKit for a weight of 1 of the presets of VRM, whose names are compared without case; a
-name without a side stands for both."""
+"""For each preset of VRM, the weights of ARKit's shapes at a weight of 1. Names of presets are in
+lower case. A shape without a side stands for both sides."""
 FARTHEST = 10.0
-"""The largest coefficient that a track may have, either sign: shapes are made for 0 to 1,
-components of SMPL-X for some 3.
+"""The largest size of a coefficient of a track. Shapes are made for 0 to 1, and components of
+SMPL-X go up to about 3.
 """
 _PLAIN = {name.lower(): name for name in ARKIT}
 
@@ -69,14 +67,15 @@ class FaceTrack:
     """Expressions of a file for each of its frames."""
 
     names: tuple[str, ...]
-    """As the file has them."""
+    """Names of the e expressions, as the file has them."""
     values: Float[np.ndarray, "m e"]
-    """A row for each frame."""
+    """Coefficients of the expressions, a row for each frame, (m, e)."""
 
 
 def arkit_name(name: str) -> str | None:
-    """Which of ARKit's shapes a name in a file is: without case, "Blend.EyeBlink_L" is
-    "eyeBlinkLeft"; None: none of them.
+    """Returns the name of ARKit's shape that a name in a file means; None for another name.
+
+    Case does not matter: "Blend.EyeBlink_L" is "eyeBlinkLeft".
     """
     plain = re.split(r"[.:|]", name)[-1]
     plain = re.sub(r"_l$", "left", re.sub(r"_r$", "right", plain.lower()))
@@ -85,8 +84,9 @@ def arkit_name(name: str) -> str | None:
 
 
 def of_preset(name: str) -> dict[str, float] | None:
-    """ARKit's shapes and their weights for a preset of VRM or a name of ARKit; None for another
-    name.
+    """Returns weights of ARKit's shapes for a name of ARKit or a preset of VRM.
+
+    None for another name.
     """
     own = arkit_name(name)
     if own is not None:
@@ -105,8 +105,10 @@ def of_preset(name: str) -> dict[str, float] | None:
 
 
 def as_arkit(track: FaceTrack) -> tuple[FaceTrack | None, tuple[str, ...]]:
-    """A track of names of ARKit, of presets and of others, as one of ARKit's shapes; and the
-    names that stand for none.
+    """Converts a track to ARKit's shapes.
+
+    Returns: the track, or None if it knows none of the names; and the names that are neither those
+    of ARKit nor presets.
     """
     values = np.zeros((len(track.values), len(ARKIT)))
     unknown = []
@@ -123,9 +125,9 @@ def as_arkit(track: FaceTrack) -> tuple[FaceTrack | None, tuple[str, ...]]:
 
 
 def clipped(values: Float[np.ndarray, "m e"]) -> Float[np.ndarray, "m e"]:
-    """Coefficients within what ARKit's shapes are made for, -1 to 2: trackers overshoot.
+    """Limits coefficients to -1 to 2, because trackers overshoot.
 
-    What is no number stays.
+    Values that are not finite stay.
     """
     return np.where(np.isfinite(values), np.clip(values, -1, 2), values)
 
@@ -133,9 +135,10 @@ def clipped(values: Float[np.ndarray, "m e"]) -> Float[np.ndarray, "m e"]:
 def checked_track(
     track: FaceTrack, frames: int
 ) -> tuple[tuple[str, ...], Float[np.ndarray, "m e"]]:
-    """Names and float32 values of a track.
+    """Returns the names and the float32 values of a track.
 
-    Raises: InvalidFileError unless it has a finite row of numbers for each frame.
+    Raises: InvalidFileError if there is not one row for each frame, or if a number is not finite or
+    is larger than FARTHEST.
     """
     values = np.asarray(track.values, np.float64)
     if values.shape != (frames, len(track.names)):

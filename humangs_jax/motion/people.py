@@ -1,8 +1,8 @@
-"""The people in a file or a folder of a motion, and what it says of each: arrays by name.
+"""Finds the people in a file or folder of a motion, and the arrays of each person by name.
 
-Estimators put people into dicts by their number, into a list for each frame, along a first axis,
-into a file each, or into one file a frame; and what they found of a person into dicts by
-coordinates, of which those of the world are taken first.
+Estimators store people in different ways: in dicts by number, in a list for each frame, along the
+first axis of arrays, in a file for each person, or in a file for each frame. Some store the poses
+of a person in several coordinate systems; those of the world are preferred.
 """
 
 import re
@@ -30,46 +30,46 @@ _INSIDE = (
     "smpl_params",
     "smpl",
 )
-"""Keys of what was found of a person, the best first."""
+"""Keys that may hold the values of a person, the best first."""
 _LISTS = ("people", "persons", "annots", "results")
-"""Keys of all people."""
+"""Keys that may hold all people."""
 _IDS = ("id", "smpl_id", "track_id", "personID", "person_id")
-"""Keys of the number of a person."""
+"""Keys that may hold the number of a person."""
 _FRAMES = ("frame_ids", "frames", "frame", "frame_id")
-"""Keys of the frames in which a person was seen."""
+"""Keys that may hold the frames in which a person was seen."""
 _FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
-"""Where the files of a folder may lie."""
+"""Sub-folders that may hold the files of a motion; "" is the folder itself."""
 _OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
-"""Suffixes of files of one person each; others are of one frame each."""
+"""Suffixes of files that each have one person. Files with another suffix each have one frame."""
 _DEEPEST = 6
-"""Levels of lists and maps in which people are looked for."""
+"""Number of levels of lists and maps in which people are looked for."""
 SHOWN = 12
-"""Keys of a file in an error."""
+"""Largest number of keys that an error lists."""
 
 
 class Person(NamedTuple):
-    """A person of a file."""
+    """A person in a file."""
 
     name: str
     """Name of the person as the file has it."""
     values: Mapping[str, Any]
-    """The file's values of the person by key."""
+    """The values of the person, by the file's keys."""
     frames: np.ndarray | None = None
     """Numbers of the frames in which the person was seen; None for all."""
     pickled: tuple[str, ...] = ()
-    """Keys whose values were pickled, which are not read."""
+    """Keys whose values are not read because they are pickled."""
 
 
 def format_of(values: Mapping[Any, Any]) -> ArrayKeys | None:
-    """The first format whose keys are all there."""
+    """Returns the first format whose keys are all among the values; None if there is none."""
     rows = (each.arrays for each in MOTIONS.values() if each.arrays is not None)
     return next((row for row in rows if all(key in values for key in row.keys)), None)
 
 
 def read_people(path: Path) -> list[Person]:
-    """The people of a file or a folder.
+    """Reads the people of a file or a folder.
 
-    Raises: FileError; InvalidFileError if it has nothing of any format.
+    Raises: FileError; InvalidFileError if nothing in it has a known format.
     """
     files = _files(path) if path.is_dir() else [path]
     alone = not path.is_dir() and path.suffix.lower() != ".json"
@@ -94,7 +94,7 @@ def read_people(path: Path) -> list[Person]:
 
 
 def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
-    """What is in a file, and which of it is pickled objects."""
+    """Reads the content of a file, and the keys whose values are pickled objects."""
     if file.suffix.lower() == ".json":
         return read_json(file), ()
     with open_file(file) as opened:
@@ -112,9 +112,9 @@ def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files of a motion in a folder, in the order of the numbers in their names.
+    """Returns the files of a motion in a folder, in the order of the numbers in their names.
 
-    Raises: InvalidFileError for none.
+    Raises: InvalidFileError if there are none.
     """
 
     def natural(file):
@@ -139,7 +139,7 @@ def _numbers(file: Path) -> list[str]:
 
 
 def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
-    """The people of a file: of lists of people by frame, or anywhere in its content."""
+    """Returns the people in the content of a file, which may be a list of people for each frame."""
     frames = _listed_frames(content)
     if frames is not None:
         return _stacked([(f"frame {i}", each) for i, each in enumerate(frames)])
@@ -150,7 +150,10 @@ def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
 
 
 def _found(content: Any, name: str, depth: int) -> list[Person]:
-    """The people in some content. name: where it names none; depth: levels above it."""
+    """Returns the people in some content.
+
+    name: of a person without a name. depth: number of levels above the content.
+    """
     content = objects(content)
     if depth > _DEEPEST:
         return []
@@ -180,7 +183,7 @@ def _found(content: Any, name: str, depth: int) -> list[Person]:
 
 
 def _first(keys: Sequence[str], values: Mapping[str, Any]) -> str | None:
-    """The first of some keys that is there."""
+    """Returns the first of some keys that the values have; None if they have none."""
     return next((key for key in keys if key in values), None)
 
 
@@ -192,7 +195,7 @@ def _word(value: Any) -> str:
 
 
 def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person]:
-    """The one person of some values; several where their arrays have one more axis, the first."""
+    """Returns the person of some values, or several whose arrays have a first axis of people."""
     place, poses = next(iter(form.poses.items()))
     if poses not in values or not _of_several(values[poses], place, form):
         return [Person(name, values)]
@@ -220,7 +223,7 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
 
 
 def _of_several(poses: Any, place: str, form: ArrayKeys) -> bool:
-    """Whether roots or whole poses are those of several people, along the first axis."""
+    """Whether the first axis of an array of roots or of whole poses is one of several people."""
     if place not in ("root", "all") or form.kind != "poses" or isinstance(poses, list):
         return False
     array = as_array(poses)
@@ -245,14 +248,14 @@ def are_rotations(array: np.ndarray) -> bool:
 
 
 def _off_rotations(array: np.ndarray) -> float:
-    """How far R R^T of matrices is from 1, at most; infinite if they are no numbers."""
+    """Returns the largest difference of R R^T from the identity; infinite if not numbers."""
     if array.dtype.kind not in "fiu":
         return np.inf
     return float(np.abs(array @ np.swapaxes(array, -1, -2) - np.eye(3)).max(initial=0))
 
 
 def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
-    """Numbers of the frames in which a person was seen; None where they are not told."""
+    """Returns the numbers of the frames in which a person was seen; None if the file has none."""
     key = _first(_FRAMES, values)
     if key is None:
         return None
@@ -267,8 +270,9 @@ def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
 
 
 def _listed_frames(content: Any) -> list[list[Person]] | None:
-    """The people of each frame in a list of lists, or in PHALP's dict by image; None for anything
-    else.
+    """Returns the people of each frame, if the content has a list for each frame.
+
+    It may be a list of lists, or PHALP's dict by image. None: it is neither.
     """
     content = objects(content)
     if (
@@ -288,7 +292,7 @@ def _listed_frames(content: Any) -> list[list[Person]] | None:
 
 
 def _tracked(image: Mapping[str, Any]) -> list[Person]:
-    """The people that PHALP follows in an image: lists, an entry for each track."""
+    """Returns the people that PHALP follows in an image, from lists with one entry a track."""
     lists = {key: objects(image.get(key)) for key in ("smpl", "tid", "camera")}
     tracks, cameras = lists["tid"], lists["camera"]
     people = []
@@ -306,9 +310,10 @@ def _tracked(image: Mapping[str, Any]) -> list[Person]:
 
 
 def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
-    """The people of each frame.
+    """Reads the people of each frame: (name of the frame's file, people).
 
-    A file whose name ends in two numbers, of which the first changes, is of a frame and a person.
+    If all names of files end in two numbers, and the first of these changes, a file has one person
+    in one frame. Otherwise a file has one frame.
     """
     numbers = [_numbers(file) for file in files]
     apart = all(len(each) > 1 for each in numbers) and len({each[-2] for each in numbers}) > 1
@@ -327,7 +332,7 @@ def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
 
 
 def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
-    """People of many frames, from those of each, which have a name."""
+    """Joins the people of each frame, (name of the frame, people), into people of all frames."""
     people: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
     for i, (_, found) in enumerate(frames):
         for person in found:
@@ -356,7 +361,7 @@ def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
 
 
 def expected(values: Mapping[Any, Any]) -> str:
-    """Gives the words for what a file of no known format was expected to have."""
+    """Returns the text of an error about values that have no known format."""
     # other files of ours, by keys that they have
     if {"header", "skinning_weights", "means"} <= values.keys():
         return "no motion: this is an avatar: expected a motion to play with it"

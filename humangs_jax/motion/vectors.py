@@ -1,5 +1,4 @@
-"""Motions in a single array, by the number of its columns; and rotations of six numbers, in the
-order in which MDM writes them.
+"""Reads motions in a single array, by its number of columns, and rotations of six numbers from MDM.
 
 A row of Motion-X has 322 numbers (https://github.com/IDEA-Research/Motion-X): root 3, body 63,
 hands 90, jaw 3, expression 50, shape of the face 100, translation 3, shape 10. Six numbers are the
@@ -31,15 +30,15 @@ _RENDER = (
     "make rotations of them, as MDM's `python -m visualize.render_mesh` does (*_smpl_params.npy)"
 )
 _FEATURES = {263: "HumanML3D", 251: "KIT-ML"}
-"""Columns of vectors of features, and of which data set they are."""
+"""Numbers of columns of feature vectors, and the data set that has them."""
 _JOINTS = {22: "HumanML3D's new_joints", 21: "KIT-ML's new_joints"}
-"""Joints in space, and of which data set they are."""
+"""Numbers of joints in space, and the data set that has them."""
 
 
 def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
-    """The values by key that an array stands for.
+    """Splits an array into values by key.
 
-    Raises: InvalidFileError, saying what the array is.
+    Raises: InvalidFileError, which says what the array is, if it has no known layout.
     """
     shape = array.shape
     columns = shape[-1] if shape else 0
@@ -73,17 +72,19 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def hint_for(values: Mapping[Any, Any]) -> str:
-    """Gives a hint about values that are not a motion; "" for none."""
+    """Returns a hint about values that are not a motion, "" for none."""
     if values.keys() >= {"motion", "text", "lengths"}:
         return f"; these are joints in space that MDM sampled: {_RENDER}"
     return ""
 
 
 def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[str, Any]:
-    """Values with matrices (m, j, 3, 3) and positions (m, 3), of six numbers a joint with the
-    frames last, or first.
+    """Replaces rotations of six numbers by matrices (m, j, 3, 3), and puts frames first.
 
-    Raises: InvalidFileError for other shapes, naming the key.
+    rotations: key of an array (j, 6, m) or (m, j, 6). moves: key of the positions, which become
+    (m, 3).
+
+    Raises: InvalidFileError, which names the key, if the rotations have another shape.
     """
     six = np.asarray(as_array(values[rotations]))
     last = six.ndim == 3 and six.shape[1] == 6
@@ -101,7 +102,7 @@ def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[
 
 
 def _matrices_of(six: Float[np.ndarray, "*b 6"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Rotation matrices of their first two rows; not finite where these are zero or parallel."""
+    """Makes rotation matrices of their first two rows; not finite where these are 0 or parallel."""
     a, b = np.asarray(six[..., :3], np.float64), np.asarray(six[..., 3:], np.float64)
     with np.errstate(all="ignore"):
         first = a / np.linalg.norm(a, axis=-1, keepdims=True)
