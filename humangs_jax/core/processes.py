@@ -360,10 +360,14 @@ Call = tuple[Any, tuple[Any, ...]]
 """A function that `jax.jit` returned, and the arguments of a call; arrays may be
 `jax.ShapeDtypeStruct`.
 """
-AT_ONCE = 2
-"""Number of programs that are compiled at once. Each takes up to a gigabyte, and the work beside
-them needs a core, too.
-"""
+
+
+def spare_cores() -> int:
+    """Returns the number of cores beside the two that a command's own work keeps busy: Python's and
+    XLA's threads. Measured on two cores: compiling one program ahead, or two at once, made the demo
+    15 s slower the first time, since each program and the work beside it took longer.
+    """
+    return max(0, (os.cpu_count() or 1) - 2)
 
 
 class Ahead:
@@ -375,10 +379,16 @@ class Ahead:
 
     A program that is never called has cost time, nothing else. After the end of the block no
     further compilation begins.
+
+    Args:
+        at_once: programs that are compiled at once, each of which takes up to a gigabyte. With 0
+            nothing is compiled ahead. None: one where the machine has a core to spare, two where
+            it has more.
     """
 
-    def __init__(self) -> None:
-        self._free = threading.BoundedSemaphore(AT_ONCE)
+    def __init__(self, at_once: int | None = None) -> None:
+        self._at_once = min(spare_cores(), 2) if at_once is None else at_once
+        self._free = threading.Semaphore(self._at_once)
         self._over = threading.Event()
 
     def __enter__(self) -> "Ahead":
@@ -392,11 +402,13 @@ class Ahead:
         the rest is dropped in silence. If a compilation fails, the error appears where the function
         is called.
         """
+        if not self._at_once:
+            return
         # threads that do not keep the process alive: its end waits for no program
         threading.Thread(target=self._begin, args=(calls,), daemon=True).start()
 
     def _begin(self, calls: Iterable[Call]) -> None:
-        """Starts a thread for each program, `AT_ONCE` at a time."""
+        """Starts a thread for each program, few at a time."""
         with contextlib.suppress(Exception):
             for call in calls:
                 self._free.acquire()

@@ -7,11 +7,13 @@ import sys
 import pytest
 
 from experiments.first_run import write_photos
+from humangs_jax.core.processes import spare_cores
 
 MOST = {"demo": 48, "animate": 8, "start": 100}
 """By command: about a quarter more than there were when this was written."""
 AHEAD = {"jit(fit_frames)", "jit(solve_round)", "jit(_reconstruct)"}
-"""Programs of `start` that take longest, which threads compile while other work is done."""
+"""Programs of `start` that take longest, which threads compile while other work is done, where a
+machine has cores to spare."""
 
 
 def ran(*words):
@@ -40,9 +42,10 @@ def test_the_demo_and_a_video_of_its_avatar_need_few_programs(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_person_from_photos_needs_few_programs_and_the_long_ones_are_compiled_ahead(tmp_path):
+def test_a_person_from_photos_needs_few_programs_and_long_ones_are_compiled_ahead(tmp_path):
     write_photos(tmp_path / "photos", 512)
     found = ran("start", tmp_path / "photos", "--out", tmp_path / "me", "--no-browser")
     names = [f"{program['name']} by {program['asked']}" for program in found]
     assert len(found) <= MOST["start"], "\n".join(names)
-    assert not AHEAD & {each["name"] for each in found if not each["beside"]}
+    if spare_cores():
+        assert not AHEAD & {each["name"] for each in found if not each["beside"]}

@@ -162,7 +162,7 @@ def test_calls_given_ahead_are_compiled_once_and_faults_among_them_are_silent(ca
     wrong = jax.jit(lambda x: x @ jnp.ones(3))
     program = jax.jit(lambda x: jnp.sort(jnp.cos(x) @ x))
     shape = jax.ShapeDtypeStruct((7, 7), np.float32)
-    with compiled_programs() as programs, Ahead() as ahead:
+    with compiled_programs() as programs, Ahead(2) as ahead:
         ahead.add([(wrong, (shape,)), (program, (shape,))])
         deadline = time.monotonic() + 60
         while not programs and time.monotonic() < deadline:
@@ -181,7 +181,7 @@ def test_after_the_block_nothing_further_is_compiled_ahead():
         asked.set()
 
     with compiled_programs() as programs:
-        with Ahead() as ahead:
+        with Ahead(2) as ahead:
             pass
         ahead.add(calls())
         assert asked.wait(60)
