@@ -33,7 +33,7 @@ class Detections:
         Path | None, arg(help=f"Keypoint file or folder: {KEYPOINTS.listed()}.")
     ] = None
     person: int | None = None
-    """Which person of the keypoint file, from 0, if a view has several; without a file, of those on
+    """Number of the person, from 0, if a view has several: in the keypoint file or, without one, on
     people.png.
     """
 
@@ -76,7 +76,8 @@ class MaskFit:
     fixed_cameras: bool = False
     """Leave cameras as they are.
 
-    Else a fit to keypoints turns back those that they show to be turned, and --to-masks moves all.
+    Otherwise a fit to keypoints corrects cameras that the keypoints show to be turned, and
+    --to-masks moves all cameras.
     """
     tight_clothes: bool = False
     """With --to-masks, fill the masks: to measure a body in no or tight clothes.

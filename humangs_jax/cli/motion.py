@@ -30,7 +30,7 @@ class MotionOfVideo:
     person: Annotated[int | None, at_least(0)] = None
     """Number of the person, the largest first, from 0. Default: the largest."""
     height: Annotated[float | None, Range(0.4, 2.5)] = None
-    """Of the person, metres: the scale of the motion. Default: that of a person of usual height."""
+    """Height of the person, metres: the scale of the motion. Default: a usual height."""
     avatar: Path | None = None
     """Move the body of this avatar as the person moves, in its size."""
     focal_mm: Annotated[float | None, Range(5.0, 2000.0)] = None
@@ -42,7 +42,7 @@ class MotionOfVideo:
     ] = None
 
     def run(self) -> None:
-        """Find the motion and write it."""
+        """Finds the motion and writes it."""
         if self.height is not None and self.avatar is not None:
             raise UsageError("--height: the avatar gives the scale: expected one of both")
         with stage("starting"):

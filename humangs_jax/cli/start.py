@@ -53,8 +53,8 @@ class Start:
         Path | None, arg(help=f"Keypoints, if they are elsewhere: {KEYPOINTS.listed()}.")
     ] = None
     person: Annotated[int | None, at_least(0)] = None
-    """Which person of the keypoint file, from 0, if a view has several; without such a file, of
-    those on people.png.
+    """Number of the person, from 0, if a view has several: in the keypoint file or, without one, on
+    people.png.
     """
     height: Annotated[float | None, Range(0.3, 3)] = None
     """Height of the person without shoes, metres: the scale where there is no calibration.

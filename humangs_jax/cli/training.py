@@ -143,7 +143,7 @@ class Processes:
     """Index of this process."""
 
     def join(self) -> None:
-        """Join the other processes, if there are any. Raises: see `join_processes`."""
+        """Joins the other processes, if there are any. Raises: see `join_processes`."""
         from humangs_jax.training.sharding import join_processes
 
         if self.distributed or self.coordinator is not None:

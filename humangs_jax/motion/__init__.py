@@ -96,7 +96,7 @@ def load_motion(
     clip: str | int | None = None,
     rest_joints: Float[Array, "j 3"] | Float[np.ndarray, "j 3"] | None = None,
 ) -> Motion:
-    """Read a motion; suffix and content decide the format (docs/motions.md).
+    """Reads a motion; suffix and content of the file decide the format (docs/motions.md).
 
     Args:
         path: None for the shipped walk; else a file or a folder of one of `data.formats.MOTIONS`.
@@ -104,11 +104,11 @@ def load_motion(
             so that y does. "auto": the format's own, or another one along which people stand on a
             floor, which is logged as a warning (`rules.up_axis`).
         fps: frames per second in place of those in the file.
-        rest_joints: joints in the T-pose of the body that will move (`avatar.rest_joints`), metres:
-            skeletons of other programs are brought to it, and a motion of another number of joints
-            is refused. None: the shipped body.
-        person: the number of the person, in a file of several.
-        clip: of the animations of a GLB file, its name or number. None: the first.
+        rest_joints: joints in T-pose of the body that will move (`avatar.rest_joints`), metres.
+            Skeletons of other programs are converted to this body, and a motion of another number
+            of joints is refused. None: the shipped body.
+        person: the number of the person, in a file of several people.
+        clip: the name or number of the animation, in a GLB file of several. None: the first.
 
     Returns:
         Rotations, translations and frames per second.

@@ -323,7 +323,7 @@ def _made(
     details: Iterable[str] = (),
     **sizes: float,
 ) -> Garment:
-    """A garment in a random fabric."""
+    """Makes a garment of a random fabric. plainness: see `sample_fabric`."""
     return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
 
 

@@ -36,7 +36,7 @@ class Piece:
     """Whether a later layer covers each vertex, (n,). None: no layer hides any of the piece."""
 
     def visible(self) -> "Piece":
-        """The piece without the faces whose corners are all hidden."""
+        """Returns the piece without the faces whose corners are all hidden."""
         if self.hidden is None or not self.hidden.any():
             return self
         kept = ~self.hidden[self.surface.faces].all(1)

@@ -49,7 +49,7 @@ The shipped body has at most 7.
 """
 STEPS = 65535
 SMALLEST_SCALE = 1e-7
-"""Metres; keeps the logarithm finite for flat Gaussians.
+"""Smallest scale of a Gaussian, metres; it keeps the logarithm finite for flat Gaussians.
 
 A thousandth of eps2d for a camera at any distance.
 """
