@@ -40,7 +40,7 @@ JOINT_NAMES = (
         for knuckle in (1, 2, 3)
     ),
 )
-"""22 of the body, jaw and eyes, then 15 per hand from the palm outwards."""
+"""Names of the 55 joints: 22 of the body, jaw and eyes, then 15 per hand from the palm outwards."""
 
 
 def _hand_parents(wrist: int, first: int) -> list[int]:

@@ -12,11 +12,12 @@ def posed_tree(
     bones: Float[np.ndarray, "*m j 3"],
     parents: Sequence[int],
 ) -> tuple[Float[np.ndarray, "*m j 3 3"], Float[np.ndarray, "*m j 3"]]:
-    """Returns rotations and places of joints in space, by numpy; `body.model.joint_transforms` is
-    the same in JAX.
+    """Returns rotations (..., j, 3, 3) and positions (..., j, 3) of joints in space, by numpy.
+    `body.model.joint_transforms` does the same in JAX.
 
-    turns: rotations of joints relative to their parents. bones: from a parent to each joint in the
-    rest pose, and the place of the root. parents: -1 for roots; each comes before its children.
+    turns: rotations of joints relative to their parents. bones: vector from the parent to each
+    joint in the rest pose; for the root its position. parents: -1 for roots; each comes before its
+    children.
     """
     world, places = np.array(turns, float), np.array(bones, float)
     for joint, parent in enumerate(parents):
@@ -29,6 +30,8 @@ def posed_tree(
 
 
 def bones_of(joints: Float[np.ndarray, "j 3"], parents: Sequence[int]) -> Float[np.ndarray, "j 3"]:
-    """Returns the vector from its parent to each joint of a rest pose; for a root its place."""
+    """Returns the vector from its parent to each joint of a rest pose, (j, 3); for a root its
+    position.
+    """
     above = np.asarray(parents)
     return np.where(above[:, None] < 0, joints, joints - joints[above])

@@ -1,5 +1,5 @@
-"""Small work on arrays by numpy. Outside of `jit` each operation of `jnp` is compiled for each
-shape, which takes some ten milliseconds where there is nothing to compute.
+"""Small operations on arrays by numpy. Outside of `jit`, each operation of `jnp` is compiled for
+each shape, which takes some ten milliseconds even if there is hardly anything to compute.
 """
 
 from collections.abc import Sequence
@@ -17,9 +17,10 @@ program takes to compile.
 
 
 def from_host(array: Any, dtype: Any = None) -> Any:
-    """Makes an array of JAX of the numbers of a list or of an array of numpy; one of JAX stays.
+    """Returns an array of JAX with the numbers of a list or of an array of numpy. An array of JAX
+    only gets the dtype.
 
-    `jnp.asarray` makes the same, by a program for each shape.
+    `jnp.asarray` gives the same result, but compiles a program for each shape.
     """
     if isinstance(array, jax.Array):
         if dtype is None or array.dtype == dtype:
@@ -29,8 +30,8 @@ def from_host(array: Any, dtype: Any = None) -> Any:
 
 
 def on_host(array: Any) -> bool:
-    """Says whether numpy can read an array at once: it is numpy's, or JAX's on a CPU of this
-    process.
+    """Says whether numpy can read an array at once, because it is numpy's, or JAX's on a CPU of
+    this process.
     """
     if isinstance(array, np.ndarray):
         return True
@@ -55,7 +56,7 @@ def joined(arrays: Sequence[Any]) -> Any:
 
 
 def _plain(array: Any) -> bool:
-    """Says whether it is an array of JAX, with numbers, whose values this process has."""
+    """Says whether a value is an array of JAX with numbers that this process can read."""
     if isinstance(array, Tracer) or not isinstance(array, jax.Array):
         return False
     numbers = jnp.issubdtype(array.dtype, jnp.number) or array.dtype == bool

@@ -33,7 +33,7 @@ from humangs_jax.core.pytree import shape_fault
 P = ParamSpec("P")
 T = TypeVar("T")
 NUMBERS = (int, float, complex, bool)
-"""Classes that are not checked: numbers of numpy and JAX will do, too."""
+"""Classes that are not checked, because numbers of numpy and JAX are accepted, too."""
 SEQUENCES = {list: Sequence, Sequence: Sequence, Iterable: Iterable, os.PathLike: os.PathLike}
 """Classes that lists and paths may have; what is in them is not checked."""
 HINTS = {
@@ -51,7 +51,7 @@ HINTS = {
     ("Sequence", "Capture"): "a list of captures",
     ("HumanGSConfig", "tuple"): "load_weights returns (variables, config)",
 }
-"""What to do, by the class that is expected and the class that was given."""
+"""Advice by the class that is expected and the class that was given."""
 
 
 def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
@@ -106,8 +106,8 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def _arrays(annotation: Any) -> tuple[Any, ...]:
-    """Returns the types of arrays that an annotation stands for, with None where it may be None;
-    nothing if it may be something else.
+    """Returns the array types that an annotation stands for, and NoneType if None is allowed. Empty
+    if the annotation allows anything else.
     """
     options = typing.get_args(annotation) or (annotation,)
     known = all(hasattr(x, "dims") or x is type(None) for x in options)
@@ -117,7 +117,9 @@ def _arrays(annotation: Any) -> tuple[Any, ...]:
 
 
 def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
-    """Says what is wrong with a value that should be an array; numbers are arrays without axes."""
+    """Returns a text that says why a value is not the expected array, or None. Numbers count as
+    arrays without axes.
+    """
     if value is None and type(None) in options:
         return None
     types_ = [x for x in options if hasattr(x, "dims")]
@@ -136,7 +138,9 @@ def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
 
 
 def _classes(annotation: Any) -> tuple[type, ...]:
-    """Returns the classes that an annotation stands for; nothing if it says more than that."""
+    """Returns the classes that an annotation stands for. Empty if the annotation says more than a
+    class.
+    """
     union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     options = typing.get_args(annotation) if union else (annotation,)
     options = tuple(SEQUENCES.get(typing.get_origin(x), x) for x in options)
@@ -154,7 +158,9 @@ def _classes(annotation: Any) -> tuple[type, ...]:
 
 
 def _call(function: Callable[..., Any], signature: inspect.Signature) -> str:
-    """Shows the function with its parameters: those without a default, the others as dots."""
+    """Returns the call of a function as text: parameters without a default, then dots for the
+    others.
+    """
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     parameters = signature.parameters.values()
     needed = [
@@ -188,7 +194,9 @@ def _other_class(classes: tuple[type, ...], value: Any) -> str:
 def _of_a_field(
     keywords: Any, signature: inspect.Signature, expected: dict[str, tuple[type, ...]]
 ) -> str | None:
-    """Says where a name belongs that the function does not have: into one of its configurations."""
+    """Returns a text about the first keyword that is no parameter of the function, or None. If it
+    is a field of one of the function's configurations, the text says so.
+    """
     for name in keywords:
         if name in signature.parameters:
             continue
@@ -204,12 +212,12 @@ def _of_a_field(
 
 
 class Values(NamedTuple):
-    """What the entries of an array may be: finite numbers in [low, high]."""
+    """The values that the entries of an array may have: finite numbers in [low, high]."""
 
     words: str
-    """The same in the words of an error message."""
+    """Description of these values in an error message."""
     low: float = -math.inf
-    """Least number."""
+    """Smallest number."""
     high: float = math.inf
     """Largest number."""
 
@@ -220,8 +228,8 @@ LARGEST = 1e6
 and float32 holds products of several such numbers."""
 BOUNDED = Values(f"finite numbers of at most {LARGEST:g} in magnitude", -LARGEST, LARGEST)
 ROUNDING = 1e-6
-"""How far numbers may lie outside of [0, 1]: a few float32 roundings, as in photos that were
-resized and in opacities from a sigmoid.
+"""Distance by which numbers may lie outside of [0, 1]. It is a few float32 roundings, as in resized
+photos and in opacities from a sigmoid.
 """
 UNIT = Values("numbers in [0, 1]", -ROUNDING, 1 + ROUNDING)
 SIGNED_UNIT = Values("numbers in [-1, 1]", -1 - ROUNDING, 1 + ROUNDING)
@@ -267,8 +275,10 @@ def check_values(
 
 
 def require_concrete(owner: str, why: str, *trees: Any) -> None:
-    """Raises: TypeError, one line, where arrays are traced. owner: the function that was called.
-    why: it needs their values.
+    """Checks that no array is traced.
+
+    owner: the function that was called. why: text that says why it needs values. Raises: TypeError
+    of one line.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees)):
         raise TypeError(
@@ -278,7 +288,7 @@ def require_concrete(owner: str, why: str, *trees: Any) -> None:
 
 @jax.jit
 def _extremes(arrays: tuple[Array, ...]) -> Array:
-    """Returns the least and the largest entry of each array, (arrays, 2); both are NaN if an
+    """Returns the smallest and the largest entry of each array, (arrays, 2). Both are NaN if an
     entry is.
     """
     return jnp.stack([jnp.stack([jnp.min(array), jnp.max(array)]) for array in arrays])

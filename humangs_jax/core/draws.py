@@ -1,7 +1,7 @@
-"""Random numbers by name, all of one draw.
+"""Random numbers by name, drawn all at once.
 
 Each draw of another shape puts a function of some 230 lines into a program and costs time to
-compile, so what needs many numbers draws them once, uniform in [0, 1).
+compile. So code that needs many numbers draws them once, uniform in [0, 1).
 """
 
 import math
@@ -18,7 +18,7 @@ from humangs_jax.core.array_types import Array, Float, Key
 def uniform_by_name(
     key: Key, shapes: Mapping[str, tuple[int, ...]], dtype: Any = jnp.float32
 ) -> dict[str, Float[Array, "..."]]:
-    """Draws uniform random numbers in [0, 1), an array of each shape by its name."""
+    """Returns uniform random numbers in [0, 1), an array of each shape by its name."""
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
     parts = jnp.split(jax.random.uniform(key, (ends[-1],), dtype), ends[:-1])
     return {
@@ -27,7 +27,7 @@ def uniform_by_name(
 
 
 def normal_of(uniform: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Turns numbers that are uniform in [0, 1) into standard normal ones."""
+    """Returns standard normal numbers made from numbers that are uniform in [0, 1)."""
     # the inverse of the error function is infinite at -1, which the smallest number would become
     least = np.nextafter(np.asarray(-1, uniform.dtype), np.asarray(0, uniform.dtype))
     return math.sqrt(2) * jax.lax.erf_inv(jnp.maximum(2 * uniform - 1, least))

@@ -20,7 +20,7 @@ PIXELS_AT_ONCE = 1 << 22
 
 
 def one_after_the_other() -> bool:
-    """Says whether loops are the faster way on the default backend: it is a CPU."""
+    """Says whether loops are faster than `vmap` on the default backend, which is so on a CPU."""
     return jax.default_backend() == "cpu"
 
 

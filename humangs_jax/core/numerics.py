@@ -43,8 +43,8 @@ def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def absolute(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Returns |x| with zero gradient at 0, where that of `jnp.abs` is 1: an L1 of images would push
-    where they agree.
+    """Returns |x| with zero gradient at 0. The gradient of `jnp.abs` is 1 there, so an L1 loss of
+    images would push where they agree.
     """
     return x * jax.lax.stop_gradient(jnp.sign(x))
 

@@ -37,7 +37,7 @@ def printable(text: object, lines: bool = False) -> str:
 
 
 def _printable_character(c: str) -> str:
-    """Escapes a character that a terminal would act on."""
+    """Returns a character, escaped if a terminal would act on it."""
     # wide spaces and characters newer than Python, which `repr` escapes, too, are harmless; words
     # of Persian and Indic languages need the two joiners
     harmless = c in "\u200c\u200d" or unicodedata.category(c) in ("Zs", "Cn", "Co")
@@ -49,8 +49,8 @@ def _printable_character(c: str) -> str:
 
 
 def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
-    """Lays out a table in lines: the first columns (left) aligned to the left, the others to the
-    right; rows may end early.
+    """Returns the lines of a table. The first `left` columns are aligned to the left, the others to
+    the right. Rows may end early.
     """
     widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows)))]
 
@@ -63,14 +63,14 @@ def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
 TICK = 0.2
 """Seconds between two updates of the line."""
 LONG = 10.0
-"""Seconds after which a stage is named where stderr is no terminal."""
+"""Seconds after which the name of a running stage is printed, if stderr is no terminal."""
 CLEAR = "\r\033[K"
 """Puts the cursor of a terminal at the beginning of an empty line."""
 
 
 @dataclasses.dataclass
 class Progress:
-    """What is shown, and what was measured."""
+    """The settings of what is shown, and the measured times."""
 
     ticking: bool = False
     """Whether a line on stderr counts the seconds of a stage while it runs."""
@@ -81,15 +81,15 @@ class Progress:
     quiet: bool = False
     """Whether neither stages nor bars are shown."""
     started: float = dataclasses.field(default_factory=time.perf_counter)
-    """When it began, seconds of `time.perf_counter`."""
+    """Time at which it began, seconds of `time.perf_counter`."""
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     """Seconds of the finished outermost stages by name, since `started`."""
     names: list[str] = dataclasses.field(default_factory=list)
     """Names of the stages that run, the outermost first."""
     next: list[str] = dataclasses.field(default_factory=list)
-    """What the user may do next, a line each, for the program that began."""
+    """Lines about what the user may do next, for the program that called `begin`."""
     paused: bool = False
-    """Whether a bar has the line."""
+    """Whether a bar is shown in place of the line."""
 
 
 _current = Progress()
@@ -98,7 +98,7 @@ _bars: "weakref.WeakSet[Any]" = weakref.WeakSet()
 
 
 def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
-    """Show stages from now on; a terminal on stderr gets a line that counts seconds.
+    """Starts to show stages. A terminal on stderr gets a line that counts seconds.
 
     Arguments: quiet: show neither stages nor bars. lines: leave a line for each stage, wherever
     stderr goes.
@@ -115,12 +115,12 @@ def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
 
 
 def current() -> Progress:
-    """Returns what is shown now."""
+    """Returns the settings of what is shown now."""
     return _current
 
 
 def end() -> None:
-    """Show nothing any more, as before `begin`.
+    """Stops showing stages, as before `begin`.
 
     Bars that an error has left open get their last line.
     """
@@ -130,11 +130,11 @@ def end() -> None:
 
 
 def say(text: object, *, error: bool = False, lines: bool = True) -> None:
-    """Print text, with what a terminal would act on escaped. Bars and the line of a stage make room
-    for it.
+    """Prints text on stdout, with everything that a terminal would act on escaped. Bars and the
+    line of a stage make room for it.
 
-    Arguments: error: to stderr. lines: whether it may have several lines; else line feeds are
-    escaped, too.
+    Arguments: error: print on stderr. lines: whether the text may have several lines; otherwise
+    line feeds are escaped, too.
     """
     stream = sys.stderr if error else sys.stdout
     encoding = getattr(stream, "encoding", None) or "utf-8"  # a terminal may know ASCII only
@@ -186,8 +186,8 @@ def stage(name: str) -> Generator[None]:
 
 
 COMPILING = "compiling, once"
-"""What a bar says until its first item is there, where a program of JAX is compiled for that: many
-seconds.
+"""Text of a bar until its first item is done, if a program of JAX is compiled for it, which takes
+many seconds.
 """
 
 
@@ -197,9 +197,10 @@ _compiled: set[Hashable] = set()
 
 @contextlib.contextmanager
 def compiling(program: Hashable = None) -> Generator[None]:
-    """Says `COMPILING` while what runs within is compiled: on open bars, or else as a stage.
+    """Shows `COMPILING` during the block, on open bars or else as a stage.
 
-    Arguments: program: what is compiled: only its first run in a process says so. None: always.
+    Arguments: program: the program that is compiled. The text is shown only at its first run in a
+    process. None: the text is shown always.
     """
     if program is not None and program in _compiled:
         yield
@@ -251,7 +252,7 @@ def bar(
 
 
 def _without_postfix(items: Iterable[Any], made: Any) -> Iterator[Any]:
-    """Yields the items; what a bar says about the first one goes when it is there."""
+    """Yields the items, and removes the bar's text when the first item is there."""
     for i, item in enumerate(items):
         if i == 0:
             made.set_postfix_str("", refresh=False)
@@ -259,7 +260,7 @@ def _without_postfix(items: Iterable[Any], made: Any) -> Iterator[Any]:
 
 
 def _close(bars: set[Any]) -> None:
-    """Gives bars their last line."""
+    """Closes bars, so that they show their last line."""
     for each in bars:
         each.close()
 
@@ -270,9 +271,7 @@ def followed() -> bool:
 
 
 def watched() -> bool:
-    """Says whether a program shows stages on a terminal: then long loops that have
-    no bar show one.
-    """
+    """Says whether a program shows stages on a terminal. Long loops without a bar then show one."""
     return _current.ticking
 
 
@@ -283,7 +282,7 @@ def _name(current: Progress, stop: threading.Event, _: float) -> None:
 
 
 def _named(current: Progress) -> str:
-    """Returns the outermost and the innermost of the stages that run."""
+    """Returns the names of the outermost and the innermost running stage."""
     return ": ".join(dict.fromkeys((current.names[0], current.names[-1])))
 
 

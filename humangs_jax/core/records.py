@@ -21,14 +21,14 @@ from humangs_jax.core.pytree import annotated_axes, is_floating, types_and_marks
 
 
 class Part(NamedTuple):
-    """A mark of an annotation: a part of the array that is checked by itself."""
+    """A mark of an annotation: a part of the array that is checked separately."""
 
     words: str
     """What an error calls the part, after the name of the array."""
     take: Callable[[np.ndarray], np.ndarray]
-    """The part, of an array on the host."""
+    """Function that returns the part of an array on the host."""
     values: Values
-    """What its entries may be."""
+    """The values that the part's entries may have."""
 
 
 class Batch(NamedTuple):
@@ -39,12 +39,14 @@ class Batch(NamedTuple):
 
 
 class ArrayField(NamedTuple):
-    """What an annotation says about an array."""
+    """The content of an array's annotation."""
 
     axes: tuple[str | int, ...] | None
-    """Names and sizes of the axes; None: any."""
+    """Names and sizes of the axes. None: any axes."""
     values: Values | None
-    """What its entries may be; None: they are not floating-point numbers, and are not looked at."""
+    """Values that the entries may have. None: they are not floating-point numbers, and are not
+    checked.
+    """
     parts: tuple[Part, ...]
     """Parts that are checked by themselves."""
 
@@ -119,12 +121,12 @@ def record_values(
 
 
 def check_record(record: Any, owner: str, sizes: Mapping[str, int] | None = None) -> None:
-    """Check the shapes and the values of a record, and of the records in it.
+    """Checks the shapes and the values of a record, and of the records in it.
 
-    Arguments: record: a dataclass whose arrays are annotated. owner: who asks, for the message.
-    sizes: of axes that are known; others are as long as in the first array that has them.
+    Arguments: record: a dataclass whose arrays are annotated. owner: the caller, for the message.
+    sizes: known sizes of axes. Other axes are as long as in the first array that has them.
 
-    Raises: ValueError, one line: the array, what was expected and what it has.
+    Raises: ValueError of one line: the array, what was expected and what it has.
     """
     known, values = dict(sizes or {}), {}
     for name, annotated in array_fields(type(record)).items():

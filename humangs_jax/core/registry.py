@@ -40,7 +40,7 @@ F = TypeVar("F", bound=Format)
 
 
 class Formats(dict[str, F]):
-    """Formats by name, in the order in which they are asked."""
+    """Formats by name, in the order in which they are tried."""
 
     @property
     def suffixes(self) -> tuple[str, ...]:
@@ -55,8 +55,8 @@ class Formats(dict[str, F]):
         return self.where(lambda each: suffix in each.suffixes)
 
     def recognized(self, path: Path) -> F | None:
-        """Returns the first format that the file has, None if it has none; formats that look into
-        it are asked first.
+        """Returns the first format that a file has, or None. Formats that look into the file are
+        tried first.
         """
         found = sorted(self.of(path).values(), key=lambda each: each.recognizes is None)
         return next(
@@ -69,8 +69,8 @@ class Formats(dict[str, F]):
         return Formats({name: each for name, each in self.items() if holds(each)})
 
     def listed(self) -> str:
-        """Lists all in one line, ".npz, .pkl: AMASS, AIST++; .json or a folder: LHM": by suffix, or
-        by name where names do not tell.
+        """Returns all formats in one line, ".npz, .pkl: AMASS, AIST++; .json or a folder: LHM".
+        They are listed by suffix, or by name if they have no suffix.
         """
         groups: dict[tuple[str, ...], dict[str, None]] = {}  # each name once
         for name, each in self.items():

@@ -27,17 +27,13 @@ COUNTS: dict[str, tuple[int, ...]] = {
     "fisheye": (4,),
     "orthographic": (),
 }
-"""Numbers of coefficients, by lens."""
+"""Allowed numbers of coefficients, by lens."""
 RINGS = 16
-"""Places along the way from the axis to a point, at each of which the image has to grow
-outwards.
-"""
+"""Number of places on the way from the axis to a point at which the image must grow outwards."""
 
 
 def check_lens(lens: object, count: int | None) -> None:
-    """Raises: ValueError for a lens that is not known, and for another number of coefficients
-    than it has.
-    """
+    """Checks that a lens is known and has this number of coefficients. Raises: ValueError."""
     if lens not in COUNTS:
         raise ValueError(f"lens: expected {', '.join(COUNTS)}, got {lens!r}")
     allowed = COUNTS[str(lens)]
@@ -51,7 +47,9 @@ def check_lens(lens: object, count: int | None) -> None:
 def distorted(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> tuple[Array, Array]:
-    """Returns where the lens puts points of the plane z = 1. Raises: as `check_lens`."""
+    """Returns the positions (x, y) at which the lens shows points (u, v) of the plane z = 1.
+    Raises: as `check_lens`.
+    """
     count = None if coefficients is None else coefficients.shape[-1]
     check_lens(lens, count)
     if lens == "fisheye":
@@ -86,8 +84,8 @@ def _fisheye_scale(coefficients: Float[Array, " n"] | None, rr: Array) -> Array:
 def distorted_with_slopes(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> tuple[Array, Array, list[list[Array]]]:
-    """Returns x, y, and the Jacobian [[dx/du, dx/dv], [dy/du, dy/dv]], by forward mode: it has a
-    gradient itself.
+    """Returns x, y, and the Jacobian [[dx/du, dx/dv], [dy/du, dy/dv]]. It is computed in forward
+    mode, so that it has a gradient.
     """
 
     def lensed(u, v):

@@ -8,8 +8,8 @@ from humangs_jax.core.array_types import Bool, Float, Int
 def face_crosses(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "f 3"]:
-    """Returns the normal of each face, twice its area long; outwards where corners go round
-    counter-clockwise.
+    """Returns the normals of the faces, (f, 3), each twice as long as the face's area. They point
+    outwards if corners go round counter-clockwise.
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
@@ -32,10 +32,8 @@ def vertex_areas(
 def vertex_area_vectors(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Returns the sum of `face_crosses` of the faces around each vertex: `unit` makes a normal of
-    it.
-
-    0 where there is no face.
+    """Returns the sum of `face_crosses` of the faces around each vertex, (n, 3); 0 where there is
+    no face. `unit` makes normals of these sums.
     """
     around = np.tile(face_crosses(vertices, faces), (3, 1))
     return np.stack(
@@ -46,9 +44,8 @@ def vertex_area_vectors(
 def mesh_edges(
     faces: Int[np.ndarray, "f 3"],
 ) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
-    """Finds the undirected edges (e, 2) of a mesh.
-
-    Also gives, for the side from corner i to i + 1 of each face, the number of its edge (f, 3).
+    """Returns the undirected edges of a mesh, (e, 2), and for each face the number of the edge from
+    corner i to i + 1, (f, 3).
     """
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
     edges, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)
@@ -56,13 +53,13 @@ def mesh_edges(
 
 
 def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
-    """Divides vectors by their lengths; those without length stay."""
+    """Returns vectors divided by their lengths. Zero vectors stay zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def directions_around(count: int, turned: float = 0.5) -> Float[np.ndarray, "d 3"]:
-    """Spreads unit vectors evenly over the sphere (a Fibonacci lattice), the first turned by
-    `turned` golden angles.
+    """Returns unit vectors spread evenly over the sphere (a Fibonacci lattice), (d, 3). The first
+    is turned by `turned` golden angles.
     """
     i = np.arange(count)
     y, turn = 1 - 2 * (i + 0.5) / count, np.pi * (3 - np.sqrt(5)) * (i + turned)

@@ -30,13 +30,15 @@ RELUCTANCE = 2e-4
 SMOOTHNESS = 0.04
 """Standard deviation of the weights that make moves smooth, as a share of the person's height."""
 LARGEST = 128
-"""Pixels: larger people are reduced by whole factors before the comparison, for speed."""
+"""Largest height of a person in a comparison, pixels. Larger people are reduced by whole factors,
+for speed.
+"""
 NOBODY = 1e-3
 """Weight of pixels that do not show the person, for smooth moves."""
 ASKED = 3
-"""Photos that are asked at most. Two that agree are enough."""
+"""Largest number of photos that are compared. Two that agree are enough."""
 CLEAR = 1.0
-"""Decibels above what is needed, from which on one photo is enough."""
+"""Gain beyond the needed one at which a single photo is enough, decibels."""
 
 
 def _aligned_errors(
@@ -105,10 +107,11 @@ def aligned_psnr(
 def smooth_moves(
     image: Float[np.ndarray, "h w 4"], photo: Float[np.ndarray, "h w 4"]
 ) -> Float[np.ndarray, "h w 2"]:
-    """Returns by how many pixels (y, x) to move the photo so that it shows the person where the
-    image does.
+    """Returns the moves in pixels (y, x), (h, w, 2), that bring the photo's person to where the
+    image has the person.
 
-    Means of the moves around each pixel, weighted by distance and by what is the person's.
+    They are means of the moves around each pixel, weighted by distance and by whether a pixel shows
+    the person.
     """
     height = _person_height(photo[..., 3])
     factor = max(1, -(-height // LARGEST))
@@ -138,7 +141,9 @@ def misplaced(image: Float[np.ndarray, "h w 4"], photo: Float[np.ndarray, "h w 4
 def moved_photo(
     photo: Float[np.ndarray, "h w c"], moves: Float[np.ndarray, "h w 2"]
 ) -> Float[np.ndarray, "h w c"]:
-    """Moves the pixels of a photo by (y, x), bilinearly; beyond its edges it goes on as there."""
+    """Returns a photo with its pixels moved by (y, x), bilinearly. Beyond its edges the photo
+    repeats the pixels of the edge.
+    """
     places = np.indices(photo.shape[:2]) - np.moveaxis(moves, -1, 0)
     channels = [_sampled(photo[..., c], places) for c in range(photo.shape[-1])]
     return np.stack(channels, axis=-1).astype(np.float32)
@@ -151,7 +156,9 @@ def _sampled(
 
 
 def _person_height(mask: Float[np.ndarray, "h w"]) -> int:
-    """Counts the rows from the first to the last of a mask; those of the image if it is empty."""
+    """Returns the number of rows from the first to the last of a mask, or of the whole image if the
+    mask is empty.
+    """
     rows = np.flatnonzero((mask > 0.5).any(axis=1))
     if len(rows):
         return int(np.ptp(rows)) + 1
@@ -159,14 +166,16 @@ def _person_height(mask: Float[np.ndarray, "h w"]) -> int:
 
 
 def sizes(height: float) -> tuple[int, int]:
-    """Returns the largest move and the side of the windows in pixels, for a person of this
-    height in pixels.
+    """Returns the largest move and the side of the windows, pixels, for a person of a height in
+    pixels.
     """
     return max(1, round(REACH * height)), max(3, round(WINDOW * height))
 
 
 def reduced(image: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray, "rows columns c"]:
-    """Averages squares of `factor` pixels a side; what is left over at the far edges is cut."""
+    """Returns an image averaged over squares of `factor` pixels a side. Rows and columns left over
+    at the far edges are cut.
+    """
     rows, columns = (size // factor for size in image.shape[:2])
     squares = image[: rows * factor, : columns * factor]
     squares = squares.reshape(rows, factor, columns, factor, -1)

@@ -1,6 +1,5 @@
-"""Buffers of splatting: how many (splat, tile) pairs fit.
-
-Measured on a scene, or guessed for traced calls; what does not fit.
+"""Sizes of the buffers of splatting: how many (splat, tile) pairs fit. Sizes are measured on a
+scene, or guessed for traced calls. Pairs that do not fit are reported.
 """
 
 import dataclasses
@@ -25,12 +24,12 @@ logger = logging.getLogger(__name__)
 
 
 class BufferOverflowError(ValueError):
-    """Says that a view needs larger buffers than its configuration has."""
+    """A view needs larger buffers than its configuration has."""
 
 
 def round_up(size: int, smallest: int = 64) -> int:
-    """Rounds up to (4, 5, 6 or 7) 2^i, at least `smallest`: similar scenes share one compilation,
-    and at most a fifth is spare.
+    """Returns the size rounded up to (4, 5, 6 or 7) 2^i, at least `smallest`. Similar scenes then
+    share one compilation, and at most a fifth is spare.
     """
     size = max(size, smallest)
     unit = 1 << max(0, (size - 1).bit_length() - 3)
@@ -38,10 +37,10 @@ def round_up(size: int, smallest: int = 64) -> int:
 
 
 def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
-    """Returns `max_pairs` for a traced call that gives None: enough for a person, never more than
-    can be needed.
+    """Returns the `max_pairs` of a traced call whose configuration has None. It is enough for a
+    person, and never more than can be needed.
 
-    g: Gaussians. width, height, tile_size: pixels.
+    g: number of Gaussians. width, height, tile_size: pixels.
     """
     # a person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024 x 1024,
     # where its 16,384 tiles add another 5 each
@@ -50,7 +49,9 @@ def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
 
 
 def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
-    """Sets `default_pairs` in a `config` that leaves `max_pairs` open; for traced calls."""
+    """Returns the configuration with `default_pairs` if its `max_pairs` is None, for traced
+    calls.
+    """
     if config.max_pairs is not None:
         return config
     pairs = default_pairs(gaussians.means.shape[0], camera.width, camera.height, config.tile_size)
@@ -64,7 +65,8 @@ def plan_buffers(
     config: SplatConfig | str = DEFAULT_CONFIG,
     margin: float = 1.25,
 ) -> SplatConfig:
-    """Measures buffers for one camera, or for the most demanding one of a batch, times `margin`.
+    """Returns a configuration with buffers for one camera, or for the most demanding one of a
+    batch, times `margin`.
 
     Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation.
     Measures concrete arrays: call it outside of transformations.
@@ -95,14 +97,15 @@ def plan_buffers(
 
 
 ROOMY = 2.0
-"""Buffers may be this many times as large as they have to be where that saves a program."""
+"""Largest size of buffers, relative to the need, that is accepted to save compiling a program."""
 _PLANNED: dict[tuple[SplatConfig, int, int], list[tuple[int, int]]] = {}
-"""Rows and pairs that images of a size were planned with in this process, as its programs are."""
+"""Rows and pairs that were planned in this process, by configuration, width and height."""
 
 
 def plan_near(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
-    """Plans buffers for one camera, or returns ones that were planned before, if all fits in them
-    and they are not much larger: an image costs less than another program.
+    """Returns a configuration with buffers for one camera. Buffers that were planned before are
+    taken if everything fits and they are not much larger, because drawing costs less than another
+    compilation.
     """
     rows, pairs = _needed(gaussians, camera, config)
     known = _PLANNED.setdefault((config, camera.width, camera.height), [])
@@ -117,7 +120,7 @@ def plan_near(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> Spla
 def raise_on_overflow(
     overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig
 ) -> None:
-    """Raises BufferOverflowError, which says what is needed, if a view has overflowed."""
+    """Raises BufferOverflowError if a view has overflowed. The error says what size is needed."""
     missing = int(np.max(np.asarray(overflow), initial=0))
     if missing:
         rows, pairs = _needed(gaussians, cameras, config)
@@ -129,8 +132,8 @@ def raise_on_overflow(
 
 
 def warn_of_overflow(overflow: Int[Array, "*v"], config: SplatConfig) -> None:
-    """Log a warning when a traced program runs and a view has overflowed, if the configuration asks
-    for it.
+    """Makes a traced program log a warning when it runs and a view has overflowed, if the
+    configuration asks for it.
     """
     if config.warn_overflow:  # else nothing is added to the program
         warn = functools.partial(_warn, max_pairs=config.max_pairs, max_rows=config.max_rows)
@@ -138,7 +141,7 @@ def warn_of_overflow(overflow: Int[Array, "*v"], config: SplatConfig) -> None:
 
 
 def _warn(missing: Array | np.ndarray, max_pairs: int | None, max_rows: int | None) -> None:
-    """Logs how many pairs did not fit."""
+    """Logs a warning with the number of pairs that did not fit, if there are any."""
     if missing > 0:
         logger.warning(
             "%d (splat, tile) pairs of a view did not fit and were not drawn: max_pairs = %s,"
@@ -150,7 +153,7 @@ def _warn(missing: Array | np.ndarray, max_pairs: int | None, max_rows: int | No
 
 
 def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[int]:
-    """Counts the most rows and the most pairs that any of the views needs."""
+    """Returns the largest numbers of rows and of pairs that any view needs."""
     gaussians, cameras = at_least_float32((gaussians, cameras))
     # one program for all buffers, images of every size, and every number of cameras
     config = dataclasses.replace(config, max_pairs=None, max_rows=None)
@@ -166,8 +169,8 @@ def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[
 def needed_by(
     gaussians: Gaussians, camera: Camera, size: Int[Array, "2"], config: SplatConfig
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Counts rows and pairs that an image of `size` (width, height) of a camera needs, in place of
-    its own size. The room that `config` has is not looked at.
+    """Returns the numbers of rows and pairs that an image of `size` (width, height) of a camera
+    needs. The camera's size and the buffers of `config` are ignored.
     """
     camera = replace(camera, width=size[0], height=size[1])
     projected = project_gaussians(gaussians, camera, config)

@@ -160,8 +160,8 @@ def _reference(
 def _project(
     gaussians: Gaussians, camera: Camera, config: SplatConfig
 ) -> tuple[Array, Array, Array, Array]:
-    """Projects Gaussians: centres (g, 2), axes (g, 2, 3), depths (g,) and whether each is drawn;
-    those that are not lie at z = 1.
+    """Returns the centres (g, 2), axes (g, 2, 3) and depths (g,) of projected Gaussians, and
+    whether each is drawn. Gaussians that are not drawn get depth 1.
 
     Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + eps2d
     I.
@@ -201,7 +201,9 @@ def _project(
 def _project_by_lens(
     gaussians: Gaussians, camera: Camera, config: SplatConfig, p: Array, visible: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Does the same as `_project`, with the Jacobian of the whole camera by autodiff."""
+    """Returns the results of `_project` for a camera with a lens. The Jacobian of the whole camera
+    comes from autodiff.
+    """
     slopes = p[:, :2] / jnp.where(visible, p[:, 2], 1.0)[:, None]
     visible &= within_reach(camera.lens, camera.distortion, *slopes.T)
     p = jnp.where(visible[:, None], p, jnp.asarray([0.0, 0.0, 1.0], p.dtype))
@@ -214,7 +216,7 @@ def _project_by_lens(
 
 
 def _pixel(p: Float[Array, "3"], camera: Camera) -> Float[Array, "2"]:
-    """Gives the pixel of a point in the camera's frame."""
+    """Returns the pixel of a point in the camera's frame, (2,)."""
     focal, center = jnp.stack([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
     if camera.lens == "orthographic":
         return focal * p[:2] + center
@@ -269,8 +271,8 @@ def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
 
 
 def _determinant(axes: Float[Array, "g 2 3"], eps2d: Array | float) -> Float[Array, " g"]:
-    """Returns the determinant of axes axes^T + eps2d I (Cauchy-Binet): of a needle, the matrix
-    itself cancels in float64 too.
+    """Returns the determinant of axes axes^T + eps2d I, (g,), by Cauchy-Binet. For needles the
+    entries of the matrix cancel, even in float64.
     """
     pairs = _cross(axes[..., jnp.asarray([0, 1, 2])], axes[..., jnp.asarray([1, 2, 0])])
     return jnp.sum(pairs**2, axis=-1) + eps2d * jnp.sum(axes**2, axis=(-1, -2)) + eps2d**2
