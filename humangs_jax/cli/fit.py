@@ -76,7 +76,7 @@ class MaskFit:
     fixed_cameras: bool = False
     """Leave cameras as they are.
 
-    Otherwise a fit to keypoints corrects cameras that the keypoints show to be turned, and
+    Otherwise a fit to keypoints turns back cameras that the keypoints show to be turned, and
     --to-masks moves all cameras.
     """
     tight_clothes: bool = False
