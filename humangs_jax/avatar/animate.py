@@ -40,8 +40,8 @@ from humangs_jax.rendering.gaussians import (
 
 @checked_arguments
 def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
-    """The avatar in a pose, differentiable in avatar and pose; affine skinning leaves its linear
-    part in `deformations`.
+    """Returns the avatar in a pose, differentiable in avatar and pose. Affine skinning leaves its
+    linear part in `deformations`.
 
     Args:
         avatar: one person.
@@ -133,7 +133,7 @@ def with_hidden_among(avatar: Avatar, hidden: Gaussians) -> Avatar:
 
 @checked_arguments
 def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
-    """The avatar in a pose, as Gaussians that means, quats and scales describe completely.
+    """Returns the avatar in a pose, as Gaussians that means, quats and scales describe completely.
 
     The linear deformation is factored into quaternions and scales. These are not differentiable
     where two scales coincide: optimise through `skin`.

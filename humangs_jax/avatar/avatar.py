@@ -85,7 +85,9 @@ class Light:
 
 
 def light_terms(normals: Float[Array, "g 3"]) -> Float[Array, "g 8"]:
-    """Spherical harmonics of the first and second order, up to constant factors."""
+    """Returns the spherical harmonics of the first and second order of unit normals, up to constant
+    factors.
+    """
     x, y, z = normals[:, 0], normals[:, 1], normals[:, 2]
     return jnp.stack([x, y, z, x * y, y * z, z * x, z**2 - x**2, 3 * y**2 - 1], axis=-1)
 
@@ -127,12 +129,13 @@ def light_coefficients(
     weights: Float[Array, " n"],
     terms: Float[Array, "n 8"],
 ) -> Float[Array, "8"]:
-    """The light that explains the colors of vertices.
+    """Returns the coefficients of the light that explains the colors of vertices.
 
-    Arguments: vertices: metres, in the T-pose. colors, weights: of the vertices; those without
-    weight do not count. terms: of the light in the photos. Returns: coefficients with the least
-    absolute deviations of the differences between vertices that are near each other, found by
-    reweighted least squares.
+    They minimise the absolute deviations of the differences between vertices that are near each
+    other, found by reweighted least squares.
+
+    Arguments: vertices: metres, in the T-pose. colors, weights: those of the vertices; vertices of
+    weight 0 do not count. terms: the `light_terms` of the vertices in the photos.
     """
     middle = (jnp.min(vertices, axis=0) + jnp.max(vertices, axis=0)) / 2
     order = jnp.argsort(along_curve(vertices - middle, CURVE_REACH))
@@ -260,8 +263,8 @@ class Avatar(Batchable):
         return self.face.expressions.names
 
     def with_face(self, body: BodyModel | None = None) -> "Avatar":
-        """The avatar with a face, so that poses may have an expression; without one it is drawn as
-        before.
+        """Returns the avatar with a face, so that poses may have an expression. Poses without an
+        expression are drawn as before.
 
         Args:
             body: the model that the avatar's vertices are of, with expressions. None: the shipped
@@ -363,8 +366,8 @@ class Avatar(Batchable):
 
 
 def recorded_source(path: str | os.PathLike[str]) -> str | None:
-    """The checksum of what an avatar file was made from, as `Avatar.save` was given it; None for a
-    file without one.
+    """Returns the checksum of what an avatar file was made from, as it was given to `Avatar.save`;
+    None for a file without one.
 
     Raises: FileNotFoundError if there is no such file; FileError if it is no avatar of this
     version.
@@ -462,7 +465,7 @@ def _face_arrays(face: Face) -> dict[str, np.ndarray]:
 
 
 def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray]) -> Face | None:
-    """The face in a file of an avatar; None if it has none.
+    """Returns the face in an avatar file; None if the file has none.
 
     Raises: InvalidFileError, naming the key.
     """

@@ -432,7 +432,9 @@ def motion_frames(
     turn: float = 0.0,
     progress: bool = True,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
-    """Frames of a moving avatar, drawn when asked for; see `motion_views` and `images`."""
+    """Yields the frames of a moving avatar. Each is drawn when it is asked for; see `motion_views`
+    and `images`.
+    """
     if shot is None:
         shot = FrameSettings()
     poses, cameras = motion_views(avatar, motion, shot, turn)

@@ -89,7 +89,10 @@ class ExrLayers:
     """
 
     def check(self) -> None:
-        """Raises: ValueError naming a layer that does not exist."""
+        """Check that all layers exist.
+
+        Raises: ValueError naming a layer that does not exist.
+        """
         unknown = [layer for layer in self.layers if layer not in LAYERS]
         if unknown:
             raise ArgumentError("channels", f"{unknown[0]!r}: expected some of {', '.join(LAYERS)}")

@@ -254,7 +254,7 @@ def reconstruct_batch(
 def stack_captures(
     config: HumanGSConfig, captures: Sequence[Capture | PreparedCapture]
 ) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
-    """Stacks what several people are reconstructed from, for a program that you write and compile.
+    """Stacks the photos of several people and their body, for a program that you write and compile.
 
     Skirts, which `reconstruct` adds, are left out.
 
@@ -339,8 +339,8 @@ def fit_buffers(
 def reconstruct_views(
     variables: Variables, config: HumanGSConfig, body: BodyModel, views: SubjectViews
 ) -> tuple[Avatar, Int[Array, ""]]:
-    """The pure function behind `reconstruct`: one subject's views to an avatar. Batch it with
-    `jax.vmap`.
+    """Returns the avatar of one subject's views. This is the pure function behind `reconstruct`;
+    batch it with `jax.vmap`.
 
     Weights files record no token capacity, and the default has room for all patches, which takes
     the time of all; `stack_captures` sizes it.
@@ -447,7 +447,7 @@ def completed_avatar(
 
 
 def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
-    """The avatar with the light of its photos (`avatar.light`).
+    """Returns the avatar with the light of its photos (`avatar.light`).
 
     Gradients do not pass through the light.
     """

@@ -139,7 +139,7 @@ class Capture:
         return self.poses[frame]
 
     def select(self, views: Sequence[int] | Int[np.ndarray, " any"]) -> "Capture":
-        """The capture with only these views, in this order; the poses stay."""
+        """Returns the capture with only these views, in this order; the poses stay."""
         views = np.asarray(views, int)
         return dataclasses.replace(
             self,
@@ -197,7 +197,7 @@ def capture_from_arrays(
     unknown: Any | None = None,
     source: str = "arrays",
 ) -> Capture:
-    """A checked capture from arrays.
+    """Returns a checked capture made of arrays.
 
     Args:
         images: (v, h, w, 3) in [0, 1].
@@ -341,8 +341,8 @@ def load_capture(
 
 
 def capture_checksum(path: str | Path) -> str:
-    """SHA-256, in hexadecimal, of all files that a capture is read from: capture.json, body.npz,
-    the model, photos and masks.
+    """Returns the SHA-256, in hexadecimal, of all files that a capture is read from: capture.json,
+    body.npz, the model, photos and masks.
 
     Captures of the same name with other contents have other checksums.
 

@@ -166,7 +166,10 @@ def read_description(file: Path) -> dict[str, Any]:
 
 
 def _check_inside(file: Path, field: str, name: str, photo: bool = False) -> None:
-    """Raises: CaptureError if a path that `file` names leaves its folder."""
+    """Check that a path that `file` names stays in its folder.
+
+    Raises: CaptureError.
+    """
     with reading(f"{file}: {field}", "path", CaptureError):
         inside(file.parent, name, photo)
 
@@ -268,13 +271,12 @@ def read_photos(
     poses: int | None = None,
     fit_masks: bool = False,
 ) -> Photos:
-    """Photos and cameras that a checked capture.json describes.
+    """Read the photos and cameras that a checked capture.json describes.
 
-    Arguments: chosen: read these views only, in this order. poses: how many frames there are; None:
-    one more than the last that a view names. fit_masks: move masks that are too large or too small
-    to the edges in the photos (`data.masks`), and log by how much; only masks in files of their
-    own, of photos that show a background.
-    Raises: CaptureError.
+    Arguments: chosen: the views to read, in this order; None: all. poses: the number of frames;
+    None: one more than the last frame that a view names. fit_masks: whether masks that are too
+    large or too small are moved to the edges in the photos (`data.masks`), with a line in the log.
+    Only masks in separate files, of photos that show a background, are moved. Raises: CaptureError.
     """
     file, views = folder / "capture.json", description["views"]
     # without the number of poses, the views say it; a huge frame number is refused

@@ -32,7 +32,7 @@ KEYS_SHOWN = 6
 
 
 def binary_kind(file: Path) -> str | None:
-    """What a file is that holds no text, in words; None for text."""
+    """Returns in words what kind of file has no text; None for a file of text."""
     with open_file(file) as opened:
         head = opened.read(HEAD)
     known = (kind for start, kind in BINARIES.items() if head.startswith(start))
@@ -41,7 +41,9 @@ def binary_kind(file: Path) -> str | None:
 
 
 def described(text: str) -> str:
-    """What a text that is no calibration seems to be; nothing of an empty one."""
+    """Returns in words what a text that is no calibration seems to be; nothing for an empty
+    text.
+    """
     if not text.strip():
         return ""
     keys = KEY.findall(text.replace("{", "\n").replace(",", "\n"))

@@ -334,7 +334,9 @@ def _crossing(
 def _silhouette_distance(
     pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "h w"]:
-    """Signed distance to the edge of the silhouette of a surface, pixels; positive inside."""
+    """Returns the signed distance of each pixel to the edge of a surface's silhouette, pixels;
+    positive inside.
+    """
     # the side that faces the camera covers all
     a, b, c = np.moveaxis(pixels[faces], 1, 0)
     turn = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]

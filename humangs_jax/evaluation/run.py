@@ -303,7 +303,9 @@ class Evaluation:
         markdown: str | os.PathLike[str] | None = None,
         latex: str | os.PathLike[str] | None = None,
     ) -> None:
-        """Write all that is named, or nothing: all numbers; the page; a line an image; tables of
+        """Write the results into the files that are named: all of them, or none.
+
+        json: all numbers. html: the page. csv: a line for each image. markdown, latex: tables of
         people. Raises: OSError.
         """
         texts = {

@@ -118,7 +118,10 @@ class RefineConfig:
     """The seed of the order of the photos and of the blocks."""
 
     def __post_init__(self):
-        """Raises ValueError for settings that do not fit together, naming them."""
+        """Check that the settings fit together.
+
+        Raises: ValueError naming the settings that do not.
+        """
         if self.steps is None and self.seconds is None:
             raise ValueError(
                 "RefineConfig: expected steps, seconds or both; without either a run would not end"

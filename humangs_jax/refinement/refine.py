@@ -102,8 +102,8 @@ def refine(
     progress: bool = False,
     watch: Callable[[Avatar], None] | None = None,
 ) -> Avatar:
-    """The avatar, fitted to the photos of a capture, or the avatar itself where that makes it no
-    better.
+    """Fits an avatar to the photos of a capture. Returns the fitted avatar, or the avatar itself if
+    the fit is no better.
 
     Learned-optimizer iterations, then Adam for as long as asked, or steps on the head alone where
     photos have 512 px or more. Views whose mask does not show the person are left out, and exposure

@@ -132,7 +132,7 @@ class Clock:
         )
 
     def elapsed(self) -> float:
-        """Seconds since the start, without compilation."""
+        """Returns the seconds since the start of the run, without compilation."""
         return time.perf_counter() - self.began - self.compile_seconds
 
     @contextlib.contextmanager
@@ -304,8 +304,9 @@ def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:
 
 
 def align(task: Task, start: Candidate, each: Comparison) -> tuple[Task, Comparison]:
-    """The task whose photos show the person where the start does, and the comparison of the start
-    with each of them; the same ones where the photos agree.
+    """Moves the photos so that they show the person where the start does. Returns the task with
+    these photos, and the comparison of the start with each of them. Returns both arguments as they
+    are if the photos agree.
 
     Iterations fit photos of one moment to a small part of a pixel. Where the person has moved from
     photo to photo, or a pose or a camera is off, what they find lies between the photos. Then
@@ -487,7 +488,7 @@ def steps(
 
 
 def stepped(task: Task, state: RefineState, view: int | np.integer) -> RefineState:
-    """The state after a step on one photo."""
+    """Returns the state after a step on one photo."""
 
     def stepped(splat: SplatConfig) -> tuple[RefineState, Array]:
         new = step(replace(state, splat=splat), task.seen[view], task.avatar, task.settings)

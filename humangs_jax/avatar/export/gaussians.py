@@ -191,8 +191,8 @@ def linear_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
 
 @checked_arguments
 def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gaussians:
-    """Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of PlayCanvas),
-    `.splat`, `.spz`, `.glb`, `.sog` (PlayCanvas) and `.pt` (checkpoints of gsplat).
+    """Read the Gaussians of a file of another program: `.ply` (3DGS, and the compressed one of
+    PlayCanvas), `.splat`, `.spz`, `.glb`, `.sog` (PlayCanvas) and `.pt` (checkpoints of gsplat).
 
     Args:
         path: The file. How it begins decides the format; where that does not tell (`.splat`), its
@@ -368,7 +368,9 @@ def with_largest(three: Float[np.ndarray, "g 3"], places: np.ndarray) -> Float[n
 
 
 def colors_of(coefficients: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
-    """Inverse of `sh_of`."""
+    """Returns the colors of coefficients of the constant spherical harmonic; the inverse of
+    `sh_of`.
+    """
     return 0.5 + SH_C0 * coefficients
 
 
