@@ -1,4 +1,4 @@
-"""What a file is that no reader of calibrations knows, in words for an error."""
+"""Describes in words, for errors, a file that no reader of calibrations knows."""
 
 import re
 from pathlib import Path
@@ -13,9 +13,9 @@ BINARIES = {
     b"MATLAB 5": "a file of MATLAB",
     b"\x80": "a pickle",
 }
-"""How files begin that somebody may take for a calibration, and what they are."""
+"""Beginnings of files that somebody may take for a calibration, and the kinds of these files."""
 HEAD = 4096
-"""Bytes that are looked at."""
+"""The number of bytes at the beginning of a file that are read."""
 INTRINSICS = (
     "camera_matrix",
     "cameraMatrix",
@@ -28,7 +28,7 @@ INTRINSICS = (
 KEY = re.compile(r"""^[ \t]*["']?([A-Za-z_][\w .-]*?)["']?[ \t]*[:=]""", re.MULTILINE)
 """A key of JSON, YAML or TOML at the beginning of a line."""
 KEYS_SHOWN = 6
-"""In an error."""
+"""The most keys that an error names."""
 
 
 def binary_kind(file: Path) -> str | None:

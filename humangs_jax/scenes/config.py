@@ -6,8 +6,8 @@ from humangs_jax.core.configuration import Range, Seed, Share, Spread, Steps, We
 from humangs_jax.rendering.splat_config import SplatConfig
 
 SCENE_SPLAT = SplatConfig(jacobian_margin=0.3)
-"""As gsplat draws: in scenes around the cameras Gaussians beside them would otherwise cover
-whole images.
+"""The renderer's settings, as gsplat draws. In scenes around the cameras, Gaussians beside the
+cameras would otherwise cover whole images.
 """
 Capacity = Annotated[int, Range(1, 100_000_000)]
 """A number of Gaussians."""
@@ -38,19 +38,21 @@ class SceneConfig:
     """How `fit_scene` fits Gaussians to photos."""
 
     capacity: Capacity = 200_000
-    """Gaussians at most; the number of slots, which every step works on."""
+    """The number of slots, which is the most Gaussians that a scene can have. Every step works on
+    all.
+    """
     steps: Steps = 7_000
-    """One photo each."""
+    """The number of steps, of one photo each."""
     start: Capacity = 5_000
-    """Gaussians to begin with where no points are given."""
+    """The number of Gaussians to begin with where no points are given."""
     degree: Annotated[int, Range(0, 3)] = 1
-    """Of the harmonics, by which colors depend on the direction of sight."""
+    """The degree of the harmonics, by which colors depend on the direction of sight."""
     rates: SceneRates = SceneRates()
     """Learning rates."""
     final_share: Share = 0.01
-    """Of the rate of the means that is left at the end; it falls exponentially."""
+    """Share of the rate of the means that is left at the end. The rate falls exponentially."""
     other_final_share: Share = 0.1
-    """Of the other rates, in the same way."""
+    """Share of the other rates that is left at the end. They fall exponentially."""
     structural: Share = 0.2
     """Share of the structural dissimilarity in the loss; the rest is absolute error."""
     opacity_penalty: Weight = 0.01
@@ -58,14 +60,16 @@ class SceneConfig:
     scale_penalty: Weight = 0.01
     """Weight of the mean scale, in extents of the cameras."""
     noise: Weight = 5e5
-    """Of the means (`mcmc_noise`), in their learning rate and per extent squared."""
+    """Weight of the noise of the means (`mcmc_noise`), relative to their learning rate and to 1 /
+    extent squared.
+    """
     relocate_every: Steps = 100
     """Steps after which dead Gaussians move and more slots are used."""
     growth: Annotated[float, Range(1, 10)] = 1.05
-    """Times as many slots are used then, up to the capacity."""
+    """Factor on the number of used slots at each relocation, up to the capacity."""
     relocate_until: Share = 0.85
-    """Share of the steps after which nothing moves any more."""
+    """Share of the steps after which no Gaussian is relocated any more."""
     splat: SplatConfig = SCENE_SPLAT
-    """How images are drawn; buffers are planned."""
+    """How images are drawn. The sizes of the buffers are planned."""
     seed: Seed = 0
-    """Of the order of photos, the noise, and what moves where."""
+    """Seed of the order of photos, the noise and the relocations."""
