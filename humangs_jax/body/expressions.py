@@ -29,16 +29,16 @@ from humangs_jax.io.reading import InvalidFileError, check_limit, reading
 
 FORMAT = "humangs-face-1"
 STEP = 1e-5
-"""Metres, of offsets in files: int16 then spans +-0.33 m."""
+"""Step of offsets in files, metres. int16 then spans +-0.33 m."""
 EYES = ("left_eye", "right_eye")
 """Joints that the eyes turn with."""
 PARTS = ("upper_teeth", "lower_teeth", "tongue", "left_lid", "right_lid", "mouth")
-"""What `FaceParts.parts` counts; "mouth" is the skin inside of it."""
+"""Names of the parts that `FaceParts.parts` numbers; "mouth" is the skin inside of it."""
 KEYS = (
     *("format", "names", "counts", "vertices", "offsets", "eye_turns"),
     *("lips", "inside_vertices", "part_faces", "parts"),
 )
-"""What a file of `assets/face.npz`'s format has."""
+"""Keys that every file of `assets/face.npz`'s format has."""
 
 
 @pytree_dataclass
@@ -50,7 +50,9 @@ class Expressions:
     directions: Float[Array, "m 3 e"]
     """Metres per unit of a coefficient, in the T-pose."""
     joint_directions: Float[Array, "j 3 e"] | None = None
-    """Metres per unit; None: joints stay where they are."""
+    """Change of the joints per unit of a coefficient, (j, 3, e), metres. None: joints do not
+    move.
+    """
     joint_turns: Float[Array, "j 3 e"] | None = None
     """Axis-angle in radians per unit, added to the rotations of the pose; None: no joint turns."""
     names: tuple[str, ...] = static_field(default=())
@@ -64,22 +66,22 @@ class FaceParts:
     """
 
     corners: Float[np.ndarray, "q 4 3"]
-    """Metres, on the mean body in T-pose."""
+    """Corners of the quadrilaterals on the mean body in T-pose, (q, 4, 3), metres."""
     directions: Float[np.ndarray, "q 4 3 e"]
     """How each corner moves per unit of a coefficient, metres."""
     parts: Int[np.ndarray, " q"]
-    """Index into `PARTS`."""
+    """Part of each quadrilateral, (q,), as an index into `PARTS`."""
     lips: Float[np.ndarray, "4 3"]
-    """Metres: the inner edges of the upper and the lower lip in the middle, the left and the
-    right corner of the mouth.
+    """Four points, (4, 3), metres: the inner edges of the upper and the lower lip in the middle,
+    and the left and the right corner of the mouth.
     """
     lip_directions: Float[np.ndarray, "4 3 e"]
-    """How these move per unit of a coefficient, metres."""
+    """Change of these points per unit of a coefficient, (4, 3, e), metres."""
 
 
 @functools.cache
 def _shipped() -> dict[str, np.ndarray]:
-    """Reads the face of the package."""
+    """Returns the arrays of the face that comes with the package."""
     with resources.as_file(resources.files("humangs_jax") / "assets" / "face.npz") as file:
         return _read_face(file)
 
@@ -146,7 +148,9 @@ def shipped_expressions(body_vertices: int) -> Expressions:
 
 
 def shipped_parts(template: Float[np.ndarray, "n 3"]) -> FaceParts:
-    """Returns teeth, tongue, lids and the inside of the mouth. template: of the shipped body."""
+    """Returns teeth, tongue, lids and the inside of the mouth. template: that of the shipped
+    body.
+    """
     arrays = _shipped()
     places = np.concatenate([template, arrays["inside_vertices"]]).astype(np.float32)
     faces = arrays["part_faces"].astype(np.int64)

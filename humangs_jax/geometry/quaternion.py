@@ -190,7 +190,7 @@ def left_singular_vectors(
 def _orthogonalize(
     a: Float[Array, "*b 3"], b: Float[Array, "*b 3"]
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
-    """Rotate two columns in their plane until they are orthogonal."""
+    """Returns two columns, rotated in their plane until they are orthogonal."""
     aa, bb, ab = (jnp.sum(x * y, axis=-1, keepdims=True) for x, y in ((a, a), (b, b), (a, b)))
     needed = ab != 0
     ratio = (bb - aa) / (2 * jnp.where(needed, ab, 1))
@@ -208,8 +208,8 @@ def _orthogonalize(
 def _complete_to_rotation(
     columns: Float[Array, "*b 3 3"], norms: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3 3"]:
-    """Normalise the two longest columns and take their cross product as the third: proper even
-    where columns vanish.
+    """Returns rotations of the normalised two longest columns and their cross product. The
+    determinant is 1 even where columns vanish.
     """
     order = jnp.argsort(-norms, axis=-1)
     first = jnp.take_along_axis(columns, order[..., None, 0:1], axis=-1)[..., 0]

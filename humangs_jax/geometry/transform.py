@@ -29,7 +29,9 @@ def make(
 def apply(
     transform: Float[Array, "*#b 4 4"], points: Float[Array, "*#b 3"]
 ) -> Float[Array, "*b 3"]:
-    """Move points by the transform; batch axes broadcast. The last row is taken as (0, 0, 0, 1)."""
+    """Returns points moved by the transform. Batch axes broadcast. The last row is taken as (0, 0,
+    0, 1).
+    """
     return (
         jnp.einsum("...ij,...j->...i", transform[..., :3, :3], points, precision=EXACT)
         + transform[..., :3, 3]
@@ -66,12 +68,12 @@ def from_twist(twist: Float[Array, "*b 6"]) -> Float[Array, "*b 4 4"]:
 
 
 BITS = 10
-"""Cells along each axis: 2^10."""
+"""Binary digits of a cell's number along an axis: there are 2^10 cells."""
 
 
 def along_curve(positions: Float[Array, "n 3"], reach: float) -> Int[Array, " n"]:
-    """Ranks positions along a space-filling curve (Morton's) of the cube from -reach to reach;
-    outside of it, as its border.
+    """Returns the ranks of positions along a space-filling curve (Morton's) of the cube from -reach
+    to reach. Positions outside count as if on its border.
     """
     cells = 2**BITS
     at = jnp.floor((positions / (2 * reach) + 0.5) * cells).astype(jnp.int32)

@@ -28,8 +28,8 @@ logger = logging.getLogger(__name__)
 def colors_in_srgb(
     path: str | Path, image: Any, data: bytes, levels: UInt[np.ndarray, "h w c"], most: int
 ) -> Float[np.ndarray, "h w 3"] | None:
-    """Returns colors of a file that says how they are encoded; None where levels are in sRGB
-    already.
+    """Returns the colors of a photo in sRGB, (h, w, 3), if its file says how they are encoded. None
+    where the levels are in sRGB already.
     """
     channels = 1 if levels.shape[-1] < 3 else 3
     levels = levels[..., :channels]
@@ -82,8 +82,8 @@ def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
 def _by_tables(
     image: Any, profile: bytes, levels: UInt[np.ndarray, "h w c"], most: int
 ) -> Float[np.ndarray, "h w 3"] | None:
-    """Converts colors by Little CMS, which has 8 bits here: where the file has 16, the lower ones
-    are added as they are.
+    """Returns colors converted by Little CMS, which has 8 bits here. If the file has 16 bits, the
+    lower ones are added unchanged. None where the levels are in sRGB already.
     """
     from PIL import Image
 
@@ -108,5 +108,5 @@ def _by_tables(
 
 @functools.lru_cache(maxsize=1024)
 def _tell(line: str) -> None:
-    """Warn once: photos are read several times."""
+    """Logs a warning once, although photos are read several times."""
     logger.warning("%s", line)

@@ -1,8 +1,8 @@
-"""What a photo says before it is decoded: a JPEG's scans, a WebP's size, an ISO file's kind, a
-PNG's chunks, EXIF's frame.
+"""Reads what a photo's file says before it is decoded: a JPEG's scans, a WebP's size, an ISO file's
+kind, a PNG's chunks, and EXIF's frame.
 
 Phones put more behind a JPEG (a video, a map of gains, depth) and inside of its segments
-(thumbnails, EXIF, C2PA). Only the marks of the picture itself count.
+(thumbnails, EXIF, C2PA). Only the markers of the picture itself count.
 """
 
 import re
@@ -17,12 +17,12 @@ from humangs_jax.io.reading import InvalidFileError
 HEIC_BRANDS = frozenset((b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1"))
 """Brands of HEIC in the box `ftyp` that a file begins with (ISO/IEC 23008-12)."""
 AVIF_BRANDS = frozenset((b"avif", b"avis"))
-"""Brands of AVIF in the same box."""
+"""Brands of AVIF in the box `ftyp`."""
 
 JPEG_START = b"\xff\xd8"
 JPEG_MARKER = re.compile(rb"\xff([^\x00\xff])")
-"""FF 00 is a byte FF of the compressed data, and before the last FF there may be any number of
-others.
+"""Pattern of a marker. FF 00 is a byte FF of the compressed data and no marker. Any number of FF
+bytes may stand before a marker.
 """
 END = 0xD9
 """Marker of JPEG files that ends the image."""
@@ -31,15 +31,15 @@ SCAN = 0xDA
 WITH_LENGTH = frozenset(
     (*range(0xC0, 0xC8), *range(0xC9, 0xD0), SCAN, 0xDB, 0xDC, 0xDD, *range(0xE0, 0xF0), 0xFE)
 )
-"""Markers that two bytes of length follow, as libjpeg reads them; all others stand alone, or
-libjpeg ends there.
+"""Markers that are followed by two bytes of length, as libjpeg reads them. All others stand alone,
+or libjpeg ends there.
 """
 
 
 def jpeg_scans(data: bytes) -> int:
-    """Counts the scans of the picture that a JPEG file begins with.
+    """Returns the number of scans of the picture that a JPEG file begins with.
 
-    Segments are stepped over, and what is behind the picture is not looked at.
+    Segments are skipped, and bytes behind the picture are not read.
     """
     at, count = len(JPEG_START), 0
     while True:
@@ -61,8 +61,8 @@ def is_webp(data: bytes) -> bool:
 
 
 def webp_size(data: bytes) -> tuple[int, int]:
-    """Returns width and height of the canvas of a WebP, for which Pillow takes memory as soon as it
-    opens one. Raises: InvalidFileError.
+    """Returns width and height of a WebP's canvas, pixels. Pillow takes memory for the canvas as
+    soon as it opens the file. Raises: InvalidFileError.
     """
     kind, body = data[12:16], data[20:30]
     if len(body) == 10 and kind == b"VP8X":
@@ -78,9 +78,9 @@ def webp_size(data: bytes) -> tuple[int, int]:
 
 
 def iso_kind(data: bytes) -> str | None:
-    """Returns Pillow's name, HEIF or AVIF, for a file that begins as such a photo, else None.
+    """Returns Pillow's name, HEIF or AVIF, of a file that begins as such a photo, else None.
 
-    A first brand mif1 may be either: the further brands tell.
+    If the first brand is mif1 or msf1, the further brands decide.
     """
     if data[4:8] != b"ftyp":
         return None
@@ -106,8 +106,8 @@ def png_chunks(data: bytes) -> dict[bytes, bytes]:
 
 
 def nclx_colors(data: bytes) -> tuple[int, int] | None:
-    """Returns code points (H.273) of the primaries and the curve of an AVIF, of the first box that
-    has some.
+    """Returns the code points (H.273) of an AVIF's primaries and curve, from the first box that has
+    them. None if there is no such box.
     """
     box = b"colrnclx"
     at = data.find(box)
@@ -118,8 +118,10 @@ def nclx_colors(data: bytes) -> tuple[int, int] | None:
 
 
 def check_png_chunks(data: bytes) -> None:
-    """Checks that a PNG file is whole: Pillow decodes some that are damaged, and pixels of a
-    palette that is not there.
+    """Checks that a PNG file is whole. Pillow decodes some damaged files, and pixels of a palette
+    that is missing.
+
+    Raises: InvalidFileError, or another ValueError.
     """
     at, names = 8, set()
     while at < len(data) and b"IEND" not in names:
@@ -160,7 +162,9 @@ def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] 
 
 
 def _same_shape(size: tuple[int, int], frame: tuple[int, int]) -> bool:
-    """Says whether two sizes have the same shape, but for a pixel and a hundredth, by rounding."""
+    """Says whether two sizes have the same ratio of sides, within one pixel and a hundredth for
+    rounding.
+    """
     scale = np.hypot(*size) / np.hypot(*frame)
     off = np.abs(scale * np.asarray(frame) - size)
     return bool((off <= 1 + 0.01 * np.asarray(size)).all())

@@ -16,8 +16,8 @@ SHELLS = (0.0, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18)
 
 
 def published() -> HumanGSConfig:
-    """Configures the authors' release, 99 M parameters, with its quirks; its encoder computes in
-    bfloat16.
+    """Returns the configuration of the authors' release: 99 M parameters, with its quirks. Its
+    encoder computes in bfloat16.
     """
     return HumanGSConfig(
         conventions=Conventions(
@@ -33,17 +33,17 @@ def published() -> HumanGSConfig:
 
 
 def paper() -> HumanGSConfig:
-    """Configures the paper's network: visible views pooled, a plain position map; conventions
-    otherwise ours.
+    """Returns the configuration of the paper's network. Visible views are pooled, and the position
+    map is plain. The other conventions are ours.
     """
     return HumanGSConfig(runtime=Runtime(dtype="bfloat16"))
 
 
 def small() -> HumanGSConfig:
-    """Configures what was trained on a CPU and is shipped: tokens of the foreground only, color
-    read off the photos.
+    """Returns the configuration of the shipped network, which was trained on a CPU. Tokens are of
+    the foreground only, and colors are read from the photos.
 
-    It has no upsampler, for its cost on a CPU (docs/training.md).
+    It has no upsampler, because of its cost on a CPU (docs/training.md).
     """
     return HumanGSConfig(
         # sizes that a CPU trains in days, and all that reads the photos directly
@@ -79,8 +79,8 @@ def small() -> HumanGSConfig:
 
 
 def tiny() -> HumanGSConfig:
-    """Configures the published parts with the conventions of `small`, for tests: every stage in the
-    smallest sizes.
+    """Returns a configuration for tests: the published parts with what `small` reads from the
+    photos, in the smallest sizes.
     """
     decoder = paper_parts(small().architecture)[2]
     return HumanGSConfig(

@@ -33,9 +33,7 @@ SHIPPED = "assets/weights.safetensors"
 
 
 def expected_variables(config: HumanGSConfig) -> Variables:
-    """Returns the shapes and dtypes of the variables of a configuration, without computing
-    anything.
-    """
+    """Returns the shapes and dtypes of a configuration's variables, without computing anything."""
     return jax.eval_shape(lambda: init_humangs(jax.random.key(0), config))
 
 
@@ -83,8 +81,8 @@ def save_weights(
 
 
 def shipped_checksum() -> str:
-    """Returns the SHA-256, in hexadecimal, of the shipped weights file; "none" where the
-    installation has none.
+    """Returns the SHA-256 of the shipped weights file, in hexadecimal. "none" if the installation
+    has none.
     """
     with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:
         if shipped.exists():
@@ -146,8 +144,10 @@ def _load_weights(path: str | os.PathLike[str]) -> tuple[Variables, HumanGSConfi
 def variables_from_tensors(
     tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str
 ) -> Variables:
-    """Makes float32 variables of flat tensors keyed by path; ValueError naming the key unless they
-    are exactly those.
+    """Returns float32 variables made from flat tensors by path.
+
+    Raises: ValueError, which names the key, unless the tensors are exactly those of the
+    configuration.
     """
     expected = expected_variables(config)
     arrays = _check(tensors, expected, where)
@@ -157,8 +157,10 @@ def variables_from_tensors(
 
 
 def _check(tensors: dict[str, Any], variables: Variables, where: str) -> dict[str, np.ndarray]:
-    """Checks that tensors are exactly the variables; returns them as numpy arrays, in the order of
-    the leaves.
+    """Returns the tensors as numpy arrays in the order of the leaves, after a check that they are
+    exactly the variables.
+
+    Raises: ValueError, which names the tensor.
     """
     expected = flatten_variables(variables)
     missing = sorted(set(expected) - set(tensors))
