@@ -1,5 +1,5 @@
-"""The configuration of a network, in three: what its weights are, what they were trained with, and
-how it runs.
+"""The configuration of a network, in three parts: what its weights are, what they were trained
+with, and how it runs.
 
 Weights files record `Architecture` and `Conventions`. `Runtime` belongs to the user and the
 machine.
@@ -114,7 +114,7 @@ class HumanGSConfig:
         return self.forward_context().tokens
 
     def forward_context(self, train: bool = False, axis_name: Any = None) -> ForwardContext:
-        """Returns what the parts get from outside in one pass, see `ForwardContext`."""
+        """Returns the record of how one pass runs, which all parts get."""
         return ForwardContext(self.conventions, self.runtime, train, axis_name)
 
     @property
@@ -128,17 +128,17 @@ class HumanGSConfig:
         return dataclasses.replace(self, runtime=Runtime())
 
     def with_runtime(self, **changes: Any) -> "HumanGSConfig":
-        """Returns the same network with changes of how it runs."""
+        """Returns the configuration with other values of fields of its `Runtime`."""
         return dataclasses.replace(self, runtime=dataclasses.replace(self.runtime, **changes))
 
     def with_conventions(self, **changes: Any) -> "HumanGSConfig":
-        """Returns the same parts with changes of their conventions."""
+        """Returns the configuration with other values of fields of its `Conventions`."""
         return dataclasses.replace(
             self, conventions=dataclasses.replace(self.conventions, **changes)
         )
 
     def with_parts(self, **changes: Any) -> "HumanGSConfig":
-        """Gives the network with some parts replaced by others."""
+        """Returns the configuration with some parts replaced by others."""
         return dataclasses.replace(
             self, architecture=dataclasses.replace(self.architecture, **changes)
         )

@@ -25,37 +25,45 @@ from humangs_jax.core.configuration import (
 )
 
 NEAR = 0.01
-"""Metres; Gaussians whose centre is nearer (or behind) are not drawn. gsplat 0.01; INRIA 0.2."""
+"""Gaussians whose centre is nearer than this, or behind the camera, are not drawn, metres. gsplat
+has 0.01, INRIA 0.2.
+"""
 
 EPS2D = 0.3
-"""Pixels^2 added to both variances of the image: a low-pass of about one pixel, without which a
-Gaussian thinner than a pixel falls between pixel centres. The same in INRIA and gsplat; opacity is
-not compensated for it (gsplat "classic")."""
+"""Variance that is added along both axes of the image, pixels^2. It is a low-pass of about one
+pixel. Without it a Gaussian thinner than a pixel falls between pixel centres. INRIA and gsplat have
+the same value. Opacity is not compensated for it (gsplat "classic").
+"""
 
 MIP_EPS2D = 0.1
-"""Pixels^2, for Gaussians whose scales contain the low-pass of the images that they were fitted to:
-about the footprint of a pixel, so that images of other sizes show them as wide as those did
-(Mip-Splatting, https://arxiv.org/abs/2311.16493)."""
+"""Added variance for Gaussians whose scales contain the low-pass of the images that they were
+fitted to, pixels^2. It is about the footprint of a pixel. Images of other sizes then show them as
+wide as those images did (Mip-Splatting, https://arxiv.org/abs/2311.16493).
+"""
 
 LEAST_DIMMING = 1e-4
-"""Least factor of opacities, by the variance that is added: too small to be seen, it keeps
+"""Smallest factor by which the added variance dims opacities. It is too small to be seen, and keeps
 gradients finite.
 """
 
 ALPHA_MIN = 1 / 255
-"""A smaller alpha is skipped: it could not change an 8-bit image by itself. The same everywhere."""
+"""Smaller alphas are skipped, because they could not change an 8-bit image. INRIA and gsplat have
+the same value.
+"""
 
 ALPHA_MAX = 0.999
-"""Alpha is clamped here, so that no pixel is ever fully opaque (T > 0). gsplat and INRIA have 0.99.
+"""Largest alpha. Larger ones are clamped, so that no pixel is ever fully opaque (T > 0). gsplat and
+INRIA have 0.99.
 """
 
 TRANSMITTANCE_STOP = 1e-4
-"""A pixel ends before the splat that would leave a transmittance T <= this. The same everywhere."""
+"""A pixel ends before the splat that would leave a transmittance T <= this. INRIA and gsplat have
+the same value.
+"""
 
 LARGEST_FOOTPRINT = 1e9
-"""Pixels; a Gaussian with a longer projected axis is not drawn.
-
-Its square's square would overflow float32.
+"""Gaussians with a longer projected axis are not drawn, pixels. The fourth power of a longer axis
+could overflow float32.
 """
 
 
@@ -197,9 +205,9 @@ published weights were trained with."""
 
 
 def splat_config(config: SplatConfig | str) -> SplatConfig:
-    """Returns a configuration as it is, or a preset by its name.
+    """Returns the preset of a name. A configuration is returned unchanged.
 
-    Raises: ValueError for another name.
+    Raises: ValueError for an unknown name.
     """
     if not isinstance(config, str):
         return config
