@@ -49,9 +49,10 @@ def test_imports_are_declared_and_dependencies_imported():
     assert imported(ROOT / "humangs_jax") == required
     groups = ("dev", "notebooks", "hdf5", "heic", "photos")
     tools = {plain(each) for name in groups for each in extras[name]}
-    own = {"data"} | {
-        plain(path.stem)
+    own = {
+        plain(name)
         for folder in ("tests", "experiments")
         for path in (ROOT / folder).rglob("*.py")
+        for name in (path.stem, path.parent.name)
     }
     assert imported(ROOT / "tests") - own - required - tools == UNTESTED

@@ -35,7 +35,6 @@ from humangs_jax.body.model import (
     surface_points,
 )
 from humangs_jax.core.array_types import Array, Bool, Float, Int
-from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
@@ -322,10 +321,8 @@ def landmark_model(
     # the surface's points: vertices that are sources, then the places in the order of landmarks
     vertices = sorted({source for found in sources.values() for source in found if source >= 0})
     order = [name for name in names if name in placed]
-    # by numpy: dozens of small operations, each of which would be a program of its own
-    surface = jax.tree.map(np.asarray, surface_points(body))
-    points = [_rows(surface, vertices)]
-    points += [_placed(body, surface, finder, placed[name]) for name in order]
+    points = [_rows(surface_points(body), vertices)]
+    points += [_placed(body, finder, placed[name]) for name in order]
 
     # the weights of joints, vertices and places in each landmark
     joints = len(body.parents)
@@ -339,14 +336,14 @@ def landmark_model(
         if name in placed:
             row[joints + len(vertices) + order.index(name)] = 1.0
 
-    all_points = jax.tree.map(from_host, _concatenated(points))
+    all_points = _concatenated(points)
     used = np.any(regressor[:, :joints], axis=0)
     return LandmarkModel(
-        joints=from_host(_regressed(body.joint_regressor, surface.rest)),
-        joint_directions=from_host(_regressed(body.joint_regressor, surface.directions)),
+        joints=_regressed(body, body.template),
+        joint_directions=_regressed(body, body.shape_directions),
         points=all_points,
-        regressor=from_host(regressor),
-        certainty=from_host(certainty or usual_certainty(names), np.float32),
+        regressor=jnp.asarray(regressor),
+        certainty=jnp.asarray(certainty or usual_certainty(names), jnp.float32),
         names=names,
         known=known,
         parents=body.parents,
@@ -368,11 +365,9 @@ def _grouped(names: tuple[str, ...], placed: Sequence[str]) -> tuple[PlacedLandm
     )
 
 
-def _regressed(
-    regressor: Float[Array | np.ndarray, "j n"], values: Float[Array | np.ndarray, "n *b"]
-) -> Float[np.ndarray, "j *b"]:
-    """Returns the values of joints, (j, ...), of a quantity that is linear in the vertices."""
-    return np.tensordot(np.asarray(regressor), np.asarray(values), axes=1)
+def _regressed(body: BodyModel, values: Float[Array, "n *b"]) -> Float[Array, "j *b"]:
+    """Returns what joints have of a quantity that is linear in the vertices."""
+    return jnp.einsum("jn,n...->j...", body.joint_regressor, values, precision=EXACT)
 
 
 def _rows(points: SurfacePoints, rows: Int[np.ndarray, " p"] | list[int]) -> SurfacePoints:
@@ -380,47 +375,41 @@ def _rows(points: SurfacePoints, rows: Int[np.ndarray, " p"] | list[int]) -> Sur
     return jax.tree.map(lambda leaf: leaf[np.asarray(rows, np.int32)], points)
 
 
-def _joint_point(body: BodyModel, surface: SurfacePoints, joint: int) -> SurfacePoints:
-    """Returns a surface point at a joint, which moves with the joint alone."""
-    row = np.asarray(body.joint_regressor)[joint : joint + 1]
-    weights = np.zeros_like(surface.weights[:1])
-    weights[0, joint] = 1.0
-    corrections = surface.corrections
-    if corrections is not None:
-        corrections = np.zeros_like(corrections[:1])
-    return replace(
-        surface,
-        rest=_regressed(row, surface.rest),
-        directions=_regressed(row, surface.directions),
-        corrections=corrections,
-        weights=weights,
+def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
+    """Makes a point of a joint: the joint carries it."""
+    row = body.joint_regressor[joint : joint + 1]
+
+    def product(values):
+        return jnp.einsum("jn,n...->j...", row, values, precision=EXACT)
+
+    return SurfacePoints(
+        product(body.template),
+        product(body.shape_directions),
+        None if body.pose_directions is None else jnp.zeros_like(body.pose_directions[:1]),
+        jnp.zeros_like(body.skinning_weights[:1]).at[0, joint].set(1.0),
     )
 
 
-def _placed(
-    body: BodyModel, surface: SurfacePoints, finder: "_Finder", place: LandmarkDefinition
-) -> SurfacePoints:
-    """Returns the point of a placed landmark, at an offset from the mean of its base's sources. The
-    point follows the sources in every shape, and turns with the joints of the place.
-
-    surface: all vertices, on the host.
+def _placed(body: BodyModel, finder: "_Finder", place: LandmarkDefinition) -> SurfacePoints:
+    """Makes a point beside the sources of a landmark: it grows with them, and turns with the joints
+    of the place.
     """
-    sources = finder.find(place.base)
-    points = [_rows(surface, [vertex]) for vertex in sources if vertex >= 0]
-    points += [_joint_point(body, surface, -1 - source) for source in sources if source < 0]
+    every, sources = surface_points(body), finder.find(place.base)
+    points = [
+        _rows(every, [source]) if source >= 0 else _joint_point(body, -1 - source)
+        for source in sources
+    ]
     mean = jax.tree.map(lambda leaf: leaf.mean(axis=0, keepdims=True), _concatenated(points))
     weights = mean.weights
     if place.joints:
         carriers = np.asarray([finder.index[joint] for joint in place.joints])
-        weights = np.zeros_like(weights)
-        weights[0, carriers] = 1 / len(carriers)
-    offset = np.asarray(place.offset, mean.rest.dtype)
-    return replace(mean, rest=mean.rest + offset, weights=weights)
+        weights = jnp.zeros_like(weights).at[0, carriers].set(1 / len(carriers))
+    return replace(mean, rest=mean.rest + jnp.asarray(place.offset, jnp.float32), weights=weights)
 
 
 def _concatenated(points: Sequence[SurfacePoints]) -> SurfacePoints:
-    """Returns all points in one record."""
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *points)
+    """Joins points."""
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *points)
 
 
 def pose_landmarks(

@@ -53,7 +53,7 @@ def test_the_page_lists_the_limits_in_force():
     rows = re.findall(r"^\| `(\w+)` \| ([\d,]+) \|", DOCS.read_text(), re.MULTILINE)
     found = {name: int(value.replace(",", "")) for name, value in rows}
     assert found == {name: int(value) for name, value in dataclasses.asdict(Limits()).items()}
-    assert "| `ratio` | 100 | Beyond `plain_bytes`:" in DOCS.read_text()
+    assert "| `ratio` | 100 | Largest unpacked size" in DOCS.read_text()
 
 
 def test_limits_are_those_of_the_environment(monkeypatch):
