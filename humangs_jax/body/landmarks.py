@@ -15,6 +15,7 @@ fits give these landmarks less weight. If it is known where a detector sees its 
 moved there by a `LandmarkDefinition`.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -321,8 +322,15 @@ def landmark_model(
     # the surface's points: vertices that are sources, then the places in the order of landmarks
     vertices = sorted({source for found in sources.values() for source in found if source >= 0})
     order = [name for name in names if name in placed]
-    points = [_rows(surface_points(body), vertices)]
-    points += [_placed(body, finder, placed[name]) for name in order]
+    beside = tuple(
+        _Beside(
+            tuple(finder.find(placed[name].base)),
+            tuple(finder.index[joint] for joint in placed[name].joints),
+            placed[name].offset,
+        )
+        for name in order
+    )
+    joint_places, joint_directions, points = _on_the_body(body, tuple(vertices), beside)
 
     # the weights of joints, vertices and places in each landmark
     joints = len(body.parents)
@@ -336,19 +344,18 @@ def landmark_model(
         if name in placed:
             row[joints + len(vertices) + order.index(name)] = 1.0
 
-    all_points = _concatenated(points)
     used = np.any(regressor[:, :joints], axis=0)
     return LandmarkModel(
-        joints=_regressed(body, body.template),
-        joint_directions=_regressed(body, body.shape_directions),
-        points=all_points,
+        joints=joint_places,
+        joint_directions=joint_directions,
+        points=points,
         regressor=jnp.asarray(regressor),
         certainty=jnp.asarray(certainty or usual_certainty(names), jnp.float32),
         names=names,
         known=known,
         parents=body.parents,
         joint_names=body.joint_names,
-        movers=_movers(body.parents, used, np.asarray(all_points.weights)),
+        movers=_movers(body.parents, used, np.asarray(points.weights)),
         placed=_grouped(names, order),
     )
 
@@ -370,7 +377,7 @@ def _regressed(body: BodyModel, values: Float[Array, "n *b"]) -> Float[Array, "j
     return jnp.einsum("jn,n...->j...", body.joint_regressor, values, precision=EXACT)
 
 
-def _rows(points: SurfacePoints, rows: Int[np.ndarray, " p"] | list[int]) -> SurfacePoints:
+def _rows(points: SurfacePoints, rows: Sequence[int]) -> SurfacePoints:
     """Returns the points with these numbers."""
     return jax.tree.map(lambda leaf: leaf[np.asarray(rows, np.int32)], points)
 
@@ -390,21 +397,48 @@ def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
     )
 
 
-def _placed(body: BodyModel, finder: "_Finder", place: LandmarkDefinition) -> SurfacePoints:
+class _Beside(NamedTuple):
+    """Where a landmark is that has a place."""
+
+    sources: tuple[int, ...]
+    """Vertices, and joints j as -1 - j, whose mean the place starts from."""
+    joints: tuple[int, ...]
+    """Joints that carry the place; none: those that carry its sources."""
+    offset: tuple[float, float, float]
+    """From the mean to the place, in the axes of the body at rest, metres."""
+
+
+def _placed(body: BodyModel, place: _Beside) -> SurfacePoints:
     """Makes a point beside the sources of a landmark: it grows with them, and turns with the joints
     of the place.
     """
-    every, sources = surface_points(body), finder.find(place.base)
+    every = surface_points(body)
     points = [
         _rows(every, [source]) if source >= 0 else _joint_point(body, -1 - source)
-        for source in sources
+        for source in place.sources
     ]
     mean = jax.tree.map(lambda leaf: leaf.mean(axis=0, keepdims=True), _concatenated(points))
     weights = mean.weights
     if place.joints:
-        carriers = np.asarray([finder.index[joint] for joint in place.joints])
+        carriers = np.asarray(place.joints)
         weights = jnp.zeros_like(weights).at[0, carriers].set(1 / len(carriers))
     return replace(mean, rest=mean.rest + jnp.asarray(place.offset, jnp.float32), weights=weights)
+
+
+@functools.partial(jax.jit, static_argnames=("vertices", "places"))
+def _on_the_body(
+    body: BodyModel, vertices: tuple[int, ...], places: tuple[_Beside, ...]
+) -> tuple[Float[Array, "j 3"], Float[Array, "j 3 s"], SurfacePoints]:
+    """Returns the joints at rest, their shape directions, and the points of these vertices and
+    places. One program: eager, it would be dozens, each of some numbers.
+    """
+    points = [_rows(surface_points(body), vertices)]
+    points += [_placed(body, place) for place in places]
+    return (
+        _regressed(body, body.template),
+        _regressed(body, body.shape_directions),
+        _concatenated(points),
+    )
 
 
 def _concatenated(points: Sequence[SurfacePoints]) -> SurfacePoints:

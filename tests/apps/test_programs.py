@@ -9,7 +9,7 @@ import pytest
 from experiments.first_run import write_photos
 from humangs_jax.core.processes import spare_cores
 
-MOST = {"demo": 48, "animate": 8, "start": 200}
+MOST = {"demo": 48, "animate": 8, "start": 100}
 """By command: about a quarter more than there were when this was written."""
 AHEAD = {"jit(fit_frames)", "jit(solve_round)", "jit(_reconstruct)"}
 """Programs of `start` that take longest, which threads compile while other work is done, where a
