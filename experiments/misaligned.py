@@ -7,7 +7,7 @@ from unittest import mock
 import numpy as np
 
 from experiments.harness import Run, entry
-from experiments.results import markdown_table
+from experiments.results import cells, markdown_table
 from experiments.subjects import (
     RING,
     HeldOut,
@@ -21,6 +21,7 @@ from experiments.subjects import (
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.capture import Capture
 from humangs_jax.evaluation.cases import predict_views
+from humangs_jax.evaluation.means import mean_scores
 from humangs_jax.refinement import search
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
@@ -36,8 +37,8 @@ SMALL = 0.02
 """Radians of the first movement whose size in centimetres is measured."""
 NEVER = float("inf")
 """For `search.STILL`: no photo is moved."""
-SHOWN = {"psnr": 2, "psnr_fg": 2, "lpips": 3}
-"""Scores of the table, and their digits."""
+SHOWN = {"psnr": ("PSNR", 2), "psnr_fg": ("foreground PSNR", 2), "lpips": ("LPIPS", 3)}
+"""Scores of the table: heading and digits. LPIPS is missing where its weights are not installed."""
 
 
 @entry
@@ -133,9 +134,9 @@ def misaligned_section(rows: dict[str, Any], centimetres: tuple[float, ...]) -> 
     for far in centimetres:
         people = [row for name, row in rows.items() if name.split()[1] == f"{far:g}"]
         for way in people[0]:
-            means = [f"{np.mean([row[way][k] for row in people]):.{d}f}" for k, d in SHOWN.items()]
+            means = cells(mean_scores(row[way] for row in people), SHOWN)
             gains = [row[way]["psnr"] - row["none"]["psnr"] for row in people]
             least = "" if way == "none" else f"{min(gains):.2f}"
             lines.append([f"{far:g} cm", len(people), way, *means, least])
-    names = ["PSNR", "foreground PSNR", "LPIPS", "least gain, dB"]
+    names = [*(heading for heading, _ in SHOWN.values()), "least gain, dB"]
     return markdown_table(["off by", "people", "refinement", *names], lines, "lrlrrrr")
