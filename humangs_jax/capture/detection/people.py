@@ -1,23 +1,24 @@
-"""All people of a photo, small ones too, whichever way up the photo is, by BlazePose
-(https://arxiv.org/abs/2006.10204).
+"""Finds all people of a photo with BlazePose (https://arxiv.org/abs/2006.10204): small people too,
+and whichever way up the photo is.
 
-Its result: 33 landmarks of a person, metric 3D landmarks, a mask.
+The result for each person is 33 landmarks in the image, 33 landmarks in metres, and a mask.
 
-Two networks, run by LiteRT. The detector looks at a square window of the photo and finds, for each
+LiteRT runs two networks. The detector looks at a square window of the photo and finds, for each
 person, the middle of the hips and a point whose distance from it is the size of the body. The
-landmark network looks at the square around them, turned so that the person stands upright. Pre- and
-postprocessing are mediapipe's for its pose graph, in numpy: bilinear samples from the crop's
-corner, no antialiasing. The networks depend on both.
+landmark network looks at the square around the person, turned so that the person stands upright.
+Pre- and postprocessing are those of mediapipe's pose graph, in numpy: samples are bilinear, begin
+at the crop's corner, and have no antialiasing. The networks depend on both.
 
-Pixels of the networks are mediapipe's: (x, y), the centre of the first at 0. `apps.detect` adds our
-half pixel.
+Pixels of the networks are mediapipe's: (x, y), with the centre of the first pixel at 0.
+`apps.detect` adds half a pixel for our convention.
 
-The detector finds people from a third of its window's side on, so it looks at the whole photo and
-at windows of a half of its longer side that overlap by half, and, where nobody in these is large,
-of a quarter. What several windows find is one person if the landmarks agree.
+The detector finds people that are at least a third of its window's side. So it looks at the whole
+photo and at windows of half the photo's longer side, which overlap by half. Where these show nobody
+large, it also looks at windows of a quarter. Detections in several windows are one person if their
+landmarks agree.
 
-Of people who stand close together the detector finds some. So these are painted over with the
-colors around them, and it looks again, until it finds nobody more: see `find_people`.
+Of people who stand close together the detector finds only some. So the people it found are painted
+over with the colors around them, and it looks again, until it finds nobody more: see `find_people`.
 """
 
 import contextlib
@@ -37,29 +38,35 @@ from humangs_jax.capture.detection.painting import painted_over
 from humangs_jax.core.array_types import Bool, Float
 
 _DETECTOR = "pose_detection.tflite"
-"""File of the detector in `assets/blazepose`."""
+"""File name of the detector in `assets/blazepose`."""
 LANDMARKS = "pose_landmark_heavy.tflite"
-"""File of the landmark network. The lite and full ones exchange left and right often, heavy hardly
-ever.
+"""File name of the landmark network. There are smaller ones, lite and full, but they often exchange
+left and right; heavy hardly ever does.
 """
 _DETECTOR_SIZE = 224
-"""Pixels a side of the detector's input."""
+"""Side of the detector's input, pixels."""
 LANDMARK_SIZE = 256
-"""Pixels a side of the landmark network's input."""
+"""Side of the landmark network's input, pixels."""
 _LANDMARK_COUNT = 33
-"""Landmarks of a person."""
+"""Number of landmarks of a person."""
 _ALIGNMENT = 6
-"""The landmark network's further points; the first two are the detector's, found again."""
+"""Number of further points that the landmark network finds. The first two are the points of the
+detector, found again.
+"""
 ENLARGED = 1.25
-"""Side of the crop over the diameter of the circle through the detector's second point."""
+"""Side of the crop over the diameter of the circle around the hips through the detector's second
+point.
+"""
 _PEAK = 0.5
-"""Least height of the heatmap around a landmark that is moved to the centroid."""
+"""Least peak of a landmark's heatmap. Where the heatmap around a landmark is this high, the
+landmark moves to its centroid.
+"""
 WINDOW = 7
-"""Side of the window of the centroid, pixels of the heatmap."""
+"""Side of the window in which the centroid of a heatmap is computed, pixels of the heatmap."""
 
 
 class Crop(NamedTuple):
-    """A square of the photo."""
+    """A square of the photo, which may be turned."""
 
     center: Float[np.ndarray, "2"]
     """Middle of the square, (2,), pixels."""
@@ -70,16 +77,18 @@ class Crop(NamedTuple):
 
     @property
     def turn(self) -> Float[np.ndarray, "2 2"]:
-        """The rotation from the crop's axes to those of the photo."""
+        """The rotation from the crop's axes to those of the photo, (2, 2)."""
         c, s = np.cos(self.angle), np.sin(self.angle)
         return np.asarray([[c, -s], [s, c]])
 
     def to_photo(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Points of the crop, in [0, 1], in pixels of the photo."""
+        """Converts points of the crop, (..., 2), in [0, 1], to pixels of the photo."""
         return self.center + (points - 0.5) * self.side @ self.turn.T
 
     def from_photo(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Pixels of the photo in the crop, which is [0, 1] x [0, 1]."""
+        """Converts pixels of the photo, (..., 2), to points of the crop, which is [0, 1] x [0,
+        1].
+        """
         return (pixels - self.center) @ self.turn / self.side + 0.5
 
 
@@ -94,7 +103,7 @@ class Detection(NamedTuple):
     """Point whose distance from the hips is the body's size, (2,), pixels."""
 
     def crop(self) -> Crop:
-        """The square that the landmark network looks at."""
+        """Returns the square that the landmark network looks at."""
         x, y = self.head - self.hips
         return Crop(
             self.hips, 2 * ENLARGED * float(np.hypot(x, y)), float(np.pi / 2 - np.arctan2(-y, x))
@@ -109,19 +118,20 @@ class Landmarks(NamedTuple):
     visibility: Float[np.ndarray, " 33"]
     """Probability that a landmark is seen and not hidden, (33,)."""
     world: Float[np.ndarray, "33 3"]
-    """Landmarks from the middle of the hips in the camera's axes (x right, y down, z away), of a
-    person of average size, (33, 3), metres.
+    """Landmarks relative to the middle of the hips, (33, 3), metres. Axes are the camera's (x
+    right, y down, z away), and the person is taken to be of average size.
     """
     presence: float
-    """Probability of a person."""
+    """Probability that the crop shows a person."""
     mask: Float[np.ndarray, "256 256"]
-    """Probability of the person in the crop, (256, 256)."""
+    """Probability that a pixel of the crop shows the person, (256, 256)."""
     crop: Crop
-    """The crop."""
+    """The square of the photo that the network looked at."""
     again: Detection
-    """The detector's points, found again by the landmark network."""
+    """The points of the detector, as the landmark network finds them again."""
     covered: bool = False
-    """Whether somebody else was painted over before this person was found, and may stand in front.
+    """Whether other people were painted over before this person was found. They may stand in front
+    of this person.
     """
 
 
@@ -131,9 +141,9 @@ def available() -> bool:
 
 
 def load_networks(folder: str, names: Sequence[str]) -> list[Any]:
-    """LiteRT's interpreters of the networks in a folder of `assets`.
+    """Loads networks from a folder of `assets`, and returns a LiteRT interpreter for each name.
 
-    Raises: ImportError, saying what to install, without LiteRT.
+    Raises: ImportError if LiteRT is missing. It says what to install.
     """
     try:
         with _silent():
@@ -156,8 +166,8 @@ def load_networks(folder: str, names: Sequence[str]) -> list[Any]:
 
 
 def outputs_of(network: Any, values: Float[np.ndarray, "..."]) -> dict[str, np.ndarray]:
-    """The outputs of a network for one input, by name, without the axis of a batch where they have
-    one.
+    """Runs a network on one input, and returns its outputs by name. Outputs with several axes come
+    without their batch axis.
     """
     network.set_tensor(network.get_input_details()[0]["index"], values[None].astype(np.float32))
     network.invoke()
@@ -169,7 +179,10 @@ def outputs_of(network: Any, values: Float[np.ndarray, "..."]) -> dict[str, np.n
 
 
 class Networks:
-    """The two networks. Raises: ImportError, saying what to install, without LiteRT."""
+    """The two networks of BlazePose.
+
+    Raises: ImportError if LiteRT is missing. It says what to install.
+    """
 
     def __init__(self) -> None:
         self._runs = load_networks("blazepose", (_DETECTOR, LANDMARKS))
@@ -178,9 +191,10 @@ class Networks:
         return outputs_of(self._runs[which], image)
 
     def detect(self, photo: Float[np.ndarray, "h w 3"], window: Crop) -> list[Detection]:
-        """People in an upright window of a photo with values in [0, 1]; black around it.
+        """Finds the people in an upright window of a photo, and returns them with the best score
+        first.
 
-        The best first.
+        photo: values in [0, 1]. Beyond the photo the window is black.
         """
         outputs = self._run(0, 2 * sampled(photo, window, _DETECTOR_SIZE, outside=0.0) - 1)
         scores, raw = _sigmoid(outputs["Identity_1"][:, 0]), outputs["Identity"]
@@ -193,7 +207,7 @@ class Networks:
         ]
 
     def landmarks(self, photo: Float[np.ndarray, "h w 3"], crop: Crop) -> Landmarks:
-        """Landmarks of the person in a crop of a photo with values in [0, 1]."""
+        """Returns the landmarks of the person in a crop. photo: values in [0, 1]."""
         outputs = self._run(1, sampled(photo, crop, LANDMARK_SIZE))
         raw = outputs["Identity"].reshape(_LANDMARK_COUNT + _ALIGNMENT, 5).astype(np.float64)
         points = refined(raw[:, :2] / LANDMARK_SIZE, _sigmoid(outputs["Identity_3"]))
@@ -215,8 +229,8 @@ class Networks:
 def sampled(
     photo: Float[np.ndarray, "h w 3"], crop: Crop, size: int, outside: float | None = None
 ) -> Float[np.ndarray, "size size 3"]:
-    """Samples a crop of the photo, bilinear. outside: value beyond the photo; None: the value at
-    its edge.
+    """Samples a crop of the photo bilinearly at (size, size) points. outside: value beyond the
+    photo. None: the value at the photo's edge.
     """
     steps = np.arange(size) / size
     points = crop.to_photo(np.stack(np.meshgrid(steps, steps), axis=-1))
@@ -228,8 +242,8 @@ def bilinear(
     points: Float[np.ndarray, "a b 2"],
     outside: float | None = None,
 ) -> Float[np.ndarray, "a b *c"]:
-    """Interpolates an image at points (x, y); whole numbers are the middles of pixels. outside:
-    value beyond the image; None: the value at its edge.
+    """Interpolates an image at points (x, y), where whole numbers are the middles of pixels.
+    outside: value beyond the image. None: the value at the image's edge.
     """
     height, width = image.shape[:2]
     x, y = points[..., 0], points[..., 1]
@@ -251,7 +265,9 @@ def bilinear(
 def refined(
     points: Float[np.ndarray, "n 2"], heatmaps: Float[np.ndarray, "m m n"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Points in [0, 1], moved to the centroid of the heatmap around them where it has a peak."""
+    """Moves points in [0, 1], (n, 2), to the centroid of the heatmap around them. Points whose
+    heatmap has no peak there stay.
+    """
     size, half, moved = len(heatmaps), WINDOW // 2, points.copy()
     for i, (column, row) in enumerate(np.trunc(points * size).astype(int)):
         if not (0 <= column < size and 0 <= row < size):
@@ -267,12 +283,16 @@ def refined(
 
 
 def mask_at(found: Landmarks, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """The mask of a crop at pixels of the photo; 0 outside of the crop."""
+    """Returns the mask of a crop at pixels of the photo, (n,), 0 to 1. It is 0 outside of the
+    crop.
+    """
     return bilinear(found.mask, found.crop.from_photo(pixels)[None] * LANDMARK_SIZE, outside=0.0)[0]
 
 
 def mask_in_photo(found: Landmarks, width: int, height: int) -> Float[np.ndarray, "height width"]:
-    """The mask of a crop at the size of the photo; 0 outside of the crop."""
+    """Returns the mask of a crop at the size of the photo, (height, width), 0 to 1. It is 0 outside
+    of the crop.
+    """
     mask = np.zeros((height, width), np.float32)
     window = mask_window(found, width, height)
     mask[window] = mask_in_window(found, window)
@@ -280,7 +300,7 @@ def mask_in_photo(found: Landmarks, width: int, height: int) -> Float[np.ndarray
 
 
 Window = tuple[slice, slice]
-"""Rows and columns of a photo."""
+"""A part of a photo: its rows and columns."""
 
 
 def mask_window(found: Landmarks, width: int, height: int, margin: int = 0) -> Window:
@@ -296,7 +316,9 @@ def mask_window(found: Landmarks, width: int, height: int, margin: int = 0) -> W
 
 
 def mask_in_window(found: Landmarks, window: Window) -> Float[np.ndarray, "h w"]:
-    """The mask of a crop at the pixels of a part of the photo; 0 outside of the crop."""
+    """Returns the mask of a crop at the pixels of a part of the photo, (h, w), 0 to 1. It is 0
+    outside of the crop.
+    """
     from PIL import Image
 
     rows, columns = window
@@ -333,7 +355,10 @@ def _anchors() -> Float[np.ndarray, "a 2"]:
 def _merged(
     scores: Float[np.ndarray, " n"], boxes: Float[np.ndarray, "n 12"]
 ) -> list[tuple[float, np.ndarray]]:
-    """Weighted non-maximum suppression: what overlaps the best is averaged by score."""
+    """Merges detections of one window that are the same person (weighted non-maximum suppression).
+    Detections that overlap with the best one are averaged, weighted by score. Returns the best
+    score and the mean box, (12,), of each person, best first.
+    """
     left, merged = np.argsort(-scores), []
     while len(left):
         # detections of one window that overlap by more are one person
@@ -384,32 +409,40 @@ def _silent() -> Generator[None]:
 
 @dataclasses.dataclass(frozen=True)
 class _SearchConfig:
-    """How people are looked for in a photo."""
+    """Constants by which people are looked for in a photo."""
 
     shares: tuple[float, float] = (1.0, 0.5)
-    """Sides of the windows over the photo's longer side."""
+    """Sides of the windows that are always looked at, shares of the photo's longer side."""
     small_shares: tuple[float, ...] = (0.25,)
-    """Sides of further windows where nobody is large; these are most of all windows."""
+    """Sides of the further windows where nobody is large, shares of the photo's longer side. Most
+    windows are of this kind.
+    """
     large: float = 0.4
-    """Side of a large person's crop over the photo's longer side. Windows of a half find people
-    from a sixth of it on, whose crops are a fifth: whoever needs smaller windows has at most a
-    quarter of the pixels of a person with a crop of two fifths, and is not the one who is meant."""
+    """Side of a large person's crop, share of the photo's longer side. Windows of a half find
+    people from a sixth of the photo's longer side on, whose crops are a fifth of it. So a person
+    who needs smaller windows has at most a quarter of the pixels of a person with a crop of two
+    fifths, and is not the main person of the photo.
+    """
     smallest: float = 0.06
-    """Side of a crop over the photo's longer side below which the person is somebody in the
-    background, or nobody."""
+    """Least side of a crop, share of the photo's longer side. Smaller ones are people in the
+    background, or nobody.
+    """
     most_crops: int = 16
-    """Crops that the landmark network looks at, best detections first."""
+    """Most crops that the landmark network looks at. The best detections come first."""
     same_hips: float = 0.15
-    """Two detections are one person if their hips are nearer than this share of the larger crop."""
+    """Two detections are one person if their hips are nearer than this share of the larger crop's
+    side.
+    """
     same_size: float = 1.6
-    """Factor by which the sides of the crops of one person differ, at most."""
+    """Largest ratio of the sides of two crops that are one person."""
     most_looks: int = 4
-    """Looks of the landmark network at a person, at most."""
+    """Most looks of the landmark network at one person."""
     settled: float = 0.05
-    """Drift of the crop (see `_settled`) below which it has found the person."""
+    """Drift of the crop below which the crop has found the person, see `_settled`."""
     larger: float = 1.25
-    """Side of the second crop over the first, at the most: the mask has 256 pixels a side, whatever
-    the side."""
+    """Largest ratio of the side of the next crop to that of the one before. A larger crop makes the
+    mask coarser, because the mask always has 256 pixels a side.
+    """
 
 
 SEARCH = _SearchConfig()
@@ -417,42 +450,48 @@ SEARCH = _SearchConfig()
 
 @dataclasses.dataclass(frozen=True)
 class _Believed:
-    """When what the landmark network sees is a person."""
+    """Limits from which on a find of the landmark network counts as a person.
+
+    Measured on 8 photos of a laboratory with 2 to 3 people each. False finds there are legs, lamps
+    and chairs that the detector takes for people.
+    """
 
     presence: float = 0.95
-    """Least presence of a person. Measured on 8 photos of a laboratory with 2 to 3 people each:
-    legs, lamps and chairs that the detector takes for people have 0.69 to 0.88, people 0.999 at the
-    worst."""
+    """Least presence of a person. False finds had 0.69 to 0.88, people 0.999 at the worst."""
     on_mask: float = 0.8
-    """Least share of the landmarks in the photo that lie on the mask: there 0.33 to 0.76, people
-    0.94."""
+    """Least share of the landmarks in the photo that lie on the mask. False finds had 0.33 to 0.76,
+    people 0.94.
+    """
     on_rest: float = 0.6
-    """`on_mask` for a person who is partly painted over, whose mask then has holes."""
+    """Least share like `on_mask`, for photos with people painted over, where masks have holes."""
     shared: float = 0.5
-    """Largest share of the smaller mask that two people both have: there 0.77 to 0.94, people
-    0.02."""
+    """Largest share of one person's mask that another person's mask may cover. False finds had 0.77
+    to 0.94, people 0.02.
+    """
     size: float = 0.4
-    """Side of the crop of a person who was found by painting over, of the largest one's, at least.
-    Smaller ones, in photos of two to six people, were what is left of a person whose mask ends too
-    early."""
+    """Least side of the crop of a person who was found after painting over others, as a share of
+    the largest person's. Smaller ones, in photos of two to six people, were the remains of a person
+    whose mask ends too early.
+    """
 
 
 BELIEVED = _Believed()
 
 
 MARGINS = (1 / 150, 1 / 100)
-"""How far what is painted reaches beyond a mask, shares of the longest side; the second is tried
-where the first shows nobody. Too little leaves a rim that looks like a person, too much hides who
-stands behind.
+"""How far painting reaches beyond a mask, shares of the longest side. The second is tried where the
+first shows nobody more. Too little leaves a rim that looks like a person, and too much hides people
+who stand behind.
 """
 SEEN = 0.5
-"""Probability from which on a pixel of a mask is a person's."""
+"""Least probability at which a pixel of a mask belongs to the person."""
 
 
 def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[Landmarks]:
-    """Returns the people of a photo with values in [0, 1], the largest first.
+    """Returns the people of a photo, the largest first. photo: values in [0, 1].
 
-    Who was found is painted over, and the photo is looked at again, until there is nobody more.
+    People who were found are painted over, and the detector looks at the photo again, until it
+    finds nobody more.
     """
     longest = max(photo.shape[:2])
     detections = window_detections(networks, photo, SEARCH.shares)
@@ -523,10 +562,10 @@ def _people(
     detections: list[Detection],
     covered: Bool[np.ndarray, "h w"] | None = None,
 ) -> list[Landmarks]:
-    """The landmarks of those detections that are people, the largest first.
+    """Returns the landmarks of the detections that are people, the largest first.
 
-    covered: where the photo was painted over; landmarks there say nothing about the mask, and not
-    more than half may be there.
+    covered: where the photo was painted over, (h, w). Landmarks there do not count when landmarks
+    are compared with the mask. A person with more than half of the landmarks there is discarded.
     """
     height, width = photo.shape[:2]
     found = []
@@ -555,8 +594,8 @@ def _people(
 def _settled(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], crop: Crop
 ) -> tuple[Landmarks, float]:
-    """Returns the landmarks of a person and how far they would still move the crop, a share of its
-    side.
+    """Follows a person with the landmark network. Returns the landmarks, and how far they would
+    still move the crop, as a share of the crop's side.
 
     The crop is moved to what was found, and the network looks again, until the crop hardly moves.
     It looks at a person at least twice: the landmark network knows hips and size better than the
@@ -577,8 +616,8 @@ def _settled(
 def window_detections(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], shares: Sequence[float]
 ) -> list[Detection]:
-    """What the detector finds in the windows whose sides are these shares of the photo's longer
-    side.
+    """Returns what the detector finds in all windows. shares: sides of the windows over the longer
+    side of the photo.
     """
     height, width = photo.shape[:2]
     return [
@@ -603,8 +642,11 @@ def windows(
 
 
 def _starts(size: int, side: float) -> Float[np.ndarray, " n"]:
-    """Returns where windows of a side begin along a photo, both in pixels. One window lies in the
-    middle if it covers the photo. Otherwise windows are spread evenly and overlap by half or more.
+    """Returns where windows begin along one side of a photo, (n,), pixels. size: length of the
+    photo's side, pixels. side: side of the windows, pixels.
+
+    One window lies in the middle if it covers the photo. Otherwise windows are spread evenly and
+    overlap by half or more.
     """
     if size <= side:
         return np.asarray([(size - side) / 2])
@@ -613,7 +655,9 @@ def _starts(size: int, side: float) -> Float[np.ndarray, " n"]:
 
 
 def distinct(detections: list[Detection], longest: int) -> list[Detection]:
-    """Keeps one detection of each person. The detections come with the best first."""
+    """Keeps one detection of each person. detections: the best first. longest: longer side of the
+    photo, pixels. Detections smaller than `SEARCH.smallest` are left out.
+    """
     kept: list[Detection] = []
     for detection in detections:
         side = detection.crop().side
@@ -635,8 +679,9 @@ def _same_detection(a: Detection, b: Detection) -> bool:
 def _on_mask(
     person: Landmarks, width: int, height: int, covered: Bool[np.ndarray, "h w"] | None = None
 ) -> float:
-    """The share of the landmarks in the photo that lie on the mask; 0 if none lies in the photo,
-    or most where it is covered.
+    """Returns the share of the landmarks in the photo that lie on the person's mask. Landmarks
+    where the photo is covered do not count. 0 if no landmark is left, or if more than half of them
+    are covered.
     """
     points = person.pixels[_inside(person.pixels, width, height)]
     if covered is not None:
@@ -649,12 +694,14 @@ def _on_mask(
 
 
 def _shared(person: Landmarks, other: Landmarks, width: int, height: int) -> float:
-    """Returns the share of a person's mask that another person's covers too."""
+    """Returns the share of a person's mask that another person's mask covers too. width and height:
+    size of the photo, pixels.
+    """
     own = person.crop.to_photo(np.argwhere(person.mask > SEEN)[:, ::-1] / LANDMARK_SIZE)
     own = own[_inside(own, width, height)]
     return float(np.mean(mask_at(other, own) > SEEN)) if len(own) else 0.0
 
 
 def _inside(pixels: Float[np.ndarray, "n 2"], width: int, height: int) -> Bool[np.ndarray, " n"]:
-    """Returns which pixels lie in the photo."""
+    """Returns which pixels lie in the photo, (n,)."""
     return np.all((pixels > -0.5) & (pixels < np.asarray([width, height]) - 0.5), axis=-1)

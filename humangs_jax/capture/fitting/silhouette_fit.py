@@ -1,9 +1,9 @@
-"""Cameras, shape and poses refined against silhouettes and keypoints: kept only if the score is
-better.
+"""Refines cameras, shape and poses of a capture with its silhouettes and keypoints.
 
-As in iterated closest points, each iteration matches the rendered silhouette with the mask's and
-solves a few steps of damped least squares. `StateStd` is a Gaussian prior around the start: without
-it cameras and people could move together.
+Each iteration matches the rendered silhouette of the body with the edge of the mask, as iterated
+closest points do, and then solves a few steps of damped least squares. `StateStd` is a Gaussian
+prior around the start: without it, cameras and people could move together. The result is kept only
+if its score is better than that of the start.
 """
 
 import dataclasses
@@ -72,35 +72,39 @@ from humangs_jax.geometry.camera import Camera
 
 @dataclasses.dataclass(frozen=True)
 class CaptureRefineConfig:
-    """Static settings of a refinement."""
+    """Settings of a refinement."""
 
     std: StateStd = dataclasses.field(default_factory=StateStd)
-    """How far off the start is expected to be."""
+    """Standard deviations of what the start may be off by."""
     coefficients: int = 10
     """Least number of shape coefficients; a capture with fewer gets more."""
     fixed_cameras: bool = False
-    """Whether only shape and poses move."""
+    """Whether the cameras stay as they are, so that only shape and poses move."""
     iterations: int = 10
-    """Number of matchings."""
+    """Number of times that the silhouettes of the body are matched with the masks."""
     longest_side: int = 512
-    """Pixels to which larger photos are shrunk."""
+    """Longest side of the photos that the refinement works on, pixels. Larger photos are shrunk."""
     points: int = 300
-    """Points of a silhouette."""
+    """Number of points on the silhouette of the body in a view."""
     reach: tuple[float, float] = (0.08, 0.015)
-    """How far these look for the mask in the first and the last matching, shares of the person's
-    height in the image.
+    """How far the points of the body look for the edge of the mask, in the first and in the last
+    matching. Both are shares of the person's height in the image.
     """
     independent: float = 30.0
-    """Number of independent equations that all points of a view count for."""
+    """Number of independent equations that all points of a view together count as."""
     robust_scales: tuple[float, float] = (1.0, 0.5)
-    """Robust scales outwards and inwards of the mask, multiples of the reach."""
+    """Robust scales for points of the body outside and inside of the mask, multiples of the
+    reach.
+    """
     keypoints_worse: float = 1.3
-    """A result whose keypoint error is more than this multiple of the start's is not kept. A fit to
-    the keypoints made that error small: right results have 0.8 to 1.07 of it, wrong bodies that
-    fill clothes 1.8.
+    """A result is discarded if its keypoint error is more than this multiple of the start's. The
+    start was fitted to the keypoints, which made its error small: right results have 0.8 to 1.07 of
+    it, wrong bodies that fill clothes 1.8.
     """
     by_joint: tuple[tuple[str, float], ...] = ()
-    """(word, factor): multiples of `std.body_pose` for joints whose names hold the word."""
+    """Pairs (word, factor). A joint whose name holds the word gets `std.body_pose` times the
+    factor.
+    """
 
 
 def usual_config(
@@ -111,9 +115,14 @@ def usual_config(
     tight: bool = False,
     calibrated: bool = True,
 ) -> CaptureRefineConfig:
-    """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given.
-    bare: the body is to fill the masks. tight: the person wears tight clothes. calibrated: False
-    for cameras that were found from the person.
+    """Returns the settings that suit what is known about the start.
+
+    Args:
+        fitted: whether the start is a fit to the keypoints that the refinement gets.
+        fixed_cameras: whether the cameras stay as they are.
+        bare: whether the body itself is to fill the masks, without clothes.
+        tight: whether the person wears tight clothes.
+        calibrated: False for cameras that were found from the person.
     """
     std, config = StateStd(), CaptureRefineConfig(fixed_cameras=fixed_cameras)
     if fitted:
@@ -138,8 +147,8 @@ def usual_config(
 
 
 def cameras_are_unseen(capture: Capture) -> bool:
-    """Whether nothing tells how cameras should move: they were found from the person, and no two
-    photos show one pose.
+    """Returns whether nothing in the capture determines how its cameras should move. This is so
+    where they were found from the person and no two photos show the same pose.
     """
     return not capture.calibrated and capture.frame_count >= capture.view_count
 
@@ -149,7 +158,10 @@ def cameras_are_unseen(capture: Capture) -> bool:
 
 
 def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfig) -> Origin:
-    """The origin of a refinement. cameras: of the views, for images of any size."""
+    """Returns the origin of a refinement: the start, from which the state counts its changes.
+
+    cameras: one camera for each view. Its images may have any size.
+    """
     body = capture.body
     named = [j for j, name in enumerate(body.joint_names) if name in BODY_NAMES]
     joints = tuple(j for j in named or range(len(body.parents)) if body.parents[j] >= 0)
@@ -167,7 +179,9 @@ def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfi
 
 
 def _body_pose_std(names: Sequence[str], config: CaptureRefineConfig) -> Float[Array, "a 3"]:
-    """Standard deviations of the free joints' rotations, radians."""
+    """Returns the standard deviations of the free joints' rotations, (a, 3), radians. names: names
+    of these a joints.
+    """
     factors = [
         next((factor for word, factor in config.by_joint if word in name), 1.0) for name in names
     ]
@@ -176,14 +190,16 @@ def _body_pose_std(names: Sequence[str], config: CaptureRefineConfig) -> Float[A
 
 
 def start_state(origin: Origin, config: CaptureRefineConfig) -> FitState:
-    """Zeros for what a refinement moves."""
+    """Returns a state of zeros for all that a refinement moves."""
     state = zero_state(origin)
     return replace(state, cameras=None) if config.fixed_cameras else state
 
 
 def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
-    """A capture with cameras, shape and poses of a state, whatever the size of the origin's images;
-    its displacement belonged to the shape before, and is left out.
+    """Returns the capture with the cameras, shape and poses of a state.
+
+    The images of the origin may have another size than those of the capture. The result has no
+    displacement, because that was made for the shape before.
     """
     own = replace(origin, cameras=replace(origin.views, K=capture.cameras.K))
     (K, cam_from_world), betas, poses = _moved(own, state)
@@ -206,25 +222,25 @@ def _moved(
 
 @pytree_dataclass
 class Evidence:
-    """What v views show."""
+    """What v views show in one matching: points, their matches, and keypoints."""
 
     points: SurfacePoints
-    """Points of the body's silhouettes, a batch of v."""
+    """Points on the silhouettes of the body, a batch of v."""
     matches: silhouettes.Matches
-    """Equations of these points, a batch of v."""
+    """Equations that match these points with the masks, a batch of v."""
     noise: Float[Array, ""]
-    """Standard deviation of silhouettes, (), pixels."""
+    """Standard deviation of the silhouettes, (), pixels."""
     scales: Float[Array, "2"]
     """Robust scales outwards and inwards, (2,), pixels."""
     keypoints: Observations | None
-    """Keypoints, a batch of v with one view each (c = 1); None without."""
+    """Keypoints as a batch of v with one view each (c = 1). None if there are no keypoints."""
 
 
 def _evidence_residuals(
     model: LandmarkModel, origin: Origin, state: FitState, evidence: Evidence, independent: float
 ) -> dict[str, Float[Array, "..."]]:
-    """Residuals of the views, in standard deviations, by kind: silhouettes (v, e) and keypoints (v,
-    1, k, 2).
+    """Returns the residuals of the views by kind, in standard deviations: "silhouettes", (v, e),
+    and "keypoints", (v, 1, k, 2). Without keypoints the second is missing.
     """
     # all frames of the state, whose poses the views share
     K, cam_from_world = cameras_of(origin, state)
@@ -234,7 +250,7 @@ def _evidence_residuals(
 
     # silhouettes of each view: the points of the body's rim, out by the thickness of clothes
     def silhouette_errors(points, matches, frame, K, matrix):
-        """Residuals of a view, (e,)."""
+        """Returns the residuals of a view, (e,)."""
         posed = pose_points(points, betas, features[frame], transforms[frame])
         seen = jnp.matmul(posed, matrix[:3, :3].T, precision=EXACT) + matrix[:3, 3]
         focal, depth = jnp.stack([K[0, 0], K[1, 1]]), jnp.maximum(seen[:, 2:], NEAR)
@@ -252,12 +268,14 @@ def _evidence_residuals(
 
     # keypoints of each view alone, under the camera of the state
     def landmarks(features, transforms, joints):
-        """Landmarks of a frame, (k, 3), metres."""
+        """Returns the landmarks of a frame, (k, 3), metres."""
         points = pose_points(model.points, betas, features, transforms)
         return landmarks_from(model, joints, points)
 
     def keypoint_errors(seen, points):
-        """Residuals of a view; those beyond five standard deviations pull less and less."""
+        """Returns the residuals of a view. Residuals beyond five standard deviations pull less and
+        less.
+        """
         return keypoint_residuals(model, seen, points, 5.0)
 
     seen = replace(evidence.keypoints, K=K[:, None], cam_from_world=cam_from_world[:, None])
@@ -267,15 +285,15 @@ def _evidence_residuals(
 
 
 def _counted(clothing: Float[Array, " b"]) -> Float[Array, " b"]:
-    """Thicknesses of clothes as their prior counts them. A negative one counts five times, because
-    clothes have none.
+    """Returns the thicknesses of clothes as their prior counts them, (b,). A negative thickness
+    counts five times, because clothes have none.
     """
     return jnp.where(clothing < 0, 5.0 * clothing, clothing)
 
 
 def _as_motion(values: Float[Array, "m ..."], memory: Float[Array, " n"]) -> Float[Array, "m ..."]:
-    """Numbers of m frames, independent and of unit variance where each of the frames has the
-    correlation `memory` (m - 1,) with the one before.
+    """Turns m frames' numbers into independent ones of unit variance. memory: (m - 1,) correlations
+    of each frame with the one before.
     """
     r = memory.reshape(-1, *[1] * (values.ndim - 1))
     return jnp.concatenate([values[:1], (values[1:] - r * values[:-1]) / jnp.sqrt(1 - r * r)])
@@ -290,8 +308,8 @@ def solve_round(
     independent: float,
     memory: Float[Array, " n"] | None = None,
 ) -> FitState:
-    """The state after some steps with fixed matches. memory: (m - 1,) correlations of m poses, see
-    `refine_capture`.
+    """Returns the state after some steps of the solver with fixed matches. memory: (m - 1,)
+    correlations of m poses, see `refine_capture`.
     """
 
     def residuals(y):
@@ -315,57 +333,63 @@ def solve_round(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Score:
-    """How well the body of a capture agrees with its photos."""
+    """How well the body of a capture agrees with the masks and keypoints of its photos."""
 
     ious: Float[np.ndarray, " v"]
     """Intersection over union of body and mask in each view, (v,); NaN without a mask."""
     iou: float | None
-    """Mean of these; None without any mask."""
+    """Mean of `ious` over the views with a mask. None if no view has one."""
     keypoints: float | None
-    """Median error of the keypoints, pixels; None without any."""
+    """Median error of the keypoints, pixels. None without keypoints."""
     loss: float
-    """1 - iou plus the keypoints' error as a share of the person's height."""
+    """1 - iou plus the keypoints' error as a share of the person's height. Without masks or without
+    keypoints, that term is missing.
+    """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SilhouetteFit:
-    """What stays the same over the matchings of v photos: masks and keypoints at the size that is
-    looked at, and the origin of the state.
+    """What stays the same in all matchings of v photos: masks and keypoints at the reduced size
+    that the refinement works on, and the origin of the state.
     """
 
     capture: Capture
-    """The start: photos at their size, with the body."""
+    """The start: the body, and the photos at their full size."""
     config: CaptureRefineConfig
     """Settings."""
     memory: Float[Array, " n"] | None
-    """Correlations of each pose with the one before, (m - 1,); None: each stands for itself."""
+    """Correlations of each pose with the one before, (m - 1,). None: poses are independent."""
     cameras: Camera
-    """Cameras of the photos at the size that is looked at."""
+    """Cameras of the photos at the reduced size."""
     masks: Float[np.ndarray, "v h w"]
-    """Masks at that size, (v, h, w), 0 to 1; zeros without masks."""
+    """Masks at the reduced size, (v, h, w), 0 to 1. Zeros if the capture has no masks."""
     unknown: Bool[np.ndarray, "v h w"] | None
-    """Where masks say nothing, (v, h, w); None: they say something everywhere."""
+    """Pixels where the masks say nothing, (v, h, w). None: there are no such pixels."""
     hidden: list[Bool[np.ndarray, "h w"] | None]
-    """Where masks say nothing, and a rim around it: there the edge of the mask is that of whoever
-    stands in front. None for a view without such pixels."""
+    """For each view, the pixels where its mask says nothing and a rim around them, (h, w). In the
+    rim the edge of the mask is the edge of what stands in front. None for a view without such
+    pixels.
+    """
     faces: Int[np.ndarray, "f 3"]
-    """Faces of the body."""
+    """Faces of the body, (f, 3)."""
     edges: silhouettes.MeshEdges
-    """Edges of these faces."""
+    """Edges of the body's faces."""
     boundaries: list[silhouettes.Boundary]
-    """Boundaries of the masks, away from whoever stands in front."""
+    """Boundaries of the masks, without the parts where something stands in front."""
     model: LandmarkModel
-    """Landmarks of the keypoints on the body."""
+    """Places of the keypoints on the body."""
     keypoints: Observations | None
-    """Keypoints in pixels of the photos, which scores are in; None without any."""
+    """Keypoints in pixels of the photos at their full size, which scores are in. None without
+    keypoints.
+    """
     observations: Observations | None
-    """Keypoints in pixels of the size that is looked at; None without any."""
+    """Keypoints in pixels of the reduced size. None without keypoints."""
     scale: float
-    """Pixels of that size for one of the photos."""
+    """Pixels of the reduced size for one pixel of the photo."""
     height: float
-    """Height of the person, pixels of that size."""
+    """Height of the person in the image, pixels of the reduced size."""
     origin: Origin
-    """Where the zeros of the state are."""
+    """The start, from which the state counts its changes."""
 
     @classmethod
     def of(
@@ -414,8 +438,8 @@ class SilhouetteFit:
         )
 
     def run(self) -> tuple[FitState, float]:
-        """The state after all matchings, and the largest move of the last one, in expected standard
-        deviations.
+        """Returns the state after all matchings, and the largest change of the state in the last
+        one, in expected standard deviations.
         """
         config, state, move = self.config, start_state(self.origin, self.config), 0.0
         first, last = config.reach
@@ -452,7 +476,9 @@ class SilhouetteFit:
         yield silhouettes.coverage, (np.zeros(self.masks.shape[1:], np.float32), places)
 
     def _no_evidence(self) -> Evidence:
-        """Returns evidence that shows nothing, whose arrays have the shapes of all evidence."""
+        """Returns evidence that shows nothing. Its arrays have the shapes that all evidence of this
+        fit has.
+        """
         views, count = len(self.masks), self.config.points
         pixels, ends = np.zeros((2, 0, 2), np.float32), np.zeros((0, 2), int)
         nothing = silhouettes.Boundary(*pixels, ends, np.zeros(0, np.float32))
@@ -471,7 +497,7 @@ class SilhouetteFit:
         )
 
     def look(self, state: FitState, reach: float) -> Evidence:
-        """What the views show, matched within `reach` pixels of the body in this state."""
+        """Returns what the views show, matched within `reach` pixels of the body in this state."""
         count = self.config.points
         moved = moved_capture(self.capture, self.origin, state)
         boundaries = [
@@ -501,8 +527,8 @@ class SilhouetteFit:
         )
 
     def _keypoint_errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
-        """Distances of the body of a capture from the keypoints `seen`, pixels of the photos; NaN
-        where there is no keypoint.
+        """Returns the distances of a capture's body from the keypoints, (v, k), pixels of the
+        photos. NaN where there is no keypoint.
         """
         cameras = capture.cameras
         seen = replace(
@@ -518,7 +544,9 @@ class SilhouetteFit:
         return np.where(known, errors, np.nan)[:, 0]
 
     def body_views(self, capture: Capture) -> list[silhouettes.BodyView]:
-        """The body of a capture of these photos in every view."""
+        """Returns the body in every view. capture: the photos of this fit with any body and
+        cameras.
+        """
         cameras = capture.cameras.resized(self.cameras.width, self.cameras.height)
         vertices = posed_vertices(capture.body, from_host(capture.betas), capture.poses)
         faces = capture.body.faces
@@ -528,7 +556,9 @@ class SilhouetteFit:
         ]
 
     def score(self, capture: Capture) -> Score:
-        """How well the body of a capture of these photos agrees with masks and keypoints."""
+        """Returns how well a body agrees with masks and keypoints. capture: the photos of this fit
+        with any body and cameras.
+        """
         known = [None] * len(self.masks) if self.unknown is None else list(~self.unknown)
         pairs = zip(self.body_views(capture), self.masks, known, strict=True)
         ious = np.asarray([overlap(view.covered, mask, seen) for view, mask, seen in pairs])
@@ -546,8 +576,8 @@ class SilhouetteFit:
 def _with_rim(
     unknown: Bool[np.ndarray, "v h w"] | None, views: int
 ) -> list[Bool[np.ndarray, "h w"] | None]:
-    """The unknown pixels of each view, and a rim of three pixels around them. None for a view
-    without unknown pixels.
+    """Returns the unknown pixels of each view together with a rim of three pixels around them, (h,
+    w). None for a view without unknown pixels.
     """
     if unknown is None:
         return [None] * views
@@ -559,8 +589,8 @@ def overlap(
     mask: Float[np.ndarray, "h w"],
     known: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """Intersection over union of a body and a mask, over the pixels where the mask is known
-    (default: all). NaN if the mask is empty.
+    """Returns the intersection over union of a body and a mask. known: pixels that count (default:
+    all). NaN if the mask is empty.
     """
     person = mask > 0.5
     if known is not None:
@@ -574,7 +604,7 @@ def overlap(
 def posed_vertices(
     body: BodyModel, betas: Float[Array, " s"], poses: BodyPose
 ) -> Float[Array, "m n 3"]:
-    """Vertices of a person in a batch of m poses, metres."""
+    """Returns the vertices of a person in each of m poses, (m, n, 3), metres."""
     rest = shape_body(body, betas)
     return jax.lax.map(lambda pose: pose_body(body, rest, pose).vertices, poses)
 
@@ -582,7 +612,8 @@ def posed_vertices(
 def _noise(
     boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]
 ) -> float:
-    """How far the bodies are from their masks, pixels, at least 0.7.
+    """Returns how far the bodies are from their masks, pixels, at least 0.7. 1.0 if nothing was
+    matched.
 
     Clothes make masks less certain, and so does a body that has not yet arrived. Silhouettes are
     never more exact than 0.7 pixels.
@@ -602,8 +633,8 @@ def _person_height(
     masks: Sequence[Float[np.ndarray, "h w"]] | Float[np.ndarray, "v h w"],
     observations: Observations | None,
 ) -> float:
-    """Height of the person in the image, pixels: median over the views of the extent of masks, or
-    else of keypoints.
+    """Returns the height of the person in the image, pixels. This is the median over the views of
+    the extent of the mask, or of the keypoints if all masks are empty. NaN without either.
     """
     sizes = [max(np.ptp(x) for x in np.nonzero(mask > 0.5)) for mask in masks if (mask > 0.5).any()]
     if not sizes and observations is not None:
@@ -624,7 +655,7 @@ class RefinedCapture:
     """The result of a refinement."""
 
     capture: Capture
-    """The better of start and result. The start itself if `report.kept` is False."""
+    """The start or the result, whichever is better. The start itself if `report.kept` is False."""
     report: FitReport
     """What was fitted, and how well."""
 
@@ -638,11 +669,17 @@ def refine_capture(
 ) -> RefinedCapture:
     """Refine cameras (rotation, centre, focal length), shape and poses of a capture.
 
-    Arguments: keypoints: of the capture's views. config: after a fit to these keypoints, see
-    `usual_config`. memory: (m - 1,) correlations in [0, 1) of each of the m poses with the one
-    before, as in a video; None: each stands for itself. Views whose mask is empty take no part.
-    Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint; ValueError if
-    the keypoints are of another number of views.
+    Views whose mask is empty take no part.
+
+    Args:
+        capture: the start.
+        keypoints: keypoints in the capture's views, or None.
+        config: settings. After a fit to these keypoints, those of `usual_config`.
+        memory: (m - 1,) correlations in [0, 1) of each of the m poses with the one before, as in a
+            video. None: poses are independent.
+
+    Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint. ValueError if
+    the keypoints have another number of views than the capture.
     """
     if keypoints is not None and len(keypoints.points) != capture.view_count:
         raise ValueError(
@@ -674,7 +711,7 @@ def refine_capture(
 
 
 def _better(found: Score, before: Score, most_worse: float) -> bool:
-    """Whether a change is kept. most_worse: see `CaptureRefineConfig.keypoints_worse`."""
+    """Returns whether a result is kept. most_worse: see `CaptureRefineConfig.keypoints_worse`."""
     if found.keypoints is None or before.keypoints is None:
         # masks of clothes are fitted a little better by wrong bodies, which keypoints would show:
         # for four people who started at the truth, by up to 0.15 of the loss

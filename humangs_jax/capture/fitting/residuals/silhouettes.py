@@ -1,15 +1,16 @@
-"""Silhouettes as evidence: that of a posed body against that of a mask.
+"""Silhouettes as evidence: compares the silhouette of a posed body with that of a mask.
 
 A body's silhouette consists of mesh edges between a face that looks at the camera and one that
 looks away (Sander et al. 2000, "Silhouette clipping"), as far as the image shows no body outside of
-them: known functions of the pose. A mask's is where its coverage crosses one half. Both are found
-on the host and held fixed while a solver moves the body.
+them. Its points are known functions of the pose. A mask's silhouette is where its coverage crosses
+one half. Both are found on the host and held fixed while a solver moves the body.
 
-As in edge trackers (Harris and Stennett 1990, "RAPiD"): each point of the body's silhouette looks
-along its normal for the nearest end of the mask, and each point of the mask's for the nearest point
-of the body's that faces the same way. Both give an equation n . x = n . q: x, a point of the body
-in the image, may slide along the mask's silhouette. People wear clothes and hair: distances
-outwards count in full, and distances inwards count less and less the larger they are.
+Points are matched as in edge trackers (Harris and Stennett 1990, "RAPiD"). Each point of the body's
+silhouette looks along its normal for the nearest end of the mask. Each point of the mask's
+silhouette looks for the nearest point of the body's silhouette that faces the same way. Both give
+an equation n . x = n . q, where x is the point of the body in the image, q the point of the mask
+and n the normal: x may slide along the mask's silhouette. People wear clothes and hair. So
+distances outwards count in full, and distances inwards count less and less the larger they are.
 """
 
 import dataclasses
@@ -35,19 +36,22 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 @dataclasses.dataclass(frozen=True)
 class _Edges:
-    """Where silhouettes are."""
+    """Constants by which silhouettes are found in images."""
 
     probe: float = 1.5
-    """Pixels outside of a silhouette at which there must be no body."""
+    """Distance outside of a silhouette at which there must be no body, pixels."""
     nearest: float = 0.05
-    """Metres: edges of faces nearer to the camera than this, or behind it, are no silhouette."""
+    """Distance to the camera, metres. Edges of faces that are nearer, or behind the camera, are no
+    silhouette.
+    """
     border: float = 1.0
-    """Pixels from the image border within which nothing is a silhouette: the image ends there, not
-    the person."""
+    """Distance to the image border, pixels. Nothing that is nearer is a silhouette, because the
+    image ends there, not the person.
+    """
     speck: float = 0.03
-    """Contours shorter than this share of a mask's longest are noise."""
+    """Contours that are shorter than this share of the longest contour of a mask are noise."""
     smoothing: float = 1.5
-    """Pixels: standard deviation of the blur whose gradient is a mask's normal."""
+    """Standard deviation of the blur whose gradient gives the normals of a mask, pixels."""
 
 
 _EDGES = _Edges()
@@ -59,7 +63,7 @@ class MeshEdges(NamedTuple):
     ends: Int[np.ndarray, "e 2"]
     """Vertices at both ends, (e, 2)."""
     faces: Int[np.ndarray, "e 2"]
-    """Faces on both sides, (e, 2); -1: none."""
+    """Faces on both sides, (e, 2). -1 where there is no second face."""
 
 
 class BodyView(NamedTuple):
@@ -70,27 +74,31 @@ class BodyView(NamedTuple):
     depths: Float[np.ndarray, " n"]
     """Depths of the vertices, (n,), metres."""
     normals: Float[np.ndarray, "n 2"]
-    """Unit directions in the image of the surface normals at the vertices, (n, 2)."""
+    """Surface normals at the vertices, projected into the image, (n, 2). Unit vectors."""
     covered: Bool[np.ndarray, "h w"]
     """Which pixels show the body, (h, w)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Boundary:
-    """Points of a silhouette, evenly spread over it; it may be empty."""
+    """Points of a silhouette, evenly spread over it. There may be none."""
 
     positions: Float[np.ndarray, "p 2"]
     """Positions, (p, 2), pixels."""
     normals: Float[np.ndarray, "p 2"]
-    """Unit normals, (p, 2), outwards."""
+    """Unit normals that point outwards, (p, 2)."""
     ends: Int[np.ndarray, "p 2"] | None = None
-    """For a body, the vertices of each point's edge, (p, 2)."""
+    """Vertices of the mesh edge that each point is on, (p, 2). None for a mask."""
     shares: Float[np.ndarray, " p"] | None = None
-    """For a body, the position of each point between these, (p,), in [0, 1]."""
+    """Position of each point between the two vertices of its edge, (p,), in [0, 1]. None for a
+    mask.
+    """
 
 
 def body_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
-    """All edges of a mesh; of more than two faces that share an edge, two are kept."""
+    """Returns all edges of a mesh. Where more than two faces share an edge, two of them are
+    kept.
+    """
     ends, sides = mesh_edges(faces)
     edge, owner = sides.ravel(), np.repeat(np.arange(len(faces)), 3)
     beside = np.full((len(ends), 2), -1)
@@ -101,7 +109,7 @@ def body_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
 
 
 def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> BodyView:
-    """Project and rasterize a posed body."""
+    """Projects and rasterizes a posed body. vertices: (n, 3), metres."""
     return BodyView(*map(np.asarray, look(vertices, faces, camera)))
 
 
@@ -128,7 +136,7 @@ def look(
 def body_boundary(
     view: BodyView, faces: Int[np.ndarray, "f 3"], mesh: MeshEdges, count: int
 ) -> Boundary:
-    """`count` points of the body's silhouette, or none if the image shows none."""
+    """Returns `count` points of the body's silhouette, or none if the image shows no silhouette."""
     # faces that look at the camera, by their orientation in the image
     corners = view.pixels[faces]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -160,8 +168,10 @@ def body_boundary(
 def mask_boundary(
     mask: Float[np.ndarray, "h w"], count: int, hidden: Bool[np.ndarray, "h w"] | None = None
 ) -> Boundary:
-    """`count` points where coverage crosses one half, or none. The image border is no silhouette,
-    nor is that of who hides the person.
+    """Returns `count` points where the coverage of a mask crosses one half, or none if it does not.
+
+    hidden: pixels where something may stand in front of the person, (h, w). Neither the silhouette
+    of that nor the image border counts as silhouette of the person.
     """
     from skimage.filters import gaussian
     from skimage.measure import find_contours
@@ -196,7 +206,9 @@ def mask_boundary(
 def _inside_image(
     positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]
 ) -> Bool[np.ndarray, "*p"]:
-    """Which positions are well inside of an image of (height, width), see `_EDGES`."""
+    """Returns which positions (x, y) are more than `_EDGES.border` inside of an image. shape:
+    (height, width).
+    """
     size = np.asarray([shape[1], shape[0]])
     return np.all((positions > _EDGES.border) & (positions < size - _EDGES.border), axis=-1)
 
@@ -212,8 +224,9 @@ def _covered(
 def _spread(
     lengths: Float[np.ndarray, " l"], count: int
 ) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Points evenly along pieces of a line: (count,) the piece of each and its position there in
-    [0, 1]; none without length.
+    """Spreads `count` points evenly over pieces of a line with these lengths, (l,). Returns the
+    piece of each point, (count,), and its position in the piece, (count,), in [0, 1]. No points if
+    the whole length is 0.
     """
     ends = np.cumsum(lengths)
     if len(ends) == 0 or ends[-1] <= 0:
@@ -224,23 +237,25 @@ def _spread(
 
 
 LOOKS = 129
-"""Samples along a normal: half a pixel apart in the first round, less later."""
+"""Number of samples along a normal. They are half a pixel apart in the first round, and closer
+later.
+"""
 
 
 @pytree_dataclass
 class Matches:
-    """Equations of one view: points[i] of the body's silhouette shall lie on the line normals[i] .
-    x = offsets[i].
+    """Equations of one view. Point `points[i]` of the body's silhouette shall lie on the line
+    normals[i] . x = offsets[i].
     """
 
     points: Int[Array | np.ndarray, " e"]
-    """Indices of the points, (e,)."""
+    """Indices of the points on the body's silhouette, (e,)."""
     normals: Float[Array | np.ndarray, "e 2"]
-    """Unit normals, (e, 2), outwards."""
+    """Unit normals of the lines, (e, 2). They point out of the person."""
     offsets: Float[Array | np.ndarray, " e"]
     """Offsets of the lines, (e,), pixels."""
     weights: Float[Array | np.ndarray, " e"]
-    """Weights, (e,); 0: no equation."""
+    """Weights, (e,). 0 for rows that are no equation."""
 
 
 def match(
@@ -251,9 +266,16 @@ def match(
     count: int,
     hidden: Bool[np.ndarray, "h w"] | None = None,
 ) -> Matches:
-    """At most 2 `count` equations of a mask and its boundary, padded with weight 0. reach: pixels,
-    how far points look.
-    hidden: where the mask says nothing, since somebody may be in front.
+    """Matches the silhouettes of a body and of a mask. Returns at most 2 `count` equations, padded
+    with rows of weight 0.
+
+    Args:
+        body: silhouette of the body.
+        mask: coverage of the mask, (h, w), 0 to 1.
+        boundary: silhouette of the mask.
+        reach: how far points look for their match, pixels.
+        count: most points of each silhouette.
+        hidden: pixels where the mask says nothing, since something may be in front, (h, w).
     """
     of_body, of_mask = _ends_of_mask(body, mask, reach, hidden), _nearest(body, boundary, reach)
     points, normals, offsets = map(np.concatenate, zip(of_body, of_mask, strict=True))
@@ -261,11 +283,13 @@ def match(
 
 
 Pairs = tuple[Int[np.ndarray, " e"], Float[np.ndarray, "e 2"], Float[np.ndarray, " e"]]
-"""Points of the body's silhouette, and the normals and offsets of their lines."""
+"""Equations without weights: indices of the points on the body's silhouette, normals and offsets of
+their lines.
+"""
 
 
 def matches_of(pairs: Pairs, count: int) -> Matches:
-    """Equations of at most 2 `count` pairs, padded with weight 0."""
+    """Returns the equations of at most 2 `count` pairs, padded with rows of weight 0."""
     points, normals, offsets = (padded(x, 2 * count) for x in pairs)
     weights = np.arange(2 * count) < len(pairs[0])
     return Matches(
@@ -282,7 +306,9 @@ def _ends_of_mask(
     reach: float,
     hidden: Bool[np.ndarray, "h w"] | None,
 ) -> Pairs:
-    """For points of the body, along their normals: where the mask goes from inside to outside."""
+    """Matches points of the body with the mask: finds along each point's normal where the mask
+    ends, that is, goes from inside to outside.
+    """
     steps = np.linspace(-reach, reach, LOOKS)
     places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
     covered = np.asarray(coverage(from_host(mask), from_host(places, np.float32)))
@@ -307,7 +333,9 @@ def coverage(mask: Float[Array, "h w"], places: Float[Array, "p l 2"]) -> Float[
 
 
 def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
-    """For points of the mask: the nearest of the body that faces the same way."""
+    """Matches points of the mask with points of the body: finds for each the nearest one that faces
+    the same way.
+    """
     if not len(body.positions) or not len(mask.positions):
         return np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
     distances = np.linalg.norm(mask.positions[:, None] - body.positions, axis=-1)
@@ -325,7 +353,9 @@ def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
 def distances(
     matches: Matches, pixels: Float[Array | np.ndarray, "p 2"]
 ) -> Float[Array | np.ndarray, " e"]:
-    """How far points of the body are outside of their lines, pixels; negative inside."""
+    """Returns how far points of the body are outside of their lines, (e,), pixels. Negative
+    inside.
+    """
     # term by term: XLA's CPU compiler (jaxlib 0.10.2) makes wrong Jacobians of `jnp.sum` over both
     # under `jax.jacfwd`
     along = matches.normals * pixels[matches.points]
@@ -340,12 +370,16 @@ def silhouette_residuals(
     scales: tuple[Float[Array, ""], Float[Array, ""]],
     independent: float,
 ) -> Float[Array, " e"]:
-    """Distances of silhouettes in standard deviations.
+    """Returns the distances between the silhouettes, (e,), in standard deviations.
 
-    Arguments: clothes: pixels by which the mask reaches beyond the body. noise: std of a
-    silhouette, pixels. scales: robust scales outwards and inwards, pixels. independent: number of
-    independent equations that all of a view count for, because neighbours on a silhouette err
-    together.
+    Args:
+        matches: equations of the view.
+        pixels: points of the body's silhouette in the image, (p, 2), pixels.
+        clothes: pixels by which the mask reaches beyond the body at each point, (p,).
+        noise: standard deviation of a silhouette, pixels.
+        scales: robust scales outwards and inwards, pixels.
+        independent: number of independent equations that all of the view count as. Neighbours on a
+            silhouette err together.
     """
     off = distances(matches, pixels) + clothes[matches.points]
     scale = jnp.where(off > 0, *scales)
@@ -361,8 +395,8 @@ def silhouette_residuals(
 def boundary_points(
     body: BodyModel, boundaries: Sequence[Boundary], count: int, coefficients: int
 ) -> SurfacePoints:
-    """The points of v silhouettes as functions of shape and pose, (v, count, ...), padded with
-    points that no equation uses.
+    """Returns the points of v silhouettes of the body as functions of shape and pose,
+    (v, count, ...). They are padded with points that no equation uses.
     """
     ends, shares = (
         np.stack([padded(getattr(each, name), count) for each in boundaries])
@@ -372,7 +406,7 @@ def boundary_points(
 
 
 def padded(rows: np.ndarray, count: int) -> np.ndarray:
-    """The rows, and rows of zeros up to `count`."""
+    """Returns the rows, followed by rows of zeros up to `count` rows."""
     return np.pad(rows, ((0, count - len(rows)),) + ((0, 0),) * (rows.ndim - 1))
 
 
