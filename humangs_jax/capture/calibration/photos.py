@@ -1,10 +1,11 @@
-"""Which photo belongs to which camera and to which frame, by file names; which way up it is, by its
-EXIF orientation; its mask.
+"""Finds the camera, the frame and the mask of each photo by file names, and which way up the photo
+is by its EXIF orientation.
 
-Phones store a portrait photo on its side, and a flag says so; half of the other programs obey it.
-What an import writes has none: pixels are turned upright, and with them the camera, if it was
-calibrated for the pixels as stored (COLMAP). A calibration of the turned photo (OpenCV) is known
-by its size. No camera sees a mirrored photo: if the flag asks for that, only the photo is turned.
+Phones store a portrait photo on its side, with a flag that says so, and about half of the other
+programs obey the flag. An import writes photos without a flag: it turns the pixels upright. If the
+camera was calibrated for the pixels as stored (COLMAP), the import turns the camera too. If it was
+calibrated for the turned photo (OpenCV), the sizes show it. No camera sees a mirrored photo: if the
+flag asks for mirroring, the photo is only turned.
 """
 
 import dataclasses
@@ -40,7 +41,7 @@ from humangs_jax.io.images import (
 )
 
 _LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
-"""How photos of named cameras are stored, for errors."""
+"""Layouts in which photos of named cameras are stored, for error messages."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Photo:
     frame: int
     """Number of its frame, from 0."""
     key: str
-    """Path relative to the folder of photos with slashes and without suffix."""
+    """Path relative to the folder of photos, with slashes and without suffix."""
 
 
 MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "silhouettes")
@@ -64,17 +65,17 @@ MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "silhouettes")
 OTHERS_FOLDERS = ("others", "occluders", "unknown")
 """Names of folders of masks of other people and of things in front of the person."""
 NO_PHOTOS = (*MASK_FOLDERS, *OTHERS_FOLDERS)
-"""Names of folders whose pictures are no photos."""
+"""Names of folders whose pictures are not photos of a capture."""
 NO_CAMERA = "without a camera in"
-"""How the reason begins why a photo is not used."""
+"""Beginning of the reason that is given for a photo without a camera."""
 
 
 def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, str | None]:
-    """The calibration without those cameras that have no photo, and a line about them; None where
-    all have one.
+    """Leaves out the cameras without a photo. Returns the calibration with the other cameras, and a
+    line about the cameras left out, or None if every camera has a photo.
 
-    Raises: CaptureError if no camera has a photo, or if a file that names its images lacks one
-    while other photos are there.
+    Raises: CaptureError if no camera has a photo, or if a calibration that names its images names a
+    missing one while the folder has photos that no camera names.
     """
     if calibration.per_image:
         there = [_photo_at(images, camera.name) is not None for camera in calibration.cameras]
@@ -104,7 +105,10 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
 
 
 def _refuse_missing(calibration: Calibration, images: Path, name: str) -> None:
-    """Raises: CaptureError."""
+    """Raises the error about a camera that has no photo. name: of the camera.
+
+    Raises: CaptureError.
+    """
     if calibration.per_image:
         photo_of(images, name, calibration.file)
     raise CaptureError(
@@ -113,11 +117,11 @@ def _refuse_missing(calibration: Calibration, images: Path, name: str) -> None:
 
 
 def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> tuple[Photo, ...]:
-    """The photos of a calibration, frame after frame.
+    """Returns the photos of a calibration, ordered by frame and then by camera.
 
-    masks: a folder; None: where the calibration names masks that are there, these.
-    Raises: CaptureError if an image of the calibration, or all of a camera, or a mask, is not
-    there, or some of the named ones.
+    masks: a folder of masks. None: use the masks that the calibration names, if they are there.
+    Raises: CaptureError if an image that the calibration names, a camera's photos or a mask is
+    missing, or if only some of the masks that the calibration names are there.
     """
     if calibration.per_image:
         owners: dict[Path, str] = {}
@@ -143,7 +147,9 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
 
 
 def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibration) -> list[Unused]:
-    """What the folder of photos holds and an import does not use, but for masks."""
+    """Returns the files in the folder of photos that an import does not use, each with the reason.
+    Folders of masks are ignored.
+    """
     used = {
         file.resolve() for photo in photos for file in (photo.image, photo.mask) if file is not None
     }
@@ -159,8 +165,10 @@ def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibratio
 
 
 def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
-    """Finds the masks that a calibration names, by camera: in its folder, in that of the photos or
-    in the one around it. All have to be there, else there are none.
+    """Finds the masks that a calibration names, by number of the camera. They may be in the
+    calibration's folder, in the folder of photos or in its parent. Empty if none is there.
+
+    Raises: CaptureError if some are there and others are missing.
     """
     found: dict[int, Path] = {}
     for i, camera in enumerate(calibration.cameras):
@@ -182,11 +190,11 @@ def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
 
 
 def photo_of(folder: Path, name: str, file: Path) -> Path:
-    """The photo that a file names, by a path that may lack its suffix, have another one, or begin
-    with folders above `folder`.
+    """Returns the photo that a calibration file names. The name is a path that may lack its suffix,
+    have another one, or begin with folders above `folder`.
 
-    Raises: CaptureError if there is none, and for a link to what is outside of the folder, see
-    `io.reading.inside`.
+    Raises: CaptureError if there is no such photo, or if it is a link to something outside of the
+    folder, see `io.reading.inside`.
     """
     photo = _photo_at(folder, name)
     if photo is None:
@@ -208,7 +216,9 @@ def _photo_at(folder: Path, name: str) -> Path | None:
 
 
 def _any_suffix(path: Path) -> Path | None:
-    """The file, or the one of that name with another suffix of photos, or with one more."""
+    """Returns the file at a path. If there is none, looks for the name with another suffix of
+    photos in place of its own, or after it. None if there is no such file.
+    """
     stems, candidates = [path.name], []
     if is_photo(path):
         stems.append(path.stem)
@@ -220,16 +230,16 @@ def _any_suffix(path: Path) -> Path | None:
 
 
 def photo_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, of the file's head alone.
+    """Returns width and height in pixels. Only the head of the file is read.
 
-    Raises: CaptureError if it is no image.
+    Raises: CaptureError if the file is not an image.
     """
     return read_checked(image_size, path)
 
 
 def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
-    """A function that finds the mask of a photo, see `masks_named_like`. The function raises
-    CaptureError where there is none.
+    """Returns a function that finds the mask of a photo, see `masks_named_like`. It raises
+    CaptureError if there is none.
     """
     find = masks_named_like(masks, images)
 
@@ -248,13 +258,13 @@ def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
 
 
 def masks_named_like(masks: Path, images: Path) -> Callable[[Path], Path | None]:
-    """A function that finds the mask of a photo of `images`: at the same path in the folder of
-    masks.
+    """Returns a function that finds the mask of a photo of `images`, at the same path in the folder
+    of masks. The function returns None if there is none.
 
-    Its name is the photo's, perhaps with one more suffix (COLMAP) or with a word for masks
-    (RealityScan's IMG.jpg.mask.png, Metashape's IMG_mask.png). AvatarReX has it in mask/pha beside
-    the photo; photos and masks are in one folder there, so that the photo itself can be what is
-    found first. The function returns None where there is none.
+    The mask has the photo's name, perhaps with another suffix, with one more suffix (COLMAP) or
+    with a word for masks (RealityScan's IMG.jpg.mask.png, Metashape's IMG_mask.png). AvatarReX has
+    the mask in mask/pha beside the photo. Photos and masks may be in one folder, so the photo
+    itself can be found first: it is skipped.
     """
     # each folder is listed once: names with a word for masks, by the photo they are of
     listed: dict[Path, dict[str, Path]] = {}
@@ -285,7 +295,9 @@ def masks_named_like(masks: Path, images: Path) -> Callable[[Path], Path | None]
 
 
 def _frames_of(calibration: Calibration, images: Path) -> list[dict[str, Path]]:
-    """Maps for each camera the names of frames to photos, by the first layout that fits one."""
+    """Returns for each camera its photos by the name of the frame. All cameras use the first layout
+    of folders in which some camera has photos.
+    """
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
         checked_path(images, name, images)
@@ -335,45 +347,47 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
 # --------------------------------------------------------------------------------------------------
 
 MIRRORED = {2: 1, 4: 3, 5: 6, 7: 8}
-"""Flags that mirror besides turning, and those that only turn so."""
+"""For each EXIF flag that mirrors and turns, the flag that only turns in the same way."""
 MIRROR = 2
-"""The flag that only mirrors."""
+"""The EXIF flag that only mirrors."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Turn:
-    """How the pixels of a photo and of its mask become what is imported."""
+    """How the pixels of a photo and of its mask are turned for an import."""
 
     photo: int
-    """The flag of the photo."""
+    """EXIF flag of the photo."""
     mask: int
-    """The flag by which the mask is turned."""
+    """EXIF flag by which the mask is turned."""
     quarters: int
     """Clockwise quarter turns of the camera; 0 for a calibration of the turned photo."""
     size: tuple[int, int]
-    """Width and height after it, pixels."""
+    """Width and height of the turned photo, pixels."""
     certain: bool
-    """Whether sizes tell what was calibrated."""
+    """Whether the sizes show if the stored or the turned photo was calibrated."""
     mirrored: bool
-    """Whether pixels are mirrored back, because the calibration is of those as stored."""
+    """Whether pixels are mirrored back. This is so if the flag mirrors and the calibration is of
+    the pixels as stored.
+    """
 
     def upright(
         self, pixels: Float[np.ndarray, "h w *c"], flag: int
     ) -> Float[np.ndarray, "height width *c"]:
-        """Pixels as a flag wants them shown, but not mirrored."""
+        """Returns pixels turned as a flag asks. If `mirrored`, they are not mirrored."""
         return oriented(oriented(pixels, flag), MIRROR if self.mirrored else 1)
 
     @property
     def rewrites(self) -> bool:
-        """Whether the files cannot be copied as they are."""
+        """Whether the files have to be written anew, because the photo or its mask is turned."""
         return (self.photo, self.mask) != (1, 1)
 
 
 def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn, ...]:
-    """Finds the turn of each photo.
+    """Returns the turn of each photo.
 
-    Raises: CaptureError unless photos have the size that was calibrated, and masks that of their
-    photo; and for a camera that was calibrated for pixels as stored, but whose photos have
+    Raises: CaptureError if a photo has another size than the calibrated one, or a mask another size
+    than its photo. Also if a camera was calibrated for pixels as stored, but its photos have
     different flags.
     """
     turns = tuple(
@@ -416,11 +430,15 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
 
 
 def mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, int]) -> int:
-    """The flag by which a mask is turned. One with a flag, or of the size of the turned photo,
-    shows it as turned; else as stored.
+    """Returns the EXIF flag by which a mask is turned. A mask with a flag, or with the size of the
+    turned photo, is turned by its own flag. Any other mask is turned by the photo's flag.
 
-    Where both sizes are the same it is taken to be turned: most tools that make masks obey the
-    flag.
+    Where stored and turned photo have the same size, the mask is taken to be turned: most tools
+    that make masks obey the flag.
+
+    flag: EXIF flag of the photo. stored and shown: width and height of the photo before and after
+    it is turned, pixels.
+    Raises: CaptureError if the mask has neither size.
     """
     own, size = read_checked(orientation, mask), photo_size(mask)
     size = size if own < 5 else size[::-1]
@@ -435,15 +453,19 @@ def mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, 
 
 
 def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h w"]:
-    """Reads the mask of a photo, as the photo is shown.
+    """Reads the mask of a photo, turned as the photo is shown. masks: folder of masks. images:
+    folder of photos.
 
-    Raises: CaptureError if there is none, or one of another size.
+    Raises: CaptureError if there is no mask, or if it has another size than the photo.
     """
     return mask_as_shown(_masks_of(masks, images)(image), image)
 
 
 def mask_as_shown(mask: Path, image: Path) -> Float[np.ndarray, "h w"]:
-    """Reads a mask as its photo is shown. Raises: CaptureError for one of another size."""
+    """Reads a mask, turned as its photo is shown, (h, w), 0 to 1.
+
+    Raises: CaptureError if the mask has another size than the photo.
+    """
     flag, stored = read_checked(orientation, image), photo_size(image)
     shown = stored if flag < 5 else stored[::-1]
     return oriented(read_checked(read_grey, mask), mask_flag(mask, flag, stored, shown))
@@ -452,8 +474,8 @@ def mask_as_shown(mask: Path, image: Path) -> Float[np.ndarray, "h w"]:
 def turned_cameras(
     calibration: Calibration, photos: Sequence[Photo], turns: Sequence[Turn]
 ) -> Calibration:
-    """The calibration, in the convention of captures, of the photos as they are imported, sizes
-    included.
+    """Returns the calibration for the photos as they are imported: cameras and observations turned,
+    with the sizes of the turned photos. The calibration has to be in the convention of captures.
     """
     cameras, seen = list(calibration.cameras), calibration.observations
     pixels = None if seen is None else seen.pixels.copy()
@@ -473,8 +495,8 @@ def turned_cameras(
 
 
 def _quarter_turned(camera: CalibratedCamera) -> CalibratedCamera:
-    """The camera of the photo turned clockwise: pixel (x, y) moves to (height - y, x), and so do
-    the camera's axes.
+    """Returns the camera of the photo after a clockwise quarter turn. Pixel (x, y) moves to (height
+    - y, x), and the camera's axes turn in the same way.
     """
     assert camera.width is not None and camera.height is not None
     turn = np.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -496,7 +518,9 @@ def _quarter_turned(camera: CalibratedCamera) -> CalibratedCamera:
 
 
 def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str], list[str]]:
-    """Says which photos were turned, and warns where sizes do not show whether cameras were too."""
+    """Returns notes on the photos that were turned, and warnings where their sizes do not show if
+    the calibration is of the turned photos, or where a photo is not mirrored.
+    """
     flagged = [(photo, turn) for photo, turn in zip(photos, turns, strict=True) if turn.photo != 1]
     if not flagged:
         return [], []
@@ -526,15 +550,15 @@ def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str
 # --------------------------------------------------------------------------------------------------
 
 _EMPTY = "the mask is empty, the photo will be left out"
-"""Warning about a mask without a person."""
+"""Warning about a mask that shows nobody."""
 
 
 def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
-    """Warnings about masks, files or alpha channels, one line for each kind of fault, naming the
-    photos.
+    """Checks masks, which are files or alpha channels. Returns a warning for each kind of fault,
+    with the names of the photos.
 
-    Raises: CaptureError for a mask that no capture may have, for masks none of which shows anybody,
-    and, where there are no mask files, for an alpha channel in some of the photos only.
+    Raises: CaptureError if a mask is not valid, if no mask shows anybody, or if there are no mask
+    files and only some photos have an alpha channel.
     """
     masked = photos[0].mask is not None
     if not masked:
@@ -566,7 +590,7 @@ def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
 
 
 def _mask_problem(person: Bool[np.ndarray, "h w"]) -> str | None:
-    """The fault of a mask; None for a usual one."""
+    """Returns what is wrong with a mask, or None. person: pixels of the person, (h, w)."""
     if not person.any():
         return _EMPTY
     if person.all():
@@ -581,15 +605,15 @@ def _mask_problem(person: Bool[np.ndarray, "h w"]) -> str | None:
 
 
 def has_alpha(photo: Path) -> bool:
-    """Whether a photo has an alpha channel, opaque or not."""
+    """Returns whether a photo has an alpha channel, opaque or not."""
     with open_image(photo) as (image, _):
         return "A" in image.getbands() or "transparency" in image.info
 
 
 def is_transparent(photo: Path) -> bool:
-    """Whether a photo has transparent pixels; an opaque alpha channel is no mask.
+    """Returns whether a photo has transparent pixels. An opaque alpha channel is no mask.
 
-    Raises: CaptureError.
+    Raises: CaptureError if the file cannot be read.
     """
     if not read_checked(has_alpha, photo):
         return False

@@ -1,18 +1,18 @@
-"""Videos -> photos: of synchronised cameras, a folder for each; of one camera, its best frames. By
-ffmpeg (imageio-ffmpeg).
+"""Takes photos out of videos with ffmpeg (imageio-ffmpeg): a folder for each camera if they are
+synchronised, or the best frames of one camera.
 
     CAMERA.mp4 (.m4v, .mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0,
                                                  every, 2 every ...
 
-All videos of several cameras have to begin at the same moment. Where their rates differ, or one
-lacks frames, those of one moment are found by time (`moments`), and the numbers are those of
-moments. Masks are videos of the same names.
+The videos of several cameras all have to begin at the same moment. Where their rates differ, or one
+lacks frames, the frames of one moment are found by time (`moments`), and files have the numbers of
+moments. Videos of masks have the same names.
 
-What a video says about itself is obeyed: pixels that are not square are scaled to square ones, and
-colors of high dynamic range or of wide primaries are converted to those of sRGB. Other videos keep
-their values.
+What a video says about itself is obeyed. Pixels that are not square are scaled to square ones.
+Colors of high dynamic range or of wide primaries are converted to sRGB. Other videos keep their
+values.
 
-Which frames of one video become photos: `frame_choice`.
+`frame_choice` chooses the frames of a single video that become photos.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ _LONGEST_SECONDS = 3600
 
 
 def find_videos(folder: Path) -> dict[str, Path]:
-    """Name of the camera -> its video, of the videos in a folder.
+    """Returns the videos of a folder by the name of their camera.
 
     Raises: CaptureError for two videos of one camera.
     """
@@ -57,49 +57,54 @@ def find_videos(folder: Path) -> dict[str, Path]:
 
 
 class _Shown(NamedTuple):
-    """What is to be done with frames so that they are as a player shows them."""
+    """How frames have to be converted so that they look as a player shows them."""
 
     shape: str = ""
-    """ffmpeg's filter that makes pixels square."""
+    """ffmpeg's filter that makes pixels square. Empty if they are."""
     matrix: str = "auto"
     """ffmpeg's name of the matrix from YCbCr to RGB."""
     encoding: Encoding | None = None
     """Encoding of colors that are not sRGB's, or None."""
     about: str = ""
-    """The colors, in words."""
+    """Description of the colors, for a note."""
     rate: float | None = None
-    """Mean frames a second, or None."""
+    """Mean number of frames per second, or None if unknown."""
     from_zero: bool = False
-    """Whether times of such files count from their beginning."""
+    """Whether the times that ffmpeg prints have to be those of the file (-copyts)."""
 
 
 class VideoPhotos(NamedTuple):
-    """Folders of photos and masks that were taken out of videos, and lines about how."""
+    """Folders of photos and masks, with notes if they were taken out of videos."""
 
     images: Path
     """Folder of photos."""
     masks: Path | None
     """Folder of masks, or None."""
     notes: tuple[str, ...] = ()
-    """How they came from videos, a line each."""
+    """How the photos were taken out of the videos, one line each."""
     warnings: tuple[str, ...] = ()
-    """What videos lack, a line each."""
+    """What the videos lack, one line each."""
 
 
 @contextlib.contextmanager
 def photos_of_videos(
     images: Path, masks: Path | None, place: Path, every: int = 1, most: int | None = None
 ) -> Generator[VideoPhotos]:
-    """Folders of photos and masks. Those of videos are written beside `place` and removed in the
-    end; others are as given.
+    """Yields folders of photos and masks. If a folder holds videos, their frames are written to a
+    temporary folder beside `place`, which is removed at the end. Folders of photos are yielded as
+    they are.
 
-    Where photos and videos are in one folder, as a phone stores the clips of Live Photos, the
-    photos are what is meant.
+    Phones store photos and the clips of Live Photos in one folder. Where a folder holds both, the
+    photos count, unless `every` or `most` is given.
 
-    Arguments: every: step of frames, or of moments, from 0. most: photos of a camera, None: all.
-    Who asks for these means the videos.
-    Raises: CaptureError naming the video, also if every or most ask something of folders that hold
-    none.
+    Args:
+        images: folder of photos or videos.
+        masks: folder of masks or of their videos. None: no masks.
+        place: where the capture will be written.
+        every: step between frames, or between moments of several videos. The first is 0.
+        most: most photos of a camera. None: all.
+    Raises: CaptureError with the name of the video, or if every or most is given and there are no
+    videos.
     """
     # videos of photos, and those of masks, where there are any
     asked = every != 1 or most is not None
@@ -149,7 +154,9 @@ def photos_of_videos(
 
 
 def _meant_videos(folder: Path, asked: bool) -> dict[str, Path]:
-    """The videos of a folder; none where it holds photos, unless frames are asked for."""
+    """Returns the videos of a folder. Where the folder also holds photos, there are none unless
+    frames are asked for.
+    """
     if not asked and scan_folder(folder).photos:
         return {}
     return find_videos(folder)
@@ -157,8 +164,8 @@ def _meant_videos(folder: Path, asked: bool) -> dict[str, Path]:
 
 @contextlib.contextmanager
 def named_after(temporary: Path, folder: Path) -> Generator[None]:
-    """Errors about a temporary folder name the folder that it was made of, since the temporary one
-    is gone when they are read.
+    """Replaces the path of a temporary folder in errors by the path of the folder that it was made
+    of, since the temporary one is gone when the errors are read.
 
     Raises: CaptureError.
     """
@@ -174,8 +181,9 @@ def named_after(temporary: Path, folder: Path) -> Generator[None]:
 def _moments(
     videos: Mapping[str, Path], every: int, most: int | None
 ) -> tuple[Moments | None, float | None]:
-    """The moments of several videos, or None of one, or of the first frames; and the seconds that
-    were looked at, None: all.
+    """Returns the moments of several videos, and how many seconds of the videos were looked at. The
+    moments are None for a single video, or if only the first frames are taken. The seconds are None
+    if whole videos were looked at.
     """
     if len(videos) < 2 or most == 1:
         return None, None
@@ -191,8 +199,9 @@ def _moments(
 def _mask_frames(
     path: Path, camera: str, moments: Moments, seconds: float | None
 ) -> list[int | None]:
-    """The numbers of a camera's masks at the moments: those of its photos if there are as many,
-    else by their own times.
+    """Returns the numbers of a camera's masks at the moments, None where it has no photo. If there
+    are as many masks as photos, the numbers are those of the photos. Otherwise masks are found by
+    their times.
     """
     times = frame_times(path, seconds)
     if len(times) == moments.counts[camera] or not np.isfinite(times).all():
@@ -205,10 +214,10 @@ def _mask_frames(
 
 
 def frame_times(path: Path, seconds: float | None = None) -> Float[np.ndarray, " n"]:
-    """Seconds of its file at which the frames of a video are shown, in order, up to some; NaN where
-    it does not say.
+    """Returns the times at which the frames of a video are shown, (n,), seconds, in order. NaN
+    where the video does not say. seconds: how much of the video is read. None: all.
 
-    Raises: CaptureError naming the video.
+    Raises: CaptureError with the name of the video.
     """
     with reading(path, "video", CaptureError):
         command = _ffmpeg(path, "metadata=mode=add:key=a:value=a,metadata=mode=print:file=-")
@@ -233,14 +242,18 @@ def split_video(
     chosen: Sequence[int | None] | None = None,
     mask_of: Path | None = None,
 ) -> int:
-    """Write frames of a video as 00000000.png, ... into a new folder.
+    """Write frames of a video as 00000000.png, ... into a new folder, and return the pixels of all
+    frames so far.
 
-    Arguments: before: pixels of the frames of other videos, which count towards the limit
-    `video_pixels`. chosen: in place of `every` and `most`, the frame for each file, ascending;
-    there is no file for None. mask_of: the video whose masks these are: its shape is theirs, and
-    their values are no colors.
-    Returns: pixels of all frames so far.
-    Raises: CaptureError naming the video.
+    Args:
+        every: step between frames.
+        most: most frames. None: all.
+        before: pixels of the frames of other videos, which count towards the limit `video_pixels`.
+        chosen: number of the frame for each file, ascending, in place of `every` and `most`. There
+            is no file for None.
+        mask_of: the video whose masks these are. Masks get the pixel shape of its frames, and their
+            values are not converted as colors.
+    Raises: CaptureError with the name of the video.
     """
     with reading(path, "video", CaptureError):
         shown = _shown(path) if mask_of is None else _shown_as_mask(path, mask_of)
@@ -276,9 +289,9 @@ def _write_chosen(path: Path, folder: Path, chosen: Sequence[int | None], shown:
 
 
 def _expression(numbers: Sequence[int]) -> str:
-    """ffmpeg's condition for frames of these numbers.
+    """Returns ffmpeg's condition that selects the frames with these numbers.
 
-    Raises: InvalidFileError for too many that follow no rule.
+    Raises: InvalidFileError if the numbers follow no rule and are too many for a command.
     """
     terms = []
     for first, step, last in progressions(numbers):
@@ -310,31 +323,36 @@ def _frame_size(path: Path, shown: _Shown) -> tuple[int, int]:
 # ---------------------------------------------------------------------------------------
 
 _STREAM = re.compile(r"^ *Stream #0:\d+.*?: Video: (.*)$", re.MULTILINE)
-"""ffmpeg's line about the stream of pictures."""
+"""Pattern of ffmpeg's line about the stream of pictures."""
 COLORS = re.compile(r"\b\w+\((?:\w+, )?([\w-]+)/([\w-]+)/([\w-]+)[,)]")
-"""Matrix, primaries and curve, behind the format of pixels: yuv420p10le(tv,
+"""Pattern of matrix, primaries and curve, which follow the format of pixels: yuv420p10le(tv,
 bt2020nc/bt2020/arib-std-b67, progressive).
 """
 _PIXEL_SHAPE = re.compile(r"\[SAR (\d+):(\d+) ")
-"""Sides of a pixel, width to height."""
+"""Pattern of the ratio of a pixel's width to its height."""
 RATE = re.compile(r", ([\d.]+)(k?) fps\b")
-"""Frames a second, perhaps in thousands."""
+"""Pattern of frames per second, perhaps in thousands."""
 PRIMARIES = {"bt2020": 9, "smpte432": 12}
-"""ffmpeg's names of primaries -> numbers of H.273; videos of others are shown as sRGB."""
+"""ffmpeg's names of primaries -> numbers of H.273. Videos with other primaries are shown as
+sRGB.
+"""
 _TRANSFERS = {"smpte2084": 16, "arib-std-b67": 18}
-"""ffmpeg's names of transfer curves -> numbers of H.273; videos of others are shown as sRGB."""
+"""ffmpeg's names of transfer curves -> numbers of H.273. Videos with other curves are shown as
+sRGB.
+"""
 _WIDEST_PIXEL = 4
-"""Sides of a pixel that is not square, over each other; the widest in use is 2."""
+"""Largest ratio of the sides of a pixel. The largest in use is 2."""
 _SQUARE = "scale=w=round(iw*max(sar\\,1)):h=round(ih*max(1/sar\\,1)),setsar=1"
 """Filter that makes pixels square. It only makes frames larger: nothing is lost."""
 _TABLE = "colors.cube"
-"""Temporary file of a table of colors."""
+"""Name of the temporary file with the table of colors."""
 
 
 def _shown(path: Path) -> _Shown:
-    """What ffmpeg prints of a video.
+    """Returns what ffmpeg prints about how a video is shown.
 
-    Raises: OSError; InvalidFileError for pixels that nobody shows.
+    Raises: OSError if the file cannot be read. InvalidFileError for pixels that are too far from
+    square.
     """
     open_file(path).close()
     # without an output ffmpeg fails, after it has printed what is there
@@ -377,8 +395,8 @@ def _with_colors(shown: _Shown, matrix: str, primaries: str, transfer: str) -> _
 
 
 def _shown_as_mask(path: Path, photos: Path) -> _Shown:
-    """Of a video of masks: the shape of its photos' pixels if frames have the size of theirs and
-    say nothing; no colors.
+    """Returns how a video of masks is shown. Its values are not converted as colors. If its frames
+    have the stored size of the photos' and it states no pixel shape, it gets that of the photos.
     """
     own, theirs = _shown(path), _shown(photos)
     as_stored = _Shown()
@@ -408,10 +426,10 @@ def _check_pixels(pixels: int, count: int, width: int, height: int) -> None:
 
 
 def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
-    """Write these frames of a video, counted from 0 and in order, as frame_00000017.png, ... into a
-    new folder.
+    """Write frames of a video as frame_00000017.png, ... into a new folder. chosen: their numbers,
+    from 0 and ascending.
 
-    Raises: CaptureError naming the video.
+    Raises: CaptureError with the name of the video.
     """
     with reading(path, "video", CaptureError):
         folder.mkdir(parents=True)
@@ -423,9 +441,10 @@ def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
 
 
 def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"]]:
-    """All frames of a video, one after the other, grey and no larger than that.
+    """Yields all frames of a video, one after the other, in grey, (h, w). longer_side: largest
+    longer side, pixels. Larger frames are shrunk.
 
-    Raises: CaptureError naming the video.
+    Raises: CaptureError with the name of the video.
     """
     return (frame[..., 0] for frame in _small_frames(path, longer_side, "gray", None))
 
@@ -433,10 +452,10 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
 def color_frames(
     path: Path, longer_side: int, chosen: Sequence[int] | None
 ) -> Iterator[UInt[np.ndarray, "h w 3"]]:
-    """These frames of a video, counted from 0 and in order, or all, in colors as stored, no larger
-    than that.
+    """Yields frames of a video in the stored colors, (h, w, 3). Larger frames are shrunk to
+    `longer_side` pixels. chosen: their numbers, from 0 and ascending. None: all.
 
-    Raises: CaptureError naming the video.
+    Raises: CaptureError with the name of the video.
     """
     return _small_frames(path, longer_side, "rgb24", chosen)
 
@@ -444,7 +463,7 @@ def color_frames(
 def _small_frames(
     path: Path, longer_side: int, pixels: str, chosen: Sequence[int] | None
 ) -> Iterator[UInt[np.ndarray, "h w c"]]:
-    """Frames as ffmpeg's format `pixels` has them, see `grey_frames` and `color_frames`."""
+    """Yields frames in ffmpeg's pixel format `pixels`, see `grey_frames` and `color_frames`."""
     with reading(path, "video", CaptureError):
         width, height = _frame_size(path, _shown(path))
         # frames of the size that is wanted, raw, through a pipe
@@ -480,16 +499,16 @@ def _small_frames(
 
 
 def frame_rate(path: Path) -> float | None:
-    """Frames a second of a video in the mean; None where it does not say.
+    """Returns the mean number of frames per second of a video. None if the video does not say.
 
-    Raises: CaptureError naming the video.
+    Raises: CaptureError with the name of the video.
     """
     with reading(path, "video", CaptureError):
         return _shown(path).rate
 
 
 def _opened(path: Path, verbosity: str = "error") -> list[str]:
-    """The beginning of a command of ffmpeg: the program, and the video."""
+    """Returns the beginning of a command of ffmpeg: the program, and the video that it reads."""
     import imageio_ffmpeg
 
     command = [
@@ -513,8 +532,8 @@ def _ffmpeg(path: Path, filters: str) -> list[str]:
 
 
 def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int:
-    """Write at most that many frames for which ffmpeg's expression is not 0; returns how many there
-    are.
+    """Write at most `most` frames for which ffmpeg's expression `select` is not 0. Returns how many
+    were written.
     """
     table, filters = folder / _TABLE, [f"select={select}", *filter(None, [shown.shape])]
     if shown.encoding is not None:

@@ -1,19 +1,20 @@
-"""A motion from the keypoints of a video of one camera that stands still: one fit over all frames,
-with one shape.
+"""Fits a motion to the keypoints of a video of one camera that stands still. One fit covers all
+frames, with one shape. Its stages are:
 
     start    the trunk of each frame by the detector's 3D landmarks, smoothed over time
-    shape    frames from all over the video, without their order: the shape, unless it is known
-    motion   windows of `WINDOW` frames that overlap: keypoints by their noise, the detector's
-             depths, the priors of poses, accelerations and jerk of the joints
-    feet     the same again, with the feet held that the motion shows to stand still
-    floor    the world turned so that whoever stands does so along y
+    shape    the shape, unless it is known, by frames from all over the video without their order
+    motion   windows of `WINDOW` frames that overlap, by keypoints with their noise, the detector's
+             depths, the priors of poses, and accelerations and jerk of the joints
+    feet     the motion once more, with the feet held where the motion shows that they stand still
+    floor    the world turned so that people stand along y
 
-The unknowns of a window are u with x = S u, S = (1 + w D^T D)^(-1/2), D the third differences
-over time: in u the solver sees a problem whose jerk is about as stiff as its keypoints
-(preconditioning), and few steps carry a correction through all frames. All stages are one compiled
+The unknowns of a window are u with x = S u, S = (1 + w D^T D)^(-1/2), where D takes third
+differences over time. This is preconditioning: in u the jerk is about as stiff as the keypoints, so
+that few steps of the solver carry a correction through all frames. All stages use one compiled
 program.
 
-After HTD-Refine (https://arxiv.org/abs/2605.26879) and GVHMR (https://arxiv.org/abs/2409.06662).
+The method follows HTD-Refine (https://arxiv.org/abs/2605.26879) and GVHMR
+(https://arxiv.org/abs/2409.06662).
 """
 
 import dataclasses
@@ -55,87 +56,98 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry.transform import EXACT
 
 WINDOW, OVERLAP = 120, 24
-"""Frames of a window, and those that it shares with the next."""
+"""Number of frames of a window, and of frames that it shares with the next window."""
 _STEPS, _STEP_LENGTH = 120, 0.1
-"""Steps of gradient descent in each stage of a window, and the length of the first step in each
-unknown."""
+"""Number of steps of gradient descent in each stage of a window, and length of the first step in
+each unknown.
+"""
 _ACCELERATION, _JERK = 10.0, 100.0
-"""Expected standard deviations of a joint's acceleration, m/s^2, and jerk, m/s^3: those of people
-who dance."""
+"""Expected standard deviations of a joint's acceleration, m/s^2, and jerk, m/s^3. They are those of
+people who dance.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class _MotionPrior:
-    """What is expected of a motion."""
+    """Constants of the prior of motions."""
 
     keypoint: float = 0.008
-    """Noise of a keypoint at the person, metres, for the preconditioning."""
+    """Noise of a keypoint as a distance at the person, metres. Only the preconditioning uses it."""
     held_speed: float = 0.03
     """Standard deviation of the speed of a foot that stands still, metres a second."""
     height: float = 0.005
-    """How exactly a person's height is known, metres."""
+    """Standard deviation of a person's known height, metres."""
     anchor: float = 20.0
-    """How hard a window holds to frames that the one before has found, per unit of the state."""
+    """Weight that holds a window to the frames that the window before has found, per unit of the
+    state.
+    """
     robust_scale: float = 5.0
-    """Robust scale of accelerations and jerk, standard deviations."""
+    """Robust scale of accelerations, jerk and speeds of feet, standard deviations."""
 
 
 _PRIOR = _MotionPrior()
 
 
 _LEVELS = ((30.0, 8.0), (10.0, 3.0), (5.0, 1.0))
-"""One row for each stage of a motion: the robust scale of keypoints, and the factor on the expected
-accelerations."""
+"""Robust scale of keypoints and factor on the expected accelerations and jerk, one row for each
+stage of a motion.
+"""
 _FEET = ("left_heel", "left_foot_index", "right_heel", "right_foot_index")
-"""Landmarks that stand still while a foot does."""
+"""Landmarks of the feet, which stand still while the foot stands."""
 _LEAST_SEEN = 6
-"""Keypoints of a frame below which its start is interpolated."""
+"""Least number of visible keypoints of a frame. The start of a frame with fewer is interpolated."""
 _LEAST_VISIBLE = 0.3
-"""Visibility of a keypoint from which on it counts for that."""
+"""Confidence above which a keypoint counts as visible for `_LEAST_SEEN`."""
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
-"""Turn between the axes of the camera and those of a world with y up and z towards the camera."""
+"""Matrix between the axes of the camera and those of a world with y up and z towards the camera."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MotionFit:
-    """A person in m frames of a video, in a world with y up whose floor is at 0."""
+    """The motion of a person in m frames of a video. The world has y up, and its floor is at y =
+    0.
+    """
 
     betas: Float[np.ndarray, " s"]
-    """The shape of the person."""
+    """Shape of the person, (s,)."""
     motion: Motion
-    """The poses."""
+    """Poses in all frames."""
     joints: Float[np.ndarray, "m j 3"]
-    """Joints in the world, metres."""
+    """Joints in the world, (m, j, 3), metres."""
     cam_from_world: Float[np.ndarray, "4 4"]
-    """The camera, which stands still, metres."""
+    """Matrix of the camera, which stands still, (4, 4), metres."""
     static: Float[np.ndarray, "m f"]
-    """How surely each landmark of `_FEET` stands still, 0 to 1."""
+    """How surely each landmark of `_FEET` stands still between the frame before and this one, (m,
+    f), 0 to 1.
+    """
 
 
 @pytree_dataclass
 class _Window:
-    """What a window knows besides its keypoints, for `_solved`."""
+    """What `_solved` knows about a window besides its keypoints."""
 
     poses: BodyPose
-    """Poses at which the unknowns are 0, a batch of frames."""
+    """Poses with which the fit begins, a batch of w frames."""
     betas: Float[Array, " s"]
-    """Shape at which its unknowns are 0."""
+    """Shape with which the fit begins, (s,)."""
     smoother: Float[Array, "w w"]
-    """S, see the module's head."""
+    """Matrix S of the preconditioning, (w, w), see the module's docstring."""
     timed: Float[Array, " w"]
-    """1 for frames that follow the one before in time, 0 for others."""
+    """1 for frames that follow each other in time, 0 for others, (w,)."""
     held: Float[Array, "v f"]
-    """How surely points of the feet stand still from a frame to the next."""
+    """How surely the landmarks of `_FEET` stand still from a frame to the next, (w - 1, f), 0 to
+    1.
+    """
     anchored: Float[Array, " w"]
-    """1 for frames that stay as they are."""
+    """1 for frames that are held to their poses, 0 for others, (w,)."""
     height: Float[Array, "2"]
-    """The person's height, metres, and how much it counts, 0 or 1."""
+    """Height of the person, metres, and its weight, 0 or 1, (2,)."""
     tall: Float[Array, " s1"]
-    """Height of the mean body, then what a unit of each coefficient adds, metres."""
+    """Height of the mean body, and what a unit of each coefficient adds to it, (1 + s,), metres."""
     rate: Float[Array, ""]
     """Frames per second."""
     scales: Float[Array, "2"]
-    """A row of `_LEVELS`."""
+    """A row of `_LEVELS`, (2,)."""
 
 
 def fit_motion(
@@ -148,15 +160,18 @@ def fit_motion(
     height: float | None = None,
     watch: Callable[[Iterable[Any], int], Iterable[Any]] = lambda stages, count: stages,
 ) -> MotionFit:
-    """The motion of a person in a video of one camera that stands still.
+    """Returns the motion of a person in a video of one camera that stands still.
 
-    Arguments:
-        keypoints: of each frame, with the detector's 3D landmarks (`Keypoints.world`).
-        K: of the camera, pixels.
-        betas: the person's shape, if it is known; None: it is fitted.
-        height: of the person, metres; None: as the keypoints and the prior have it.
-        watch: called with the stages and the number of windows; returns the stages, for a bar.
-    Raises: ValueError if no frame shows the person.
+    Args:
+        body: body model of the person.
+        keypoints: keypoints of all frames, with the detector's 3D landmarks (`Keypoints.world`).
+        K: intrinsics of the camera, (3, 3), pixels.
+        fps: frames per second.
+        betas: shape of the person, (s,). None: the shape is fitted.
+        height: height of the person, metres. None: it follows from keypoints and prior.
+        watch: called with the stages and the number of windows. It returns the stages, and may show
+            a bar meanwhile.
+    Raises: ValueError if no frame shows the person, or if the keypoints have no 3D landmarks.
     """
     body = without_expression(body)
     kind = keypoints.set
@@ -218,7 +233,9 @@ def _observations(keypoints: Keypoints, K: Float[np.ndarray, "3 3"]) -> Observat
 def _start(
     model: LandmarkModel, seen: Observations, fps: float, betas: Float[np.ndarray, " s"]
 ) -> BodyPose:
-    """Usual poses, turned and placed as the detector's 3D landmarks are, smoothed over time."""
+    """Returns the first poses: usual poses, turned and placed like the detector's 3D landmarks and
+    smoothed over time.
+    """
     problem = keypoint_problem(model)
     still = replace(zero_state(problem.origin), betas=jnp.asarray(betas, jnp.float32))
     resting, joints = problem.landmarks_and_joints(still)
@@ -256,13 +273,13 @@ def _start(
 
 
 def _radius(points: Float[np.ndarray, "*m k 3"]) -> Float[np.ndarray, "*m"] | np.floating:
-    """Root mean square of the distances from the middle."""
+    """Returns the root mean square of the points' distances from their mean."""
     off = points - points.mean(-2, keepdims=True)
     return np.sqrt(np.square(off).sum(-1).mean(-1))
 
 
 def _steady(values: Float[np.ndarray, "m ..."], fps: float) -> Float[np.ndarray, "m ..."]:
-    """Values of the frames without outliers, smoothed over time."""
+    """Removes outliers from values of the frames, (m, ...), and smooths them over time."""
     kept = median_filter(values, size=(5, *[1] * (values.ndim - 1)), mode="nearest")
     # over a tenth of a second, or half a frame
     return gaussian_filter1d(kept, max(0.1 * fps, 0.5), axis=0, mode="nearest")
@@ -271,7 +288,9 @@ def _steady(values: Float[np.ndarray, "m ..."], fps: float) -> Float[np.ndarray,
 def _turn(
     a: Float[np.ndarray, "k 3"], b: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]
 ) -> Rotation:
-    """The rotation about the weighted middles that brings points a closest to points b."""
+    """Returns the rotation that brings points a closest to points b, both taken relative to their
+    weighted mean.
+    """
     a, b = (x - np.average(x, axis=0, weights=weights) for x in (a, b))
     return Rotation.align_vectors(b, a, weights=weights)[0]
 
@@ -304,7 +323,9 @@ def _place(
 
 
 def _tallness(body: BodyModel) -> Float[np.ndarray, " s1"]:
-    """The height of the mean body, then what a unit of each shape coefficient adds, metres."""
+    """Returns the height of the mean body, then what a unit of each shape coefficient adds to it,
+    (1 + s,), metres.
+    """
     template = np.asarray(body.template)
     top, bottom = template[:, 1].argmax(), template[:, 1].argmin()
     directions = np.asarray(body.shape_directions)[:, 1]
@@ -314,7 +335,7 @@ def _tallness(body: BodyModel) -> Float[np.ndarray, " s1"]:
 def _of_height(
     betas: Float[np.ndarray, " s"], tall: Float[np.ndarray, " s1"], height: float | int | None
 ) -> Float[np.ndarray, " s"]:
-    """Returns the shape of that height (metres) nearest to `betas`; with None, `betas`."""
+    """Returns the shape nearest to `betas` that has this height, metres. None: `betas`."""
     if height is None:
         return betas
     missing = height - tall[0] - tall[1:] @ betas
@@ -326,7 +347,7 @@ def _of_height(
 
 
 def _windows(m: int) -> list[np.ndarray]:
-    """Numbers of the frames of each window, which overlap."""
+    """Returns the numbers of the frames of each window. Windows overlap."""
     starts = range(0, max(m - OVERLAP, 1), WINDOW - OVERLAP)
     return [np.arange(start, min(start + WINDOW, m)) for start in starts]
 
@@ -339,7 +360,8 @@ def _joined(
 ) -> BodyPose:
     """Solves the windows one after the other, and returns the poses of all frames.
 
-    A window keeps the first half of the frames that it shares with the one before.
+    Each window is held to the first half of the frames that it shares with the window before. more:
+    further arguments of `run` for a window.
     """
     for i, window in enumerate(windows):
         anchored = np.zeros(len(window))
@@ -362,9 +384,16 @@ def _run(
     static: Float[np.ndarray, "w f"] | None = None,
     anchored: Float[np.ndarray, " w"] | None = None,
 ) -> tuple[BodyPose, Float[np.ndarray, " s"]]:
-    """Fits the poses of these frames. Returns all poses and the shape.
+    """Fits the poses of some frames. Returns the poses of all frames, with those replaced, and the
+    shape.
 
-    timed: whether the frames follow each other in time and the shape is known already.
+    Args:
+        frames: numbers of the frames, (w,) at most `WINDOW`.
+        poses: poses of all frames, with which the fit begins.
+        scales: a row of `_LEVELS`.
+        timed: whether the frames follow each other in time. If so, the shape stays.
+        static: how surely the feet stand still, (w, f). None: they are not held.
+        anchored: 1 for frames that are held to their poses, (w,). None: none is.
     """
     count = len(frames)
     # windows have one length, so that one program does for all: what is added shows nothing
@@ -423,7 +452,7 @@ def _solved(
     feet = np.asarray([model.names.index(name) for name in _FEET])
 
     def smooth(state: FitState) -> FitState:
-        """x = begun + S u."""
+        """Returns the state x = begun + S u of the unknowns u."""
 
         def moved(old, u):
             return old + jnp.einsum("vw,w...->v...", window.smoother, u, precision=EXACT)
@@ -486,7 +515,7 @@ def _descended(loss: Callable[[FitState], Float[Array, ""]], start: Any) -> FitS
 
 
 def _roots_of(rotations: Float[Array, "m j 3"]) -> Float[Array, "m j 3"]:
-    """The rotations of the roots, 0 for the other joints."""
+    """Returns the rotations with 0 for all joints but the root, (m, j, 3)."""
     return jnp.zeros_like(rotations).at[:, 0].set(rotations[:, 0])
 
 
@@ -508,7 +537,9 @@ def _feet(model: LandmarkModel, landmarks: Float[Array, "m k 3"]) -> Float[np.nd
 def _static_feet(
     model: LandmarkModel, betas: Float[np.ndarray, " s"], poses: BodyPose, fps: float
 ) -> Float[np.ndarray, "m f"]:
-    """How surely each point of the feet stands still between a frame and the one before."""
+    """Returns how surely each point of the feet stands still between the frame before and this one,
+    (m, f), 0 to 1.
+    """
     points, _ = _landmarks(model, jnp.asarray(betas, jnp.float32), poses)
     moved = np.diff(_feet(model, points), axis=0, prepend=np.nan) * fps
     moved[..., 2] /= 2  # depths of a single camera are unsteady
@@ -527,7 +558,9 @@ def _standing(
     static: Float[np.ndarray, "m f"],
     fps: float,
 ) -> MotionFit:
-    """The motion in a world turned so that the person stands along y, with the floor at 0."""
+    """Returns the motion in a world turned so that the person stands along y, with the floor at y =
+    0.
+    """
     shape = jnp.asarray(betas, jnp.float32)
     joints = np.asarray(_landmarks(model, shape, poses)[1], np.float64)
     rest = shape_body(body, shape)

@@ -1,9 +1,9 @@
-"""Files of keypoints: ours, OpenPose's, EasyMocap's, COCO's (AlphaPose's, COCO-WholeBody's) and
-MMPose's.
+"""Reads files of keypoints: ours, OpenPose's, EasyMocap's, COCO's (also AlphaPose's and
+COCO-WholeBody's) and MMPose's.
 
-In ours alone the centre of the first pixel is at (0.5, 0.5). The keypoints of one person, by
-`save_keypoints`: an npz of points (v, k, 2), confidences (v, k), the set's name, and the names of
-the v views. The people in photos, by `humangs detect`:
+Only our files have the centre of the first pixel at (0.5, 0.5). There are two kinds.
+`save_keypoints` writes the keypoints of one person: an npz of points (v, k, 2), confidences (v, k),
+the set's name, and the names of the v views. `humangs detect` writes the people in photos:
 
     {"format": "humangs-people", "version": 1, "set": "mediapipe33", "images": [
         {"image": "front.jpg", "width": 1920, "height": 1080, "people": [
@@ -11,7 +11,8 @@ the v views. The people in photos, by `humangs detect`:
             ...]}, null]}]}
 
 world: metres from the middle of the hips in the camera's axes (x right, y down, z away), of a
-person of average size. The i-th of every image is one and the same person; null: not in it.
+person of average size. The i-th entry of `people` is the same person in all images, or null if the
+person is not in the image.
 """
 
 import dataclasses
@@ -50,21 +51,25 @@ from humangs_jax.io.arrays import ArrayFile, write_npz
 from humangs_jax.io.reading import check_limit, limits, shown, write_json
 
 FORMAT = "humangs-people"
-"""Name of the format in its files."""
+"""Value of the field "format" of the files."""
 VERSION = 1
-"""Version of the format that is written and read."""
+"""Version of the format that is written. No other version is read."""
 _DECIMALS = 4
-"""Decimals of numbers in the file: a ten-thousandth of a pixel, a tenth of a millimetre."""
+"""Number of decimals of numbers in the file: a ten-thousandth of a pixel, a tenth of a
+millimetre.
+"""
 
 
 def recognizes_own(source: KeypointFile) -> bool:
-    """Whether a file is one of ours; npz archives are taken for one."""
+    """Returns whether a file is one of ours. Every npz archive counts as ours."""
     return source.path.suffix.lower() == ".npz" or _is_people_file(source.json)
 
 
 def read_own(source: KeypointFile, format: SourceFormat) -> Detections:
-    """The keypoints of one person, or all people, with confidence 0 where they are not in the
-    image. Raises: CaptureError.
+    """Returns the keypoints in one of our files, of one person or of all people. People have
+    confidence 0 in images that they are not in.
+
+    Raises: CaptureError if the file is not valid.
     """
     if source.path.suffix.lower() == ".npz":
         return _saved(source.path)
@@ -81,10 +86,11 @@ def read_own(source: KeypointFile, format: SourceFormat) -> Detections:
 
 
 def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
-    """Write our own format (.npz). names: of the views, as in the capture. `read_keypoints` reads
-    exactly these back.
+    """Write keypoints of one person in our own format (.npz). `read_keypoints` reads exactly these
+    back.
 
-    Raises: ValueError if the path does not end in .npz, or there is not one name per view.
+    names: one name for each view, as in the capture.
+    Raises: ValueError if the path does not end in .npz, or if there is not one name per view.
     """
     if len(names) != len(keypoints.points):
         raise ValueError(
@@ -131,19 +137,21 @@ class SeenPerson:
     """A person in an image."""
 
     points: Float[np.ndarray, "k 3"]
-    """Pixels and visibility of the points, (k, 3)."""
+    """Pixels (x, y) and visibility of the points, (k, 3)."""
     world: Float[np.ndarray, "k 3"]
-    """Places of the points, (k, 3), metres."""
+    """Positions of the points in space, (k, 3), metres, see the module's docstring."""
     presence: float
-    """Presence of the person, in [0, 1]."""
+    """Probability that there is a person, in [0, 1]."""
     hands: Float[np.ndarray, "42 6"] | None = None
-    """The 21 landmarks of the left and of the right hand: pixels, confidence, and places in metres;
-    0 for a hand that was not seen; None: hands were not looked for, or neither was seen."""
+    """The 21 landmarks of the left and then of the right hand, (42, 6): pixels, confidence, and
+    position in metres. Zeros for a hand that was not seen. None if neither was seen, or hands were
+    not looked for.
+    """
 
 
 def columns_of(person: SeenPerson | None, hands: bool) -> Float[np.ndarray, "k 6"]:
-    """Pixels, confidence and places of a person's points, 0 for nobody: those of `MEDIAPIPE_33`, or
-    with hands of `MEDIAPIPE_69`.
+    """Returns pixels, confidence and position of a person's points, (k, 6). Zeros for None. The
+    points are those of `MEDIAPIPE_69` if `hands`, else of `MEDIAPIPE_33`.
     """
     if person is None:
         kind = MEDIAPIPE_69 if hands else MEDIAPIPE_33
@@ -157,18 +165,18 @@ def columns_of(person: SeenPerson | None, hands: bool) -> Float[np.ndarray, "k 6
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImagePeople:
-    """An image and its people."""
+    """The people that were found in an image."""
 
     image: str
     """Name of the image."""
     size: tuple[int, int]
-    """Width and height, pixels."""
+    """Width and height of the image, pixels."""
     people: tuple[SeenPerson | None, ...]
-    """The people, None for those who are not in the image."""
+    """All people of the photos. None for those who are not in this image."""
 
 
 def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
-    """Write the file, whole or not at all."""
+    """Write the people of images to a file. If writing fails, no partial file is left."""
     described = []
     for image in images:
         people = [None if person is None else _described(person) for person in image.people]
@@ -202,9 +210,10 @@ def _described(person: SeenPerson) -> dict[str, Any]:
 
 
 def read_people(path: Path, content: Any = None) -> tuple[KeypointSet, tuple[ImagePeople, ...]]:
-    """The set and the images of a file. content: its JSON value, if it is known.
+    """Returns the set of keypoints and the images of a file of people. content: the JSON value of
+    the file, if it is read already.
 
-    Raises: CaptureError naming file and field.
+    Raises: CaptureError with the name of file and field.
     """
     content = checked_json(path) if content is None else content
     if not _is_people_file(content):
@@ -251,22 +260,24 @@ def _own_person(person: Any, count: int, path: Path, field: str) -> SeenPerson |
 # -----------------------------------------------------------------------------------------------
 
 BODY = "pose_keypoints_2d"
-"""Key of the body."""
+"""Key of the points of the body."""
 _BODY_POINTS = (25, 18)
-"""Points of the body in the models BODY_25 and BODY_25B, and in COCO."""
+"""Numbers of points of a body: 25 in the models BODY_25 and BODY_25B, 18 in COCO."""
 _OTHER_MODELS = {15: "MPI", 135: "BODY_135", 20: "an animal of ControlNet"}
-"""Models with other numbers of points, which are refused by name."""
+"""Models that are refused, by their number of points."""
 
 
 def recognizes_openpose(source: KeypointFile) -> bool:
-    """Whether a file is a JSON object with people, or a list of such."""
+    """Returns whether a file is a JSON object with "people", or a list of such objects."""
     frames = source.json if isinstance(source.json, list) else [source.json]
     return bool(frames) and all(isinstance(frame, dict) and "people" in frame for frame in frames)
 
 
 def read_openpose(source: KeypointFile, format: SourceFormat) -> Detections:
-    """The people of one image, or of the frames of a video, which programs with nodes write as a
-    list. Raises: CaptureError.
+    """Returns the people of one image, or of the frames of a video in a file with a list of frames.
+    Node-based programs (ControlNet) write such lists.
+
+    Raises: CaptureError if the file is not valid.
     """
     listed = isinstance(source.json, list)
     frames = source.json if listed else [source.json]
@@ -292,7 +303,9 @@ def read_openpose(source: KeypointFile, format: SourceFormat) -> Detections:
 
 
 def _canvas(frame: dict[str, Any], file: Path) -> tuple[int, int] | None:
-    """Width and height of the image that the points are of, where the file says so."""
+    """Returns width and height of the image in which the points are, or None if the file does not
+    state them.
+    """
     width, height = frame.get("canvas_width"), frame.get("canvas_height")
     if width is None or height is None:
         return None
@@ -300,7 +313,10 @@ def _canvas(frame: dict[str, Any], file: Path) -> tuple[int, int] | None:
 
 
 def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np.ndarray, "k 3"]:
-    """own: OpenPose has written it."""
+    """Returns the points of a person, (k, 3). own: whether OpenPose itself has written the file.
+
+    Raises: CaptureError for points of an unknown model.
+    """
     if expect(person, dict, file, field).get(BODY) is None:
         person = person | {BODY: []}
     (body,) = members(person, file, field, **{BODY: list})
@@ -328,8 +344,9 @@ def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np
 def _parts(
     person: dict[str, Any], counts: dict[str, int], file: Path, field: str
 ) -> Float[np.ndarray, "k 3"]:
-    """The points of the parts of a person; those that were not detected are left out, null, or
-    empty lists.
+    """Returns the points of all parts of a person, (k, 3). counts: number of points of each part,
+    by its key. Zeros for a part that was not detected: its key is missing, or its value null or an
+    empty list.
     """
     points = []
     for key, count in counts.items():
@@ -345,13 +362,15 @@ def _parts(
 
 
 def recognizes_easymocap(source: KeypointFile) -> bool:
-    """Whether a file is a JSON object with annots."""
+    """Returns whether a file is a JSON object with a list "annots"."""
     return isinstance(source.json, dict) and isinstance(source.json.get("annots"), list)
 
 
 def read_easymocap(source: KeypointFile, format: SourceFormat) -> Detections:
-    """The people of one image: person I is the one with that personID, where these are small
-    numbers. Raises: CaptureError.
+    """Returns the people of one image. Person i is the one whose personID is i, if that is a whole
+    number below 64 and not taken. Other people follow after.
+
+    Raises: CaptureError if the file is not valid.
     """
     content, file, people = source.json, source.path, {}
     for i, entry in enumerate(content["annots"]):
@@ -381,8 +400,8 @@ def read_easymocap(source: KeypointFile, format: SourceFormat) -> Detections:
 def _part(
     entry: dict[str, Any], key: str, count: int | None, file: Path, field: str
 ) -> Float[np.ndarray, "k 3"]:
-    """The points of a part of a person, zeros where it is left out or empty. count: how many there
-    are, None: any number.
+    """Returns the points of a part of a person, (k, 3). Zeros if the part is missing or empty.
+    count: number of points. None: any number.
     """
     if not entry.get(key):
         return np.zeros((count or 0, 3))
@@ -399,11 +418,13 @@ _COCO_PARTS = {
     "lefthand_kpts": 21,
     "righthand_kpts": 21,
 }
-"""COCO-WholeBody's, in the order of its 133 points."""
+"""Keys and numbers of points of COCO-WholeBody's parts, in the order of its 133 points."""
 
 
 def recognizes_coco(source: KeypointFile) -> bool:
-    """Whether a file has annotations, or a list of results that name their image."""
+    """Returns whether a file is a JSON object with "annotations", or a list of results that name
+    their image.
+    """
     if isinstance(source.json, dict):
         return "annotations" in source.json
     entries = source.json if isinstance(source.json, list) else []
@@ -413,9 +434,10 @@ def recognizes_coco(source: KeypointFile) -> bool:
 
 
 def read_coco(source: KeypointFile, format: SourceFormat) -> Detections:
-    """The images of a file, those of results in the order in which they first appear.
+    """Returns the people of all images of a file. Images of a list of results come in the order in
+    which they first appear.
 
-    Raises: CaptureError.
+    Raises: CaptureError if the file is not valid.
     """
     of_kind = _annotated_images if isinstance(source.json, dict) else _result_images
     return detections_of(of_kind(source.json, source.path))
@@ -432,7 +454,9 @@ def _result_images(entries: list[Any], file: Path) -> list[DetectedImage]:
 
 
 def _annotated_images(content: dict[str, Any], file: Path) -> list[DetectedImage]:
-    """Crowds, and annotations without keypoints, are ignored."""
+    """Returns the images of a file with "images" and "annotations". Crowds and annotations without
+    keypoints are ignored.
+    """
     described, annotations = members(content, file, images=list, annotations=list)
     # images first: annotations name them by their id
     images: dict[str | int, tuple[dict[str, Any], list[Float[np.ndarray, "k 3"]]]] = {}
@@ -471,8 +495,8 @@ def _image_label(value: Any, file: Path, field: str) -> str | int:
 
 
 def _whole_body(entries: list[Any]) -> bool:
-    """Whether some person has a part of COCO-WholeBody; those who lack it have its points with
-    confidence 0.
+    """Returns whether some person has a part of COCO-WholeBody besides the body. Then people
+    without such a part get its points with confidence 0.
     """
     return any(
         isinstance(entry, dict) and len(_COCO_PARTS.keys() & entry.keys()) > 1 for entry in entries
@@ -491,9 +515,11 @@ def _coco_person(
 def _by_visibility(
     person: Float[np.ndarray, "k 3"], file: Path, field: str
 ) -> Float[np.ndarray, "k 3"]:
-    """Confidences from visibilities.
+    """Converts visibilities of a person's points to confidences: 1 for a visible point, 0.5 for a
+    hidden one, 0 for one without annotation. person: (k, 3).
 
     Fractions occur in COCO-WholeBody, where any value above 0 means reliable.
+    Raises: CaptureError for values outside of 0 to 2.
     """
     visibility = person[:, 2]
     # COCO's visibility of a point that is seen; 1 is hidden, 0 not annotated
@@ -507,7 +533,11 @@ def _by_visibility(
 
 
 def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
-    """Width and height that the file states; 0 means unknown."""
+    """Returns width and height that the file states for an image, pixels. None if one is 0 or
+    missing.
+
+    Raises: CaptureError for values that are no size.
+    """
     width, height = size = image.get("width"), image.get("height")
     if not width or not height:
         return None
@@ -522,11 +552,13 @@ def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
 # ----------------------------------------------------------------------------------
 
 _PREFIX = "results_"
-"""What the demo scripts put before the name of the image."""
+"""Prefix of the demo scripts before the name of the image."""
 
 
 def recognizes_mmpose(source: KeypointFile) -> bool:
-    """Whether a file has a list of instances or frames; an empty list may be anybody's."""
+    """Returns whether a file has a list of instances or frames. An empty list counts, although
+    another program may have written it.
+    """
     entries = _entries(source)
     if not isinstance(entries, list):
         return False
@@ -536,7 +568,10 @@ def recognizes_mmpose(source: KeypointFile) -> bool:
 
 
 def read_mmpose(source: KeypointFile, format: SourceFormat) -> Detections:
-    """The image of a file, or the frames of a video. Raises: CaptureError."""
+    """Returns the people of an image, or of the frames of a video.
+
+    Raises: CaptureError if the file is not valid.
+    """
     name, file, entries = source.name.removeprefix(_PREFIX), source.path, _entries(source)
     if not any(isinstance(entry, dict) and "frame_id" in entry for entry in entries):
         return detections_of([DetectedImage(name, file, _people(entries, file, "instances"))])
