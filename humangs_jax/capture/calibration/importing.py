@@ -1,8 +1,8 @@
-"""`import_cameras`: photos and the calibration that another tool made of their cameras -> a capture
-folder without body.
+"""Imports photos and the calibration that another tool made of their cameras (`import_cameras`).
+The result is a capture folder without body.
 
 docs/cameras.md describes the formats and their conventions. Photos are copied as they are, or
-undistorted where the lens asks for it; capture.json names body.npz, which `humangs fit` makes.
+undistorted if the lens needs it. capture.json names body.npz, which `humangs fit` makes later.
 """
 
 import dataclasses
@@ -66,12 +66,12 @@ from humangs_jax.io.images import MASK, is_heic, read_grey, read_image, write_pn
 from humangs_jax.io.reading import check_limit, reading, write_json
 
 _SIZES_SHOWN = 5
-"""Sizes of photos that a report lists."""
+"""Largest number of sizes of photos that a report lists."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ImportReport:
-    """What was imported and how it was read; `str(report)` is what the command line prints."""
+    """What was imported, and how it was read. `str(report)` is what the command line prints."""
 
     out: Path
     """Folder of the capture."""
@@ -86,23 +86,23 @@ class ImportReport:
     height: int
     """Height of the photos, pixels."""
     undistorted: int
-    """Photos of which lens distortion was removed."""
+    """Number of photos of which lens distortion was removed."""
     turned: int
-    """Photos that were turned upright by their EXIF orientation."""
+    """Number of photos that were turned upright by their EXIF orientation."""
     heic: int
-    """Photos that were HEIC, or their masks."""
+    """Number of photos that are HEIC or have a HEIC mask."""
     masks: bool
-    """Whether it has mask files."""
+    """Whether the import had mask files."""
     checks: Checks
-    """What was found about the calibration."""
+    """What was found out about the calibration."""
     read_as: str
-    """How the calibration was read: format, axes, unit, and pixel centres."""
+    """How the calibration was read: format, axes, unit and pixel centres."""
     notes: tuple[str, ...]
-    """Further lines."""
+    """Further lines of the report."""
     warnings: tuple[str, ...]
-    """Likely mistakes."""
+    """Likely mistakes, one line each."""
     unused: tuple[Unused, ...] = ()
-    """What the folder of photos holds besides."""
+    """Files in the folder of photos that were not used."""
 
     def __str__(self) -> str:
         photos, cameras = counted(self.views, "photo"), counted(self.cameras, "camera")
@@ -142,26 +142,34 @@ def import_cameras(
     overwrite: bool = False,
     also: Mapping[str, object] | None = None,
 ) -> ImportReport:
-    """Write a capture folder (all of it or nothing) of photos and their calibration; body.npz is
-    still to be made.
+    """Write a capture folder of photos and their calibration. If anything fails, nothing is
+    written. The folder has no body.npz yet.
 
-    Arguments:
-        source: file or folder of any format in docs/cameras.md; its content decides which one.
-        images: folder of the photos, or of a video of each camera (CAMERA.mp4). masks: folder of
-            their masks, named alike. others: folder of masks of other people and of things in
-            front, named alike; photos that nobody covers need none.
-        out: the capture folder. With `overwrite` a capture that is there is replaced as a whole.
-        scale: metres per unit of the source; None: the format's unit, else the one that puts the
-            cameras near a person.
-        up: the axis of the source's world that points up, "+y", "-z", ...; None: the format's.
-        every, frames: of videos, the frame step and the largest number of frames.
+    Args:
+        source: file or folder in any format of docs/cameras.md. The content decides which format it
+            is.
+        images: folder of the photos, or of a video of each camera (CAMERA.mp4).
+        out: the capture folder.
+        masks: folder of the photos' masks, which have the photos' names. None: the masks that the
+            calibration names, if any.
+        others: folder of masks of other people and of things in front of the person, which have the
+            photos' names. Photos in which nothing covers the person need none.
+        scale: metres per unit of the source. None: the unit of the format, or else the one that
+            puts the cameras near a person.
+        up: the axis of the source's world that points up, "+y", "-z", .... None: that of the
+            format.
         pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0),
-            "half": (0.5, 0.5);
-            None: as the format says.
-        also: name -> content of JSON files that appear in the folder together with the capture.
+            "half": (0.5, 0.5). None: as the format says.
+        every: step between the frames of videos.
+        frames: largest number of frames of videos. None: all.
+        overwrite: whether a capture at `out` is replaced as a whole.
+        also: contents of JSON files, by their name, that are written to the folder together with
+            the capture.
 
-    Raises: ValueError for an option, CaptureError (one line: file, field, what was expected) for
-    everything else.
+    Returns: what was imported, and how.
+
+    Raises: ValueError for an option. CaptureError for everything else, in one line: file, field,
+    and what was expected.
     """
     source, images, out = Path(source), Path(images), Path(out)
     masks = None if masks is None else Path(masks)
@@ -198,9 +206,10 @@ def import_cameras(
 
 
 def photo_size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
-    """Width and height of the photo of that name.
+    """Returns width and height of the photo that the source calls `name`.
 
-    A name without photo gets those of another: its camera is left out later.
+    If there is none, it returns the size of another photo: a camera without photo is left out
+    later.
     """
     try:
         return photo_size(photo_of(images, name, source))
@@ -223,7 +232,7 @@ def import_calibration(
     pixel_centers: str | None = None,
     also: Mapping[str, object] | None = None,
 ) -> ImportReport:
-    """`import_cameras` of a calibration in memory, which replaces a capture that is there."""
+    """Imports a calibration in memory like `import_cameras`. A capture at `out` is replaced."""
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
     about_unit = None
     if scale is None:
@@ -303,7 +312,7 @@ def import_calibration(
 
 
 def _no_common_frame(calibration: Calibration) -> str:
-    """The warning that no two photos are of one frame."""
+    """Returns the warning that no two photos are of the same frame."""
     if calibration.per_image:
         return "no two photos show the same moment: each is a frame with another pose"
     same = "photos of one frame must have the same file name"
@@ -313,8 +322,8 @@ def _no_common_frame(calibration: Calibration) -> str:
 def _mask_line(
     calibration: Calibration, masks: Path | None, photos: Sequence[Photo]
 ) -> tuple[str | None, bool]:
-    """A line about the masks that a calibration names, None if it names none; and whether these are
-    used.
+    """Returns a line about the masks that a calibration names, or None if it names none, and
+    whether these masks are used.
     """
     if calibration.mask_key is None:
         return None, False
@@ -346,10 +355,11 @@ def _check_options(
 
 
 def _canvas(images: Path, photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[int, int]:
-    """Width and height of what is written: the largest of all photos, upright.
+    """Returns width and height of all photos that are written, pixels. They are the largest width
+    and the largest height of all upright photos.
 
-    Raises: CaptureError if the photos of one camera have several sizes, or if so much may not be
-    read together.
+    Raises: CaptureError if the photos of one camera have different sizes, or if the photos together
+    exceed the limits of pixels.
     """
     first = {}
     for photo, turn in zip(photos, turns, strict=True):
@@ -407,10 +417,10 @@ def _write(
     canvas: tuple[int, int],
     in_front: Mapping[Path, Path],
 ) -> list[str]:
-    """Writes photos, masks, what is unknown, and capture.json.
+    """Writes photos, masks, masks of unknown pixels, and capture.json.
 
-    Arguments: in_front: the masks of others, by photo.
-    Returns: the names of photos whose person reaches what the camera has not seen.
+    Arguments: in_front: the masks of other people and things, by photo.
+    Returns: the names of photos in which the person reaches the border of what the camera has seen.
     """
     (folder / "images").mkdir(parents=True)
     if photos[0].mask is not None:
@@ -451,8 +461,8 @@ def _write(
 
 
 def _of_phones(photo: Photo) -> bool:
-    """Whether the photo or its mask is HEIC, which captures have none of: other programs cannot
-    read it.
+    """Returns whether the photo or its mask is HEIC. Captures have no HEIC files, because other
+    programs cannot read them.
     """
     return any(
         file is not None and read_checked(is_heic, file) for file in (photo.image, photo.mask)
@@ -477,12 +487,12 @@ def _rewrite(
     transparent: bool,
     canvas: tuple[int, int],
 ) -> tuple[dict[str, str], Float[np.ndarray, "h w"] | None]:
-    """Photo and mask (or its alpha) upright, as a pinhole sees them, and padded; pixels that it
-    does not see are white and background.
+    """Writes a photo and its mask (or alpha channel) upright, undistorted to a pinhole camera, and
+    padded. Added pixels are white, and background in the mask.
 
-    A photo that has alpha besides its mask keeps it. Opaque alpha, where no photo is `transparent`,
-    is left out.
-    Returns: the paths for capture.json, and the mask as it was written; None without one.
+    A photo that has alpha besides its mask keeps it. An opaque alpha channel is left out if no
+    photo is `transparent`.
+    Returns: the paths for capture.json, and the mask as it was written, or None if there is none.
     """
     # upright, and as a pinhole sees them
     image, alpha = read_checked(read_image, photo.image)
@@ -513,8 +523,8 @@ def _rewrite(
 def _padded(
     pixels: Float[np.ndarray, "h w *c"], canvas: tuple[int, int], fill: float
 ) -> Float[np.ndarray, "height width *c"]:
-    """Pixels (h, w, ...) with more on the right and below; those of an alpha channel that are added
-    are opaque white.
+    """Pads pixels (h, w, ...) on the right and below to the size of the canvas. fill: value of the
+    added pixels, whose alpha is 1 if the fill is 1.
     """
     (height, width), (right, below) = pixels.shape[:2], canvas
     if (height, width) == (below, right):

@@ -1,14 +1,15 @@
-"""Formats with a camera for each camera: OpenCV's K, R and T (AvatarReX, THuman4.0), EasyMocap,
-Panoptic, TOML, Qualisys.
+"""Reads formats that list the values of each camera: OpenCV's K, R and T (AvatarReX, THuman4.0),
+EasyMocap, Panoptic, multical, TOML and Qualisys.
 
-A world point X is at R X + T in the camera, pixel centres are at whole numbers. The values of a
-camera stand in a map, `{"cam00": {"K": .., "R": .., "T": .., "imgSize": [W, H]}}`, or
-beside those of others with its name behind: `K_01`, `dist_01`, `Rot_01` or `R_01` (matrix or
-rotation vector), `T_01`, with the list `names`, as in EasyMocap's intri.yml and extri.yml
+In OpenCV's convention a world point X is at R X + T in the camera, and pixel centres are at whole
+numbers. A camera's values are either in a separate map, `{"cam00": {"K": .., "R": .., "T": ..,
+"imgSize": [W, H]}}`, or the values of all cameras are in one map with the camera's name at the end
+of each key: `K_01`, `dist_01`, `Rot_01` or `R_01` (matrix or rotation vector), `T_01`, with the
+list `names`, as in EasyMocap's intri.yml and extri.yml
 (https://chingswy.github.io/easymocap-public-doc/database/1_camera.html).
 
-FileStorage's YAML is not quite YAML: the header is `%YAML:1.0`, and flow maps have no space after a
-colon ({ x:1 }). Matrices are `!!opencv-matrix` with rows, cols, dt and data.
+The YAML of OpenCV's FileStorage is not quite YAML: the header is `%YAML:1.0`, and flow maps have no
+space after a colon ({ x:1 }). Matrices are `!!opencv-matrix` with rows, cols, dt and data.
 https://docs.opencv.org/4.x/da/d56/classcv_1_1FileStorage.html
 """
 
@@ -49,20 +50,22 @@ from humangs_jax.io.reading import (
 )
 
 _FISHEYE = ("fisheye", "is_fisheye", "equidistant")
-"""Values of `model` and the like, or keys that are true, of lenses with another formula."""
+"""Words for fisheye lenses. They are values of `model` and similar keys, or keys whose value is
+true.
+"""
 
 
 Where = Callable[[str], tuple[Path, str]]
-"""The file and the field of a key of a camera, for errors."""
+"""Function that returns file and field of a camera's key, for errors."""
 
 
 def _in_map(file: Path, name: str) -> Where:
-    """Where the keys of a map of that name are."""
+    """Returns the function that finds file and field of keys in a map of this name."""
     return lambda key: (file, f"{name}.{key}")
 
 
 def recognizes_opencv(source: CalibrationFile) -> bool:
-    """Whether a file has K, R and T of cameras."""
+    """Returns whether a file has K, R and T of cameras."""
     if not (
         source.text.lstrip().startswith(("{", "%YAML", "---"))
         or source.path.suffix in (".yml", ".yaml")
@@ -76,7 +79,10 @@ def recognizes_opencv(source: CalibrationFile) -> bool:
 
 
 def read_opencv(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """The cameras of one file. Raises: CaptureError naming the key."""
+    """Reads the cameras of one file.
+
+    Raises: CaptureError with the name of the key.
+    """
     values = _values(source)
     nested = {name: value for name, value in values.items() if isinstance(value, Mapping)}
     if not nested:
@@ -87,12 +93,15 @@ def read_opencv(source: CalibrationFile, format: CameraFormat) -> Calibration:
 
 @functools.lru_cache(maxsize=1)
 def _values(source: CalibrationFile) -> dict[str, Any]:
-    """Parsed once: YAML is slow."""
+    """Returns the values of a file. They are cached, because parsing YAML is slow."""
     return parse_file_storage(source.text, source.path)
 
 
 def read_easymocap(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """The cameras of both files. Raises: CaptureError naming file and key."""
+    """Reads the cameras of the folder's two files, intri.yml and extri.yml.
+
+    Raises: CaptureError with the name of file and key.
+    """
     inner, outer = source.path / "intri.yml", source.path / "extri.yml"
 
     def file_of(key: str) -> Path:
@@ -110,8 +119,8 @@ def read_easymocap(source: CalibrationFile, format: CameraFormat) -> Calibration
 def _flat_cameras(
     values: Mapping[str, Any], file_of: Callable[[str], Path]
 ) -> list[CalibratedCamera]:
-    """Cameras whose names stand behind their keys: those of the list `names`, else those that have
-    a K.
+    """Reads cameras whose names are at the end of their keys. The cameras are those of the list
+    `names`, or without it those that have a K. file_of: returns the file of a key, for errors.
     """
     names = list(values.get("names") or (key[2:] for key in values if key.startswith("K_")))
     if not names:
@@ -137,9 +146,8 @@ def _flat_cameras(
 def _renamed_camera(
     name: str, entry: Mapping[str, Any], keys: Mapping[str, str], file: Path, field: str
 ) -> CalibratedCamera:
-    """A camera of an entry in which OpenCV's keys have these names: theirs -> OpenCV's.
-
-    Others are not looked at.
+    """Reads a camera whose values have other keys than OpenCV's. keys: their key -> OpenCV's key.
+    Values with other keys are ignored. file and field: of the entry, for errors.
     """
     theirs = {ours: key for key, ours in keys.items()} | {
         keys[key]: key for key in entry if key in keys
@@ -171,8 +179,8 @@ def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> Calibrate
 
 
 def _lens(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
-    """The fields of a camera that tell its lens. A fisheye is refused where photos without
-    distortion are asked for.
+    """Returns the fields of `CalibratedCamera` for the lens. For a fisheye lens they include the
+    error for commands that need photos without distortion.
     """
     coefficients, at, refusal = None, "", None
     for key, value in values.items():
@@ -193,8 +201,8 @@ def _lens(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
 
 
 def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
-    """Shelf and Campus (VoxelPose): focal lengths and centres by name, a lens as k and p; T is
-    where the camera stands.
+    """Converts a camera of Shelf and Campus (VoxelPose) to OpenCV's values. Shelf has focal lengths
+    and principal point under their names, the lens as k and p, and T is the position of the camera.
     """
 
     def numbers(key: str, *shape: int) -> Float[np.ndarray, "..."]:
@@ -214,13 +222,13 @@ def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
 # --------------------------------------------------------------------------------------------------
 
 _MATRIX = "opencv-matrix"
-"""The tag of matrices."""
+"""Tag of matrices in FileStorage."""
 
 
 def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
-    """The values of a FileStorage text; matrices are (rows, cols) arrays.
+    """Parses a FileStorage text and returns its values by key. Matrices are arrays (rows, columns).
 
-    Raises: CaptureError naming the line.
+    Raises: CaptureError with the number of the line.
     """
     with reading(file, "YAML file", CaptureError):
         if text.lstrip().startswith("{"):
@@ -250,7 +258,11 @@ class _Loader(yaml.SafeLoader):
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """The next node; no aliases, which a small file can nest to billions of values."""
+        """Returns the next node.
+
+        Raises: MarkedYAMLError for an alias, because a small file can nest aliases to billions of
+        values. InvalidFileError if nodes are nested too deeply.
+        """
         if self.check_event(yaml.AliasEvent):
             where = self.get_event().start_mark
             raise yaml.MarkedYAMLError(problem="aliases are not supported", problem_mark=where)
@@ -263,8 +275,8 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(node: yaml.Node, file: Path) -> Any:
-    """Reads the value of a node. Numbers are read here and not by YAML, which would take a camera's
-    name 01 for one.
+    """Returns the value of a node. Numbers are read here, because YAML would read the camera's name
+    01 as a number.
     """
     if isinstance(node, yaml.ScalarNode):
         value = _scalar(node.value) if node.style is None else node.value
@@ -302,7 +314,7 @@ def _matrix(value: Any, tag: str, file: Path, where: str) -> Float[np.ndarray, "
 
 
 def _matrices(value: Any, file: Path, field: str) -> Any:
-    """JSON values with the maps that stand for matrices replaced by arrays."""
+    """Returns JSON values in which maps that describe matrices are replaced by arrays."""
     if isinstance(value, list):
         return [_matrices(item, file, field) for item in value]
     if not isinstance(value, dict):
@@ -317,7 +329,7 @@ def _matrices(value: Any, file: Path, field: str) -> Any:
 
 
 def recognizes_panoptic(source: CalibrationFile) -> bool:
-    """Whether a file has a list of cameras."""
+    """Returns whether a file has a list "cameras", and no "frames"."""
     return (
         isinstance(source.json, dict)
         and isinstance(source.json.get("cameras"), list)
@@ -326,7 +338,10 @@ def recognizes_panoptic(source: CalibrationFile) -> bool:
 
 
 def read_panoptic(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """The cameras of the list. Raises: CaptureError naming the key."""
+    """Reads the cameras of the list.
+
+    Raises: CaptureError with the name of the key.
+    """
     # Panoptic's keys -> OpenCV's
     keys = {
         "K": "K",
@@ -349,21 +364,23 @@ def read_panoptic(source: CalibrationFile, format: CameraFormat) -> Calibration:
 # -------------------------------------------
 
 _RELATIVE = "_to_"
-"""Separates the names of two cameras in a key: "a_to_b" has the pose of a relative to b, with
-X_a = R X_b + T."""
+"""Separator of the names of two cameras in a key: "a_to_b" has the pose of a relative to b, with
+X_a = R X_b + T.
+"""
 
 
 def recognizes_multical(source: CalibrationFile) -> bool:
-    """Whether a file has maps of cameras and of their poses."""
+    """Returns whether a file has maps "cameras" and "camera_poses"."""
     return isinstance(source.json, dict) and all(
         isinstance(source.json.get(key), dict) for key in ("cameras", "camera_poses")
     )
 
 
 def read_multical(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """Reads the cameras of both maps; the world is the camera whose pose is relative to no other.
+    """Reads lenses and poses of the cameras. The world's axes are those of the camera whose pose is
+    not relative to another camera.
 
-    Raises: CaptureError naming the key.
+    Raises: CaptureError with the name of the key.
     """
     file, lenses = source.path, source.json["cameras"]
     poses: dict[str, Float[np.ndarray, "4 4"]] = {}
@@ -402,8 +419,8 @@ def read_multical(source: CalibrationFile, format: CameraFormat) -> Calibration:
 
 
 def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
-    """The camera that a key of `camera_poses` is of, and the one in whose axes it is, None for the
-    world's.
+    """Splits a key of `camera_poses`. Returns the camera that it places, and the camera in whose
+    axes the pose is, or None if the pose is in the world. names: of all cameras.
     """
     parts = key.split(_RELATIVE)
     for i in range(1, len(parts)):
@@ -418,14 +435,14 @@ def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
 
 
 def recognizes_toml(source: CalibrationFile) -> bool:
-    """Whether a file is called so and has tables of cameras."""
+    """Returns whether a file has the suffix .toml and tables of cameras."""
     return source.path.suffix.lower() == ".toml" and bool(_tables(source))
 
 
 def read_toml(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """The cameras of a file, but for those to be ignored or never placed.
+    """Reads the cameras of a file, without those that are marked with `ignore`.
 
-    Raises: CaptureError naming the key.
+    Raises: CaptureError with the name of the key.
     """
     cameras, file = [], source.path
     for key, table in _tables(source).items():
@@ -468,19 +485,22 @@ def _tables(source: CalibrationFile) -> dict[str, Mapping[str, Any]]:
 # ------------------------------------------------------------------------------------------
 
 _SUBPIXELS = 64.0
-"""Units of intrinsics per pixel."""
+"""Number of units of intrinsics in a pixel."""
 _LENS = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
-"""Attributes of Brown and Conrady's coefficients k1, k2, p1, p2."""
+"""Attributes of Brown and Conrady's coefficients, in the order k1, k2, p1, p2."""
 
 
 def recognizes_qualisys(source: CalibrationFile) -> bool:
-    """Whether a file is XML of a calibration with fields of view."""
+    """Returns whether a file is XML with the transforms and focal lengths of Qualisys."""
     text = source.text.lstrip()
     return text.startswith("<") and "<transform" in text and "focalLengthU" in text
 
 
 def read_qualisys(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """The cameras of a file. Raises: CaptureError naming the camera and what is missing."""
+    """Reads the cameras of a file.
+
+    Raises: CaptureError with the name of the camera and what is missing.
+    """
     check_limit("slow_text_bytes", len(source.text), "characters of XML")
     if re.search(r"<!(DOCTYPE|ENTITY)", source.text):
         raise InvalidFileError("XML with entities, which are not read")

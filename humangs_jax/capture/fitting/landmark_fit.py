@@ -1,17 +1,16 @@
-"""A body through keypoints: rigid, points, body, hands, then all frames together with one shape.
-Pure; vmap it over people.
+"""Fits a body to the keypoints of one person in stages. At the end all frames are fitted together
+with one shape. The functions are pure, so that they can be vmapped over people.
 
     rigid   position and orientation of a resting body, from the best of several starts
-    points  body joints and shape against triangulated points; skipped by frames without any
-    body    the same against the keypoints of every view
+    points  body joints and shape to triangulated points; skipped by frames without any
+    body    body joints and shape to the keypoints of every view
     hands   all joints that a keypoint depends on, with a smaller robust scale
-    person  all frames at once: one shape, the noise that was found, of each landmark too, and, of
-            several frames that several views show, the places at which the detector sees its
-            landmarks
-    motion  where requested, the same with smooth motion, which is expected weakly first: see
-            `smooth_motion`
+    person  all frames at once: one shape, with the noise that was found, also for each landmark.
+            For four and more frames that several views show, also the places at which the detector
+            sees its landmarks
+    motion  if requested, all frames with smooth motion, see `smooth_motion`
 
-The first four are one program that runs with other weights and other free unknowns, because
+The first four stages are one program that runs with different weights and free unknowns, because
 compilation dominates the time.
 """
 
@@ -63,51 +62,60 @@ from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.transform import EXACT
 
 ROBUST_SCALES = {"rigid": 30.0, "points": 15.0, "body": 15.0, "hands": 10.0, "person": 5.0}
-"""Robust scales of keypoints in the stages, standard deviations."""
+"""Robust scales of keypoints in each stage, standard deviations."""
 STEPS = 150
-"""Steps of the solver in a stage, at most."""
+"""Largest number of steps of the solver in a stage."""
 _TOLERANCE = 3e-4
-"""Tolerance of the unknowns, which are of unit size."""
+"""Change of the unknowns at which the solver stops. Unknowns are of unit size."""
 MOTION_SCALE = 5.0
-"""Robust scale of accelerations, multiples of the expected one: a frame that shows somebody else
-hardly pulls the others.
+"""Robust scale of accelerations, multiples of the expected one. It is small, so that a frame that
+shows somebody else hardly pulls the others.
 """
 FEW = 6
-"""Keypoints below which a frame's pose is mostly the prior's. Smooth motion interpolates it."""
+"""Number of keypoints below which a frame's pose follows mostly from the prior. Smooth motion
+interpolates such a frame.
+"""
 
 
 @pytree_dataclass
 class LandmarkFit:
-    """A person in m frames, as a fit found it."""
+    """The result of a fit of a person in m frames."""
 
     betas: Float[Array, " s"]
     """Shape coefficients, (s,)."""
     poses: BodyPose
-    """A batch of m poses."""
+    """Poses in all frames, a batch of m."""
     landmarks: Float[Array, "m k 3"]
     """Landmarks of the body, (m, k, 3), metres."""
     joints: Float[Array, "m j 3"]
     """Joints of the body, (m, j, 3), metres."""
     noise: Float[Array, " m"]
-    """Standard deviation of the detections, (m,), pixels."""
+    """Standard deviation of the detections in each frame, (m,), pixels."""
     state: FitState
-    """The solution in units of the problem's origin."""
+    """The result in units of the problem's origin."""
     smoothness: Float[Array, ""]
-    """Acceleration prior that was used, (), metres per frame squared; 0: none."""
+    """Expected acceleration that was used, (), metres per frame squared. 0 if frames are
+    independent.
+    """
     certainty: Float[Array, " k"]
-    """Certainty of the landmarks, (k,): the reciprocal of each one's noise over that of all."""
+    """Certainty of each landmark, (k,): the noise of all landmarks over its noise."""
 
 
 @checked_arguments
 def fit_landmarks(
     model: LandmarkModel, observations: Observations, smoothness: float = 0.0
 ) -> LandmarkFit:
-    """Shape and poses of one person.
+    """Returns shape and poses of one person.
 
-    Arguments: observations: a batch of m frames, in their order in time where motion is to be
-    smooth. smoothness: expected acceleration of joints, metres per frame squared; 0: frames are
-    independent. The result is finite for all finite observations; frames without keypoints rest in
-    the prior's usual pose, or with smooth motion are interpolated.
+    The result is finite for all finite observations. Frames without keypoints rest in the prior's
+    usual pose, or are interpolated if the motion is smooth.
+
+    Args:
+        model: landmarks of the keypoints on the body.
+        observations: keypoints of all frames, a batch of m. They have to be in order of time if the
+            motion is smooth.
+        smoothness: expected acceleration of joints, metres per frame squared. 0: frames are
+            independent.
     """
     fit = fit_frames(model, observations)
     if smoothness and len(fit.noise) > 2:
@@ -117,7 +125,7 @@ def fit_landmarks(
 
 @jax.jit
 def fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit:
-    """All stages but the motion."""
+    """Runs all stages but the motion. observations: a batch of m frames."""
     problem = keypoint_problem(model)
     states = jax.vmap(lambda seen: _fit_frame(problem, seen))(observations)
     observations = replace(observations, noise=_noise_found(problem, observations, states))
@@ -156,8 +164,8 @@ def _poses(problem: KeypointProblem, state: FitState) -> BodyPose:
 
 
 def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
-    """The problem in which every joint is free that moves a landmark; the others rest in the usual
-    pose.
+    """Returns the problem in which every joint that moves a landmark is free. The other joints rest
+    in the usual pose.
     """
     prior, joints = pose_prior(model.joint_names), tuple(j for j in model.movers if j > 0)
     origin = usual_origin(prior, joints, model.joint_directions.shape[-1])
@@ -165,7 +173,9 @@ def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
 
 
 def _fit_frame(problem: KeypointProblem, seen: Observations) -> FitState:
-    """Stages rigid to hands of one frame, from several starts; the best by its keypoints."""
+    """Runs the stages rigid to hands for one frame from several starts. Returns the state with the
+    least cost.
+    """
     points, counts, weights = triangulate_robustly(seen)
     # one view leaves more orientations open than several
     followed = 2 if seen.points.shape[0] > 1 else 4
@@ -178,7 +188,7 @@ def _fit_frame(problem: KeypointProblem, seen: Observations) -> FitState:
     stages = _stages(problem, Targets(points, counts >= 2, pixel))
 
     def run(state, stage):
-        """The state after one stage, and its cost."""
+        """Returns the state after one stage, and its cost."""
         weighted = replace(seen, confidences=seen.confidences * stage.landmark_weights)
 
         def residuals(y):
@@ -202,14 +212,14 @@ def _rigid_starts(
     counts: Float[Array, " k"],
     kept: int,
 ) -> FitState:
-    """The `kept` best positions and orientations of a resting body, a batch.
+    """Returns the `kept` best positions and orientations of a resting body, a batch.
 
-    The trunk of a resting body is turned onto triangulated points (Kabsch 1976); the 24
-    orientations of a cube compete with it. The position for an orientation solves linear equations.
-    The best by keypoints are kept.
+    One candidate is the trunk of the resting body turned onto triangulated points (Kabsch 1976),
+    the others are the 24 orientations of a cube. The position for an orientation solves linear
+    equations. The candidates that follow the keypoints best are kept.
 
-    Arguments: points, counts: triangulated landmarks (k, 3) and how many views agree with each
-    (k,), 0: unknown.
+    Arguments: points: triangulated landmarks, (k, 3), metres. counts: number of views that agree
+    with each, (k,). 0: unknown.
     """
     resting = zero_state(problem.origin)
     landmarks, joints = problem.landmarks_and_joints(resting)
@@ -248,7 +258,7 @@ def _rigid_starts(
 
 
 def _cube_rotations() -> Float[np.ndarray, "24 3 3"]:
-    """The rotations that map the axes to each other."""
+    """Returns the 24 rotations that map the axes to each other."""
     signed = (
         np.eye(3)[list(order)] * np.asarray(signs)[:, None]
         for order in itertools.permutations(range(3))
@@ -260,8 +270,8 @@ def _cube_rotations() -> Float[np.ndarray, "24 3 3"]:
 def _kabsch(
     a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]
 ) -> Float[Array, "3 3"]:
-    """The rotation about weighted centres that takes points a to b best; the identity where nothing
-    is known.
+    """Returns the rotation about the weighted means that takes points a to points b best. It is the
+    identity if all weights are 0.
     """
     share = weights / jnp.maximum(jnp.sum(weights), 1e-9)
     centered_a, centered_b = (x - jnp.sum(share[:, None] * x, axis=0) for x in (a, b))
@@ -278,8 +288,11 @@ def _position(
     offsets: Float[Array, "k 3"],
     weights: Float[Array | np.ndarray, " k"],
 ) -> Float[Array, "3"]:
-    """The point from which landmarks at `offsets` (k, 3) project to their detections: with (x, y) a
-    detection over the focal length, x (z + t_z) = X + t_x, the same for y, linear in t.
+    """Returns the position at which landmarks project to their detections, (3,), metres. offsets:
+    landmarks relative to the position, (k, 3), metres.
+
+    Let (x, y) be a detection over the focal length, (X, Y, z) the offset and t the position, all in
+    the camera's axes. Then x (z + t_z) = X + t_x, and the same for y, which is linear in t.
     """
     rotation = observations.cam_from_world[:, :3, :3]
     xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
@@ -299,20 +312,20 @@ def _position(
 
 @pytree_dataclass
 class _Stage:
-    """One run of the solver."""
+    """Settings of one run of the solver."""
 
     landmark_weights: Float[Array, " k"]
-    """What the keypoints of each landmark count, (k,)."""
+    """Weights of the keypoints of each landmark, (k,)."""
     targets: Targets
     """Triangulated points with their weights."""
     scale: Float[Array, ""]
     """Robust scale, standard deviations."""
     free: FitState
-    """Which numbers of the state move, booleans."""
+    """Booleans of the state's shape: which numbers move."""
 
 
 def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
-    """The stages rigid, points, body and hands, a batch."""
+    """Returns the stages rigid, points, body and hands, a batch."""
     model, resting = problem.model, zero_state(problem.origin)
     trunk = jnp.asarray(trunk_weights(model.names))
     # joints that move before the hands do
@@ -321,7 +334,9 @@ def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
     ones, none = jnp.ones_like(trunk), jnp.zeros_like(trunk)
 
     def free(shape, joints):
-        """What moves: orientation and position always, the shape and joints if asked for."""
+        """Returns which numbers move: orientation and position always, shape and joints if asked
+        for.
+        """
         return replace(
             resting,
             betas=jnp.full(resting.betas.shape, shape),
@@ -347,7 +362,9 @@ def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
 def _noise_found(
     problem: KeypointProblem, observations: Observations, states: FitState
 ) -> Float[Array, " m"]:
-    """The noise of the detections in each frame, pixels, from what its state leaves."""
+    """Returns the noise of the detections in each frame, (m,), pixels. It is estimated from the
+    errors that the states leave.
+    """
 
     def of_frame(seen, state):
         errors = keypoint_errors(seen, problem.landmarks_and_joints(state)[0])
@@ -361,14 +378,17 @@ def _noise_found(
 def _certainty_found(
     problem: KeypointProblem, observations: Observations, states: FitState
 ) -> Float[Array, " k"]:
-    """Certainties of the landmarks, (k,): the noise of all over the noise of each, which is the
-    median error in keypoints that several views of a frame show. The fewer these are, the nearer to
-    what is usual.
+    """Returns the certainties of the landmarks, (k,): the noise of all landmarks over that of each.
+
+    The noise of a landmark is the median error of its keypoints that several views of a frame show.
+    The fewer there are, the nearer it is to the usual noise.
     """
     names = problem.model.names
 
     def errors_of_frame(seen, state):
-        """Errors in units of the frame's noise, (c, k); NaN where one view alone says something."""
+        """Returns errors in units of the frame's noise, (c, k). NaN where fewer than two views show
+        a landmark.
+        """
         errors = keypoint_errors(seen, problem.landmarks_and_joints(state)[0]) / seen.noise
         known = (seen.confidences > 0) & (problem.known > 0)
         shared = known & (jnp.sum(known, axis=0) > 1)
@@ -393,7 +413,7 @@ def _certainty_found(
 def _person_residuals(
     problem: KeypointProblem, observations: Observations, state: FitState
 ) -> dict[str, Float[Array, "..."]]:
-    """All frames at once with one shape."""
+    """Returns the residuals of all frames with one shape, by kind."""
 
     def of_frame(seen, own):
         return frame_residuals(problem, seen, own, ROBUST_SCALES["person"])
@@ -416,16 +436,22 @@ def smooth_motion(
     fit: LandmarkFit,
     smoothness: float | Float[Array, ""],
 ) -> LandmarkFit:
-    """A fit whose joints move as smoothly as `smoothness` expects, and as its keypoints allow.
+    """Returns a fit whose joints move as smoothly as `smoothness` expects, and as the keypoints
+    allow.
 
-    Arguments: observations: those of the fit. fit: without smooth motion, of at least three frames.
+    Args:
+        observations: the observations that were fitted.
+        fit: the fit without smooth motion, of at least three frames.
+        smoothness: expected acceleration of joints, metres per frame squared.
 
-    The expected acceleration is multiplied by 64, 16, 4 and 1, one solve each: frames that one view
-    hardly determines come together before anything pulls hard. The result is that of the last level
-    which follows the keypoints of every frame as well as the fit does, up to their noise: the
-    robust cost of a frame may exceed the fit's by the number of its unknowns. That is twice what
-    the true pose exceeds it by on average, because a fit with p unknowns takes up p of the squared
-    normal errors and half of them are the cost. If no level does, the fit itself.
+    The expected acceleration is multiplied by 64, 16, 4 and 1, one solve each. So frames that one
+    view hardly determines come together before anything pulls hard. The result is that of the last
+    of these levels that follows the keypoints of every frame as well as the fit does, up to their
+    noise. If no level does, the result is the fit itself.
+
+    "Up to their noise" means that the robust cost of a frame may exceed the fit's by the number of
+    the frame's unknowns. That is twice the excess of the true pose on average: a fit with p
+    unknowns takes up p of the squared normal errors, and half of them are the cost.
     """
     problem = keypoint_problem(replace(model, certainty=fit.certainty))
     seen = replace(observations, noise=fit.noise)
@@ -435,7 +461,9 @@ def smooth_motion(
     limit = costs(fit.state) + jnp.minimum(6 + 3 * len(problem.origin.joints), observed)
 
     def solve_level(carry, std):
-        """Goes on from the level before; its result is kept if it follows the keypoints."""
+        """Solves one level, beginning with the result of the level before. Keeps the result if it
+        follows the keypoints.
+        """
         state, kept, held = carry
         residuals = functools.partial(_motion_residuals, problem, seen, std)
         state, _ = solve(residuals, state, STEPS, method="lbfgs", tolerance=_TOLERANCE)
@@ -454,7 +482,9 @@ def smooth_motion(
 def _keypoint_costs(
     problem: KeypointProblem, observations: Observations, state: FitState
 ) -> Float[Array, " m"]:
-    """The robust cost of the keypoints of each frame, (m,), half squares of standard deviations."""
+    """Returns the robust cost of the keypoints of each frame, (m,): half the square sum of
+    residuals in standard deviations.
+    """
 
     def of_frame(seen, landmarks):
         return half_squares(
@@ -469,8 +499,8 @@ def _keypoint_costs(
 def _motion_residuals(
     problem: KeypointProblem, observations: Observations, std: Float[Array, ""], state: FitState
 ) -> dict[str, Float[Array, "..."]]:
-    """Residuals of all frames, and of the accelerations of their joints. std: the expected
-    acceleration, metres per frame squared.
+    """Returns the residuals of all frames, and of the accelerations of their joints. std: the
+    expected acceleration, metres per frame squared.
     """
     axes = frame_axes(state)
     joints = jax.vmap(problem.landmarks_and_joints, in_axes=(axes,))(state)[1]
@@ -479,18 +509,20 @@ def _motion_residuals(
 
 
 def _chosen(good: Bool[Array, ""], new: Any, old: Any) -> Any:
-    """The new pytree where it is good, else the old one."""
+    """Returns the new pytree if `good`, else the old one."""
     return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)
 
 
 def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) -> Any:
-    """(m - 2, j, 3) of the frames but the first and the last, metres per frame squared."""
+    """Returns the accelerations of joints, (m - 2, j, 3), metres per frame squared. The first and
+    last frame have none.
+    """
     return joints[2:] - 2 * joints[1:-1] + joints[:-2]
 
 
 def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> FitState:
-    """The state with the poses of frames that show nothing interpolated between their nearest
-    neighbours that show something.
+    """Returns the state with interpolated poses in frames that show fewer than `FEW` landmarks.
+    They lie between the nearest other frames.
     """
     m = len(seen.noise)
     shown = jnp.sum(jnp.any(seen.confidences * problem.known > 0, axis=1), axis=1) >= FEW

@@ -1,14 +1,15 @@
-"""Cameras around a person from landmarks alone: a start from the detector's 3D landmarks, then
-bundle adjustment.
+"""Finds cameras around a person from landmarks alone: first a start from the detector's 3D
+landmarks, then bundle adjustment.
 
 A detector that sees one photo gives landmarks in metres in the axes of that photo's camera, as if
-the camera looked straight at the person. Their depths are guesses, 5 to 10 cm off, and the whole is
-turned by up to 20 degrees. Rotations that bring those of several photos together (generalised
-Kabsch: Gower 1975, https://doi.org/10.1007/BF02291478) are a start. Bundle adjustment then needs
-the pixels only; the 3D landmarks keep the size, and what pixels leave open.
+the camera looked straight at the person. Their depths are guesses, 5 to 10 cm off, and all of them
+together are turned by up to 20 degrees. The start consists of the rotations that bring the
+landmarks of several photos together (generalised Kabsch: Gower 1975,
+https://doi.org/10.1007/BF02291478). Bundle adjustment then mainly uses the pixels. The 3D landmarks
+keep the size, and decide what pixels leave open.
 
-What is minimised is half the square sum of these residuals, with X = R_v L_k, p = X + t_v, u =
-(p_x, p_y) / p_z:
+The cost is half the square sum of these residuals, with X = R_v L_k, p = X + t_v, u = (p_x, p_y) /
+p_z:
 
     pixels  sqrt(w) rho((f_v u - x) / noise_v)       rho(q) = q s / sqrt(s^2 + |q|^2), Geman and
                                                      McClure
@@ -19,11 +20,12 @@ What is minimised is half the square sum of these residuals, with X = R_v L_k, p
     bones   (|left bone| - |right bone|) / std       each kind has its own std, see `STD`
     focal   y_g, with f_v = f0_v exp(std_v y_g)      one y for each kind of camera
 
-A pixel depends on one landmark, one camera and one y. So the landmarks are eliminated (Schur
-complement: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6.1); what is left
-is a small system of the cameras.
+A pixel depends on one landmark, one camera and one y. So the landmarks can be eliminated (Schur
+complement: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6.1), which leaves
+a small system of the cameras.
 
-On the host in float64: every number of photos would be another program to compile.
+All of this runs on the host in float64, because JAX would compile another program for every number
+of photos.
 """
 
 import dataclasses
@@ -35,7 +37,7 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.core.array_types import Float, Int
 
 NEAR = 0.05
-"""Metres: depths are clamped to at least this."""
+"""Least depth, metres. Smaller depths are clamped to it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,65 +45,71 @@ class _Std:
     """Standard deviations of what is known besides the pixels."""
 
     world: float = 0.15
-    """Of the detector's 3D landmarks, metres, shared errors included: pixels decide where several
-    views see them."""
+    """Standard deviation of the detector's 3D landmarks, metres. It includes errors that all
+    landmarks share, so that pixels decide where several views see a landmark.
+    """
     bones: float = 0.01
-    """Of the difference of left and right bones, metres."""
+    """Standard deviation of the difference of a left and its right bone's length, metres."""
     size: float = 0.01
-    """Of the logarithm of the person's size against the detector's 3D landmarks: what keeps the
-    scale."""
+    """Standard deviation of the logarithm of the person's size against the detector's 3D landmarks.
+    This keeps the scale.
+    """
 
 
 STD = _Std()
 
 
 ROBUST_SCALES = (40.0, 6.0)
-"""Robust scales of pixels, standard deviations, one search after the other: the start is off by
-tens of them.
+"""Robust scales of pixels, standard deviations. There is one search for each, in this order. The
+first is large because the start is off by tens of standard deviations.
 """
 EXACT = 1e-9
-"""Relative decrease of the cost that ends the search for a result."""
+"""Relative decrease of the cost that ends the search for a final result."""
 COARSE = 1e-3
-"""Relative decrease of the cost that ends the search where costs are only compared."""
+"""Relative decrease of the cost that ends a search whose cost is only compared with others."""
 _STILL = 1e-6
-"""Added to the diagonal of the normal equations: what no residual moves stays where it is."""
+"""Number that is added to the diagonal of the normal equations, so that unknowns that no residual
+moves stay where they are.
+"""
 _FURTHEST = 5.0
-"""Largest logarithm of the change of a depth in one step, and of a focal length in all, as
-multiples of e.
+"""Largest absolute logarithm of the change of a depth in one step, and of the change of a focal
+length in all.
 """
 VIEW = 9
-"""Unknowns of a view: turn, place, and the mean of its turned landmarks."""
+"""Number of unknowns of a view: turn (3), place (3), and the mean of its turned landmarks (3)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
-    """The landmarks of a person in c photos, and what is known of the cameras."""
+    """The landmarks of a person in c photos, and what is known about the cameras."""
 
     points: Float[np.ndarray, "c k 2"]
-    """Detections from the principal point, (c, k, 2), pixels."""
+    """Detected landmarks relative to the principal point, (c, k, 2), pixels."""
     weights: Float[np.ndarray, "c k"]
-    """Weights of the landmarks, (c, k); 0: not seen."""
+    """Weights of the landmarks, (c, k). 0 where a landmark is not seen."""
     noise: Float[np.ndarray, " c"]
     """Standard deviation of the detections, (c,), pixels."""
     world: Float[np.ndarray, "c k 3"]
-    """The detector's 3D landmarks in camera axes about their weighted mean, all of one size, (c, k,
-    3), metres.
+    """The detector's 3D landmarks in the axes of each camera, relative to their weighted mean and
+    scaled to one size, (c, k, 3), metres.
     """
     focal: Float[np.ndarray, " c"]
     """Focal lengths to begin with, (c,), pixels."""
     focal_std: Float[np.ndarray, " c"]
     """Standard deviations of the logarithms of the focal lengths, (c,)."""
     kinds: Int[np.ndarray, " c"]
-    """Kind of each camera, (c,), from 0: cameras of one kind keep the ratio of their focal lengths.
+    """Kind of each camera, (c,), from 0. Cameras of one kind keep the ratio of their focal
+    lengths.
     """
     bones: Int[np.ndarray, "b 2 2"]
-    """Landmarks at the ends of left bones and of their right partners, (b, 2, 2): bone, side, end.
+    """Landmarks at both ends of left bones and of their right partners, (b, 2, 2). Axes are bone,
+    side and end.
     """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rig:
-    """c cameras about a person."""
+    """A person's landmarks, and c cameras around the person."""
 
     landmarks: Float[np.ndarray, "k 3"]
     """Landmarks of the person, (k, 3), metres."""
@@ -120,8 +128,8 @@ class Rig:
 def align_views(
     worlds: Float[np.ndarray, "c k 3"], weights: Float[np.ndarray, "c k"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "c 3 3"]]:
-    """Generalised Kabsch: the mean shape (k, 3) of landmarks that are turned together, and the
-    rotations (c, 3, 3) from it to each view's axes.
+    """Returns the mean shape, (k, 3), of the landmarks of all views turned onto each other, and the
+    rotations, (c, 3, 3), from it to each view's axes (generalised Kabsch).
     """
     shape = worlds[int(np.argmax(weights.sum(1)))]
     rotations = np.tile(np.eye(3), (len(worlds), 1, 1))
@@ -140,8 +148,8 @@ def _turns_onto(
     worlds: Float[np.ndarray, "c k 3"],
     weights: Float[np.ndarray, "c k"],
 ) -> Float[np.ndarray, "c 3 3"]:
-    """The rotations (c, 3, 3) that bring a shape onto the landmarks of each view best (Kabsch
-    1976); of points on a line, one of those.
+    """Returns the rotations, (c, 3, 3), that turn a shape best onto the landmarks of each view
+    (Kabsch 1976). If points lie on a line, one of the best rotations.
     """
     share = weights / weights.sum(1, keepdims=True)
     source = shape - (share @ shape)[:, None]
@@ -157,9 +165,14 @@ def place_person(
     offsets: Float[np.ndarray, "k 3"],
     focal: float,
 ) -> Float[np.ndarray, "3"]:
-    """Where landmarks at `offsets`, in camera axes, have to be put to project to their pixels: with
-    (x, y) a pixel over the focal length, x (z + t_z) = X + t_x, the same for y, linear in t. By the
-    person's size where that puts it behind the camera.
+    """Returns the position at which landmarks project to their pixels, (3,), metres.
+
+    Let (x, y) be a pixel over the focal length, (X, Y, z) the landmark's offset and t the position.
+    Then x (z + t_z) = X + t_x, and the same for y, which is linear in t. If that gives a distance
+    far from the one by the person's size, the position follows from the size.
+
+    points: (k, 2) pixels from the principal point. weights: (k,). offsets: landmarks relative to
+    the position, in the camera's axes, (k, 3), metres. focal: focal length, pixels.
     """
     xy = points / focal
     rows = np.zeros((*xy.shape, 3))
@@ -172,7 +185,7 @@ def place_person(
     share = weights / weights.sum()
 
     def spread(p: Float[np.ndarray, "k 2"]) -> float:
-        """Root mean square of the distances from the mean."""
+        """Returns the weighted root mean square of the points' distances from their mean."""
         return float(np.sqrt(share @ np.sum((p - share @ p) ** 2, axis=1)))
 
     # by the size: farther away the person is smaller in the photo
@@ -191,44 +204,44 @@ class Rows:
     """The residuals of a rig, in standard deviations."""
 
     seen: Float[np.ndarray, "c k 5"]
-    """Pixels (2) and 3D landmarks (3) of a landmark in a view, (c, k, 5)."""
+    """Residuals of pixels (2) and of 3D landmarks (3) for each landmark in each view, (c, k, 5)."""
     tied: Float[np.ndarray, " t"]
-    """Size and bones, which tie landmarks to each other, (t,)."""
+    """Residuals of size and bones, (t,). They tie landmarks to each other."""
     focal: Float[np.ndarray, " g"]
-    """The y of each kind of camera, (g,)."""
+    """Residuals of the focal lengths: y of each kind of camera, (g,)."""
 
     @property
     def cost(self) -> float:
-        """Half the square sum."""
+        """Half the square sum of all residuals."""
         return 0.5 * float(np.sum(self.seen**2) + np.sum(self.tied**2) + np.sum(self.focal**2))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Derivatives:
-    """The derivatives of `Rows` by the unknowns of a `Step`.
+    """Derivatives of `Rows` by the unknowns of a `Step`.
 
-    Those of `Rows.focal` by y are 1.
+    The derivatives of `Rows.focal` by y are 1.
     """
 
     by_landmark: Float[np.ndarray, "c k 5 3"]
-    """Derivatives of `seen` by their landmark, (c, k, 5, 3)."""
+    """Derivatives of each row of `seen` by its landmark, (c, k, 5, 3)."""
     by_view: Float[np.ndarray, "c k 5 9"]
-    """Derivatives of `seen` by turn, place and mean of their view, (c, k, 5, 9)."""
+    """Derivatives of each row of `seen` by turn, place and mean of its view, (c, k, 5, 9)."""
     by_focal: Float[np.ndarray, "c k 5"]
-    """Derivatives of `seen` by the y of their camera's kind, (c, k, 5)."""
+    """Derivatives of each row of `seen` by the y of its camera's kind, (c, k, 5)."""
     tied: Float[np.ndarray, "t k 3"]
     """Derivatives of `tied` by all landmarks, (t, k, 3)."""
 
 
 def pixel_errors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "c k 2"]:
-    """Landmarks as the cameras see them, less those detected, pixels."""
+    """Returns landmarks as the cameras see them minus the detected ones, (c, k, 2), pixels."""
     seen = _turned(rig) + rig.places[:, None]
     slopes = seen[..., :2] / np.maximum(seen[..., 2:], NEAR)
     return rig.focal[:, None, None] * slopes - evidence.points
 
 
 def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
-    """Residuals with this robust scale."""
+    """Returns the residuals of a rig. scale: robust scale of pixels, standard deviations."""
     root, turned = np.sqrt(evidence.weights)[..., None], _turned(rig)
     errors = pixel_errors(evidence, rig) / evidence.noise[:, None, None]
     errors = errors * scale / np.sqrt(scale**2 + np.sum(errors**2, axis=-1, keepdims=True))
@@ -250,8 +263,8 @@ def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
 
 
 def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
-    """The derivatives of `residuals`, with the mean of a view as a separate unknown, which does not
-    change the minimum.
+    """Returns the derivatives of `residuals`. The mean of a view is a separate unknown here, which
+    does not change the minimum.
     """
     root, turned = np.sqrt(evidence.weights)[..., None, None], _turned(rig)
     c, k = evidence.weights.shape
@@ -302,8 +315,10 @@ def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
 def _tied(
     evidence: Evidence, rig: Rig, turned: Float[np.ndarray, "c k 3"]
 ) -> Float[np.ndarray, "t k 3"]:
-    """d log r / d L = the sum over views of share R^T (X - mean) / r^2, and of bones d |a - b| / d
-    a = (a - b) / |a - b|.
+    """Returns the derivatives of the residuals of size and bones by all landmarks, (t, k, 3).
+
+    They are d log r / d L = the sum over views of share R^T (X - mean) / r^2, and for bones d |a -
+    b| / d a = (a - b) / |a - b|.
     """
     share = _shares(evidence)
     centered = turned - np.sum(share * turned, axis=1, keepdims=True)
@@ -333,14 +348,14 @@ def _bones(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "b 2 3"]:
 
 
 def _factors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, " g"]:
-    """The y of each kind, from any camera of it."""
+    """Returns the y of each kind of camera, (g,). It is computed from any camera of the kind."""
     factors = np.zeros(1 + int(evidence.kinds.max()))
     factors[evidence.kinds] = np.log(rig.focal / evidence.focal) / evidence.focal_std
     return factors
 
 
 def _cross(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Matrices [x] with [x] y = x x y."""
+    """Returns the matrices [x], (..., 3, 3), with [x] y = x x y."""
     out = np.zeros((*x.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -x[..., 2], x[..., 1], -x[..., 0]
     return out - np.swapaxes(out, -1, -2)
@@ -352,20 +367,21 @@ def _cross(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Step:
-    """A change of a rig."""
+    """A change of all unknowns of a rig."""
 
     landmarks: Float[np.ndarray, "k 3"]
     """Shifts of the landmarks, (k, 3), metres."""
     views: Float[np.ndarray, "c 9"]
-    """Changes of the views, (c, 9): turn (3, radians), place (3: sideways over the depth, twice,
-    and the logarithm of the depth), and the mean of the view (3), which follows from the rest.
+    """Changes of the views, (c, 9): turn (3, radians), place (3) and the mean of the view (3),
+    which follows from the rest. The changes of place are those of x over depth, y over depth and
+    the logarithm of the depth.
     """
     focal: Float[np.ndarray, " g"]
     """Changes of the y of each kind of camera, (g,)."""
 
 
 def moved(evidence: Evidence, rig: Rig, step: Step) -> Rig:
-    """A rig after a step."""
+    """Returns the rig after a step."""
     turns, sideways = step.views[:, :3], step.views[:, 3:5]
     deeper = np.clip(step.views[:, 5:6], -_FURTHEST, _FURTHEST)
     depth = rig.places[:, 2:] * np.exp(deeper)  # never behind the camera
@@ -385,11 +401,11 @@ def adjust(
     tolerance: float = EXACT,
     scales: Sequence[float] = ROBUST_SCALES,
 ) -> tuple[Rig, float]:
-    """Bundle adjustment by Levenberg and Marquardt: the cameras, and half the square sum of the
-    residuals.
+    """Runs bundle adjustment by Levenberg and Marquardt. Returns the rig, and half the square sum
+    of its residuals.
 
-    Arguments: tolerance: relative decrease of the cost that ends the search. scales: robust ones,
-    one search after the other.
+    Arguments: tolerance: relative decrease of the cost that ends a search. scales: robust scales of
+    pixels, standard deviations. There is one search for each, in this order.
     """
     rig, cost = start, np.inf
     for scale in scales:
@@ -398,9 +414,9 @@ def adjust(
 
 
 def _descend(evidence: Evidence, rig: Rig, scale: float, tolerance: float) -> tuple[Rig, float]:
-    """Minimises with one robust scale.
+    """Minimises the cost with one robust scale. Returns the rig and its cost.
 
-    The damping follows Nielsen 1999, as Madsen, Nielsen and Tingleff 2004, algorithm 3.16.
+    The damping follows Nielsen 1999, as in Madsen, Nielsen and Tingleff 2004, algorithm 3.16.
     """
     rows = residuals(evidence, rig, scale)
     normal = normal_equations(evidence, rows, derivatives(evidence, rig, scale))
@@ -428,13 +444,14 @@ def _descend(evidence: Evidence, rig: Rig, scale: float, tolerance: float) -> tu
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """J^T J and J^T r in blocks, of the rows `seen` and `focal`; rows that tie landmarks stay rows.
+    """J^T J and J^T r of the rows `seen` and `focal`, in blocks. Rows that tie landmarks are kept
+    as rows.
 
     The cameras have m = 9 c + g unknowns.
     """
 
     landmarks: Float[np.ndarray, "k 3 3"]
-    """Blocks of J^T J of each landmark, (k, 3, 3)."""
+    """Block of J^T J of each landmark, (k, 3, 3)."""
     cameras: Float[np.ndarray, "m m"]
     """Block of J^T J of the cameras, (m, m)."""
     between: Float[np.ndarray, "k 3 m"]
@@ -444,15 +461,15 @@ class NormalEquations:
     by_cameras: Float[np.ndarray, " m"]
     """J^T r of the cameras, (m,)."""
     tied: Float[np.ndarray, "t k 3"]
-    """Derivatives of the rows that tie landmarks, (t, k, 3)."""
+    """Derivatives of the rows that tie landmarks by all landmarks, (t, k, 3)."""
     tied_rows: Float[np.ndarray, " t"]
-    """Residuals of these rows, (t,)."""
+    """Residuals of the rows that tie landmarks, (t,)."""
     kinds: int
     """Number of kinds of cameras, g."""
 
 
 def normal_equations(evidence: Evidence, rows: Rows, of: Derivatives) -> NormalEquations:
-    """The normal equations of all residuals."""
+    """Returns the normal equations of all residuals."""
     c, k = evidence.weights.shape
     g = len(rows.focal)
     own = np.eye(g)[evidence.kinds]  # (c, g) 1 for the kind of a view
@@ -494,17 +511,18 @@ def normal_equations(evidence: Evidence, rows: Rows, of: Derivatives) -> NormalE
 
 
 def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
-    """The damped step of Gauss and Newton, and the decrease of the cost that it expects.
+    """Returns the damped step of Gauss and Newton, and the decrease of the cost that the linear
+    model expects from it.
 
-    With l the landmarks, q the cameras, U the tied rows, r their residuals, and t = U l + r as
+    Let l be the landmarks, q the cameras, U the tied rows, r their residuals, and t = U l + r
     separate unknowns:
 
         D l + E q + U^T t = -a                  D block diagonal: landmarks by landmark
         E^T l + C q       = -b
         U l         - t   = -r
 
-    With F = (E, U^T) and K = diag(C, -1), l = -D^-1 (a + F (q, t)) leaves (K - F^T D^-1 F) (q, t) =
-    F^T D^-1 a - (b, r).
+    With F = (E, U^T) and K = diag(C, -1), eliminating l = -D^-1 (a + F (q, t)) leaves (K - F^T D^-1
+    F) (q, t) = F^T D^-1 a - (b, r).
     """
     # the damped blocks, named as above
     k, ties, m = len(normal.landmarks), len(normal.tied_rows), len(normal.by_cameras)
