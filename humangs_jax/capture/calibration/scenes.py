@@ -1,10 +1,10 @@
-"""Formats with a camera for each image: COLMAP's models, and transforms.json (NeRF, nerfstudio,
-GaussianAvatars, VHAP).
+"""Reads formats that list a camera for each image: COLMAP's models, and transforms.json (NeRF,
+nerfstudio, GaussianAvatars, VHAP).
 
-COLMAP: a folder with cameras.txt, images.txt and, optionally, points3D.txt, or the same as .bin
-(https://colmap.github.io/format.html). images.txt has two lines for each image: the pose (world to
-camera, OpenCV axes, quaternion wxyz) and the points seen, which may be empty. Pixel centres are at
-+0.5; unit and axes of the world are arbitrary.
+A COLMAP model is a folder with cameras.txt, images.txt and, optionally, points3D.txt, or with the
+same files as .bin (https://colmap.github.io/format.html). images.txt has two lines for each image:
+the pose (world to camera, OpenCV axes, quaternion wxyz) and the points seen, which may be empty.
+Pixel centres are at +0.5. Unit and axes of the world are arbitrary.
 """
 
 import dataclasses
@@ -42,8 +42,8 @@ from humangs_jax.data.formats import CameraFormat
 from humangs_jax.io.reading import InvalidFileError, read_bytes, reading, shown
 
 Registered = tuple[str, str, str, Sequence[float], np.ndarray]
-"""An image: where it stands, its name, the number of the camera, quaternion and translation, (n, 3)
-points as x y id.
+"""An image of a COLMAP model: its position in the file for errors, its name, the id of its camera,
+quaternion and translation (7 numbers), and its points (n, 3) as x, y and id.
 """
 _PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -56,9 +56,9 @@ _PARAMETERS = {
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
 }
-"""Camera models and their parameters in cameras.txt."""
+"""Camera models and the names of their parameters, in the order of cameras.txt."""
 NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9), _PARAMETERS, strict=True))
-"""Camera models by their numbers in cameras.bin."""
+"""Names of camera models by their numbers in cameras.bin."""
 
 
 def read_colmap(source: CalibrationFile, format: CameraFormat) -> Calibration:
@@ -215,7 +215,7 @@ class _Bytes:
         self.data, self.at = read_bytes(file, "mesh_bytes"), 0
 
     def take(self, size: int) -> bytes:
-        """The next bytes."""
+        """Returns the next bytes."""
         self.at += size
         if self.at > len(self.data):
             raise InvalidFileError("not a readable COLMAP model: cut short, or damaged")
@@ -270,15 +270,15 @@ def _binary_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
 # --------------------------------------------------------------------------------------------------
 
 _CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
-"""Values of `camera_model` for lenses that are read."""
+"""Values of `camera_model` for lenses that can be undistorted."""
 _FISHEYE_MODEL = "OPENCV_FISHEYE"
-"""The value for a fisheye."""
+"""Value of `camera_model` for a fisheye lens."""
 _MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_intrinsics")
-"""Keys of a whole K, in a frame or in the file."""
+"""Keys of a whole matrix K, in a frame or in the file."""
 
 
 def recognizes_transforms(source: CalibrationFile) -> bool:
-    """Whether a file is JSON with `frames`."""
+    """Returns whether a file is a JSON object with "frames"."""
     return isinstance(source.json, dict) and "frames" in source.json
 
 
@@ -414,11 +414,12 @@ def _number(values: Mapping[str, Any], key: str, file: Path, prefix: str) -> flo
 def _find_moments(
     frames: Sequence[Mapping[str, Any]], cameras: Sequence[CalibratedCamera], file: Path
 ) -> tuple[list[int], int]:
-    """The frame of each image, counted from 0 in the order of time, and how many cameras there are.
+    """Returns the number of each image's moment, from 0 in the order of time, and the number of
+    cameras.
 
-    Raises: CaptureError naming the key, for a value in some images only, for what is no time, for
-    two images of one camera and one moment, and for several images of a camera where nothing tells
-    which were taken together.
+    Raises: CaptureError with the name of the key, if some images lack the value, if a value is no
+    time, if two images of one camera are of one moment, or if a camera has several images and
+    nothing shows which images were taken together.
     """
     # which moment and which camera an image is of, by the first of these keys that is there
     of_time = (
@@ -472,8 +473,10 @@ def _find_moments(
 def _values(
     frames: Sequence[Mapping[str, Any]], keys: Sequence[str], file: Path
 ) -> tuple[str, list[Any]]:
-    """The first key that an image has, and its value in all of them, numbers or names; "" if there
-    is none.
+    """Returns the first of the keys that an image has, and its values in all images, which are
+    numbers or names. "" and no values if no image has any of the keys.
+
+    Raises: CaptureError if only some images have the key.
     """
     key = next((key for key in keys if any(key in frame for frame in frames)), "")
     values = []

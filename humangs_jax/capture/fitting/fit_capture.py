@@ -1,5 +1,5 @@
-"""From photos with cameras and keypoints to a capture with a body: how well it is known, and how it
-agrees with the keypoints.
+"""Fits a body to photos with cameras and keypoints, and reports how well it is known and how well
+it agrees with the keypoints.
 """
 
 import dataclasses
@@ -66,22 +66,22 @@ class Uncertainty(NamedTuple):
     joint_covariances: Float[np.ndarray, "m j 3 3"]
     """Covariances of the joints' positions, (m, j, 3, 3), square metres."""
     determined: Float[np.ndarray, "m j"]
-    """Share of the prior's variance of a joint's rotation that the views remove, (m, j), mean over
-    axes: 1 is all; 0 is nothing, as for joints that no keypoint depends on.
+    """Share of the prior's variance of each joint's rotation that the views remove, (m, j), mean
+    over axes. 1 is all. 0 is nothing, as for joints that no keypoint depends on.
     """
     shape_covariance: Float[np.ndarray, "s s"]
     """Covariance of the shape coefficients, (s, s)."""
 
     @property
     def joint_std(self) -> Float[np.ndarray, "m j"]:
-        """(m, j) metres: root mean square of the expected distance from the true joint."""
+        """Root mean square of the expected distance from the true joint, (m, j), metres."""
         return np.sqrt(np.trace(self.joint_covariances, axis1=-2, axis2=-1))
 
 
 def fit_uncertainty(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> Uncertainty:
-    """The covariance of a fit to these observations, in float64."""
+    """Returns the uncertainty of a fit to these observations, computed in float64."""
     # derivatives of the residuals by the pose of their frame and by the shape that all share
     model = replace(model, certainty=fit.certainty)
     derivatives = _derivatives(model, replace(observations, noise=fit.noise), fit)
@@ -115,7 +115,7 @@ def fit_uncertainty(
 def _determined(
     problem: KeypointProblem, poses: Float[np.ndarray, "m p p"]
 ) -> Float[np.ndarray, "m j"]:
-    """`Uncertainty.determined` from the covariance (m, p, p) of the unknowns, in the order
+    """Returns `Uncertainty.determined`. poses: covariance of the unknowns, (m, p, p), in the order
     global_orient, transl, body_pose.
     """
     joints, variances = np.asarray(problem.origin.joints), np.diagonal(poses, axis1=-2, axis2=-1)
@@ -131,8 +131,8 @@ def _determined(
 def _derivatives(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> tuple[Float[Array, "m r u"], Float[Array, "m j 3 u"]]:
-    """The derivatives of residuals and joints of each frame by its unknowns: global_orient, transl,
-    body_pose, then the shape.
+    """Returns the derivatives of residuals, (m, r, u), and of joints, (m, j, 3, u), of each frame
+    by its u unknowns: global_orient, transl, body_pose, and the shape.
     """
     problem, state, m = keypoint_problem(model), fit.state, len(observations.noise)
     poses = jnp.concatenate(
@@ -160,7 +160,9 @@ def _derivatives(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Examination:
-    """The report on a body and keypoints, and the arrays behind it, of v views and k keypoints."""
+    """A report that compares a body with keypoints, and the arrays of v views and k keypoints from
+    which it was made.
+    """
 
     report: FitReport
     """The report."""
@@ -169,16 +171,19 @@ class Examination:
     compared: Bool[np.ndarray, "v k"]
     """Which keypoints were compared with the body, (v, k)."""
     outliers: Bool[np.ndarray, "v k"]
-    """Which of these are outliers, (v, k)."""
+    """Which compared keypoints are outliers, (v, k)."""
 
 
 def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = None) -> Examination:
-    """Compare the body of a capture with keypoints of its views, in the order of the views.
+    """Compare the body of a capture with keypoints of its views.
 
-    Arguments: record: of the fit to these keypoints, if that is known: its noise (default: from the
-    median error), and what the views determine.
-    Raises: ValueError if the number of views differs, the record is of fewer frames, or the body
-    has none of the landmarks.
+    Args:
+        capture: the capture with its body.
+        keypoints: keypoints in the order of the capture's views.
+        record: record of the fit to these keypoints. It has the noise of the keypoints, and what
+            the views determine. None: the noise is estimated from the median error.
+    Raises: ValueError if the number of views differs, if the record has fewer frames, or if the
+    body has none of the landmarks.
     """
     _check_same_views(capture, keypoints, record)
     # distances of the body's landmarks from the keypoints, frame by frame
@@ -228,7 +233,10 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
 
 
 def _check_same_views(capture: Capture, keypoints: Keypoints, record: FitRecord | None) -> None:
-    """Raises: ValueError, see `examine`."""
+    """Checks that keypoints and record fit to a capture.
+
+    Raises: ValueError, see `examine`.
+    """
     views, joints = capture.view_count, len(capture.body.joint_names)
     if len(keypoints.points) != views:
         raise ValueError(f"keypoints of {len(keypoints.points)} views, but the capture has {views}")
@@ -248,8 +256,8 @@ def _exchanges(
     views: Int[np.ndarray, "m c"],
     names: tuple[str, ...],
 ) -> tuple[Swap, ...]:
-    """What seems exchanged. Exchanged hands are reported once, and not again as exchanged sides of
-    their view.
+    """Returns what seems to be exchanged. Exchanged hands are not reported again as exchanged sides
+    of their view.
     """
     hands = find_exchanged_hands(keypoints, names)
     explained = {swap.views[0] for swap in hands}
@@ -281,14 +289,14 @@ def _view_report(
 
 
 def _quantile(values: Float[np.ndarray, "..."], share: float) -> float:
-    """A quantile of the values that are not NaN; NaN if all are."""
+    """Returns a quantile of the values that are finite. NaN if none is."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if known.size else float("nan")
 
 
 def calls_of_fit(body: BodyModel, kind: KeypointSet, views: int) -> Iterator[Call]:
-    """The programs of `fit_photos` and its report on photos of one moment, by their number alone,
-    the first one first.
+    """Yields the programs that `fit_photos` and its report run for photos of one moment, in the
+    order of their use. They depend only on the number of views. kind: set of the keypoints.
     """
     model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)
     k, one = len(kind.names), (1, views)
@@ -304,24 +312,28 @@ def calls_of_fit(body: BodyModel, kind: KeypointSet, views: int) -> Iterator[Cal
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FittedCapture:
-    """A fit in memory: the capture with its body, and the record that is stored beside it."""
+    """The result of a fit: the capture with its body, and the record that is stored beside it."""
 
     capture: Capture
-    """Photos, cameras and the fitted body; cameras that were turned are turned back."""
+    """Photos, cameras and the fitted body. Cameras that were turned in the photos are turned
+    back.
+    """
     record: FitRecord
-    """Keypoints of the fit, and how well its result is known."""
+    """Keypoints that were fitted, and how well the result is known."""
     fit: LandmarkFit
     """Result of the optimisation."""
     notes: tuple[str, ...]
-    """Further results of the fit, a line each."""
+    """Further results of the fit, one line each."""
     warnings: tuple[str, ...]
-    """What points to a mistake in the fit, a line each."""
+    """Signs of a mistake in the fit, one line each."""
     camera_errors: tuple[CameraError, ...] = ()
     """Cameras that were turned back."""
 
     @functools.cached_property
     def report(self) -> FitReport:
-        """How good the fit is. Made only when asked for, because it tries exchanges of views."""
+        """Report on how good the fit is. It is made only when needed, because it tries exchanges of
+        views.
+        """
         report = examine(self.capture, self.record.keypoints, self.record).report
         notes, warnings = (*report.notes, *self.notes), (*report.warnings, *self.warnings)
         return dataclasses.replace(report, notes=notes, warnings=warnings)
@@ -336,15 +348,19 @@ def fit_photos(
     smoothness: float = 0.0,
     fixed_cameras: bool = False,
 ) -> FittedCapture:
-    """Find shape and poses of the person in photos, and turn cameras back that the keypoints show
-    to be turned.
+    """Find shape and poses of the person in photos. Cameras that are turned, as the keypoints show,
+    are turned back.
 
-    Arguments: keypoints: of each view, in the order of the photos. body_file: where the body comes
-    from, see `Capture`.
-    smoothness: see `fit_landmarks`. fixed_cameras: they stay as they are, as do those that were
-    found from the person.
-    Raises: ValueError if the numbers of views differ, no view has a keypoint that the body has, or
-    the body's root is not its first joint.
+    Args:
+        photos: photos with cameras.
+        keypoints: keypoints of each view, in the order of the photos.
+        body: body model to fit.
+        body_file: where the body comes from, see `Capture`.
+        smoothness: see `fit_landmarks`.
+        fixed_cameras: whether the cameras stay as they are. Cameras that were found from the person
+            always stay.
+    Raises: ValueError if the numbers of views differ, if no view has a keypoint that the body has,
+    or if the body's root is not its first joint.
     """
     if len(keypoints.points) != len(photos.names):
         raise ValueError(
@@ -395,7 +411,9 @@ def fit_photos(
 
 
 def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:
-    """A line about landmarks that the detector sees elsewhere, if the fit looked for them."""
+    """Yields a line about landmarks that the detector sees elsewhere than the body has them, if the
+    fit looked for such landmarks.
+    """
     if fit.state.places is None:
         return
     moved = 1000 * PLACE_STD * np.linalg.norm(np.asarray(fit.state.places), axis=-1)
@@ -414,8 +432,8 @@ def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:
 
 
 def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str]:
-    """Warnings about frames (m, c, k) with few keypoints or a single view. smooth: whether the
-    motion is.
+    """Yields warnings about frames with few keypoints or with a single view. seen: which keypoints
+    are seen, (m, c, k). smooth: whether the motion is smooth.
     """
     taken = "interpolated between its neighbours" if smooth else "the prior's, not the photos'"
     single = []
@@ -434,8 +452,8 @@ def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str
 def _motion_warnings(
     joints: Float[np.ndarray, "m j 3"], held: float, smoothness: float
 ) -> Iterator[str]:
-    """Warnings about motion that was to be smooth. held: the smoothness to which accelerations were
-    held.
+    """Yields warnings about motion that was to be smooth. held: the expected acceleration that the
+    fit used in the end, 0 if none.
     """
     if not smoothness:
         return

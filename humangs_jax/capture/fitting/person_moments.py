@@ -1,12 +1,12 @@
-"""Whether photos of a person are of one moment, and the cameras about that moment, from the
-person's landmarks.
+"""Decides from a person's landmarks if photos are of one moment, and finds the cameras of that
+moment.
 
-A detector that takes a back for a front exchanges left and right of a whole view. Each
-view is mirrored on trial, and the others decide. The body, whose toes and nose are in front,
-decides whether all are mirrored.
+A detector that takes a back for a front exchanges left and right in a whole view. So each view is
+mirrored on trial, and the other views decide. Whether all views are mirrored is decided by the
+body, whose toes and nose are in front.
 
-A trial is an adjustment with some views mirrored. While trials are compared they are as exact as
-that needs; the one that is taken is then made as exact as it can be.
+A trial is an adjustment of the cameras with some views mirrored. Trials are only as exact as a
+comparison needs. The chosen trial is then made as exact as possible.
 """
 
 import dataclasses
@@ -33,82 +33,91 @@ from humangs_jax.core.progress import bar, watched
 from humangs_jax.io.images import DIAGONAL_35MM
 
 USUAL_FOCAL = 29.0
-"""Focal length of a telephone's main camera, mm, 35-mm equivalent."""
+"""Focal length of a telephone's main camera, mm, as 35-mm equivalent."""
 USUAL_STD = 0.2
 """Standard deviation of the logarithm of a focal length that is only assumed."""
 _EXIF_STD = 0.03
 """Standard deviation of the logarithm of a focal length from EXIF."""
 SEEN = 0.1
-"""Least visibility of a landmark that counts."""
+"""Least visibility of a landmark that is used."""
 FEWEST = 6
-"""Least number of such landmarks in a photo."""
+"""Least number of landmarks that are used in a photo."""
 SMALLEST = 16.0
-"""Pixels: a person who is smaller in a photo is a point."""
+"""Least size of a person in a photo, pixels. A smaller person is only a point."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _OneMoment:
-    """When photos are of one moment. Distances are rms over the person's size in the photo."""
+    """Limits that decide if photos are of one moment. Distances are shares of the person's size in
+    the photo.
+    """
 
     most_error: float = 0.02
-    """Rms distance of the landmarks from the person's points, a share of the person's size in the
-    photo, up to which the photos show one moment. Measured on a man in a laboratory: 7 moments,
-    four cameras each, 0.007 to 0.014; photos of several moments 0.045 to 0.073, with one photo of
-    another moment among four 0.033."""
+    """Largest rms distance of the landmarks from the person's points in photos of one moment.
+    Measured on a man in a laboratory: 7 moments with four cameras each had 0.007 to 0.014, photos
+    of several moments 0.045 to 0.073, and four photos with one of another moment 0.033.
+    """
     doubtful: float = 0.012
-    """The same distance above which mirrorings are also tried from the other end, all views
-    mirrored. Detections of one moment with an error of 3 pixels of 900 leave 0.004 to 0.007, a
-    mirrored view 0.02 and more."""
+    """Rms distance above which mirrorings are also tried from the other end, with all views
+    mirrored. Detections of one moment with an error of 3 pixels of 900 have 0.004 to 0.007, a
+    mirrored view 0.02 and more.
+    """
     without_one: float = 0.015
-    """The distance of `most_error` up to which the others are then of one moment: three of four
-    photos of several moments leave 0.021 or more."""
+    """Largest rms distance when one photo is left out, for the others to be of one moment. Three of
+    four photos of several moments have 0.021 or more.
+    """
     fewest: int = 4
-    """Photos from which on one may be left out because it contradicts the others."""
+    """Least number of photos of which one may be left out because it contradicts the others."""
     other: float = 0.03
-    """Rms distance of the landmarks of one such photo, a share of the person's size, above which it
-    shows another moment."""
+    """Largest rms distance of the landmarks in one further photo. A photo with more shows another
+    moment.
+    """
     deciding: int = 8
-    """Photos that decide between one moment and several, at most; others are compared with what
-    these say."""
+    """Largest number of photos that decide between one moment and several. Further photos are
+    compared with their result.
+    """
     mirrored: float = 0.7
-    """A view is mirrored if the cost is then less than this share of what it is without."""
+    """Largest ratio of the costs with and without a view mirrored, for the view to count as
+    mirrored.
+    """
     least_angle: float = 4.0
-    """Degrees between the directions from which photos see the person; below it they are taken one
-    by one."""
+    """Least angle between the directions from which photos see the person, degrees. If it is
+    smaller, each photo is taken alone.
+    """
     far: float = 0.2
-    """Share of the person's size; errors above count as this one."""
+    """Largest error that counts. Larger errors count as this one."""
 
 
 ONE_MOMENT = _OneMoment()
 
 
 _BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
-"""Ends of the bones whose left and right have one length."""
+"""Ends of the bones that have one length on the left and on the right."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PersonViews:
-    """What a detector sees of one person in c photos of one moment."""
+    """Landmarks that a detector sees of one person in c photos."""
 
     points: Float[np.ndarray, "c k 2"]
-    """Detections, (c, k, 2), pixels, the centre of the first pixel at (0.5, 0.5)."""
+    """Detected landmarks, (c, k, 2), pixels, with the centre of the first pixel at (0.5, 0.5)."""
     visibility: Float[np.ndarray, "c k"]
-    """Visibility of the landmarks, (c, k), in [0, 1]; 0: not seen."""
+    """Visibility of the landmarks, (c, k), in [0, 1]. 0 where a landmark is not seen."""
     world: Float[np.ndarray, "c k 3"]
-    """3D landmarks about the middle of the hips in the camera's axes (x right, y down, z away), as
-    if the camera looked straight at the person, (c, k, 3), metres.
+    """3D landmarks relative to the middle of the hips, (c, k, 3), metres. Axes are the camera's (x
+    right, y down, z away), as if the camera looked straight at the person.
     """
     names: tuple[str, ...]
     """Names of the landmarks, see `KeypointSet`."""
     sizes: tuple[tuple[int, int], ...]
-    """(width, height) of the photos, pixels."""
+    """Width and height of each photo, pixels."""
     focal: Float[np.ndarray, " c"]
-    """Focal lengths, (c,), pixels; NaN where unknown."""
+    """Focal lengths, (c,), pixels. NaN where unknown."""
     photos: tuple[str, ...]
     """Names of the photos."""
 
     def select(self, views: Sequence[int]) -> "PersonViews":
-        """Some of the photos, in this order."""
+        """Returns some of the photos, in this order."""
         rows = list(views)
         return dataclasses.replace(
             self,
@@ -122,7 +131,7 @@ class PersonViews:
 
 
 def known_landmarks(seen: PersonViews) -> Bool[np.ndarray, "c k"]:
-    """Which landmarks are visible and have finite coordinates, (c, k)."""
+    """Returns which landmarks are visible and have finite coordinates, (c, k)."""
     finite = np.isfinite(seen.points).all(-1) & np.isfinite(seen.world).all(-1)
     return finite & (np.nan_to_num(seen.visibility) > SEEN)
 
@@ -144,24 +153,28 @@ def cleaned(seen: PersonViews) -> PersonViews:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trial:
-    """The cameras of photos if left and right are exchanged in some of them."""
+    """Cameras that were fitted with left and right exchanged in some photos."""
 
     mirrored: Bool[np.ndarray, " c"]
-    """Whether left and right of a view are exchanged, (c,)."""
+    """Whether left and right are exchanged in each view, (c,)."""
     rig: Rig
-    """Cameras and landmarks."""
+    """The cameras, and the person's landmarks."""
     cost: float
     """Half the square sum of the adjustment's residuals."""
     evidence: Evidence
-    """Landmarks with the exchanges made."""
+    """The landmarks of the photos, with left and right exchanged."""
 
     @property
     def error(self) -> float:
-        """The rms distance of the landmarks from their pixels, see `_relative_error`."""
+        """Rms distance of the landmarks from their pixels, a share of the person's size, see
+        `_relative_error`.
+        """
         return _relative_error(self._shares, self.evidence.weights)
 
     def of_view(self, view: int) -> float:
-        """Rms distance of the landmarks of one photo, a share of the person's size in it."""
+        """Returns the rms distance of the landmarks in one photo, a share of the person's size in
+        it.
+        """
         seen = self.evidence.weights[view] > SEEN
         return float(np.sqrt(np.mean(np.minimum(self._shares[view][seen], ONE_MOMENT.far) ** 2)))
 
@@ -171,25 +184,25 @@ class Trial:
 
     @property
     def pixels(self) -> Float[np.ndarray, "c k"]:
-        """Distances of landmarks from their pixels."""
+        """Distances of landmarks from their pixels, (c, k), pixels."""
         return np.linalg.norm(pixel_errors(self.evidence, self.rig), axis=-1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Explanation:
-    """What explains the landmarks of photos."""
+    """The answer of `explain`: cameras of one moment, or none."""
 
     trial: Trial | None
-    """Cameras of `views` about one person; None: each photo stands alone."""
+    """Cameras of `views`. None: each photo stands for itself."""
     views: tuple[int, ...]
-    """Indices of all photos, or of all but one."""
+    """Indices of the photos that the trial explains. These are all, or all but one."""
     warnings: tuple[str, ...] = ()
-    """What a user should know about this explanation, a line each."""
+    """Warnings about this explanation, one line each."""
 
 
 def explain(seen: PersonViews) -> Explanation:
-    """Whether one person in one pose explains all photos, all but one of them, or none of them
-    together.
+    """Returns the cameras that explain all photos, or all but one, by one person in one pose. If
+    there are none, each photo stands for itself.
     """
     every = tuple(range(len(seen.photos)))
 
@@ -291,7 +304,7 @@ def under_bar(items: Sequence[Any], what: str) -> Iterator[Any]:
 
 
 def best_trial(seen: PersonViews) -> Trial:
-    """The cameras that explain the landmarks best, whichever views are mirrored."""
+    """Returns the trial that explains the landmarks best, whichever views are mirrored."""
     views = len(seen.points)
     found = _try(seen, np.zeros(views, bool))
     if views > 1:
@@ -306,7 +319,9 @@ def best_trial(seen: PersonViews) -> Trial:
 
 
 def _least(seen: PersonViews, start: Trial) -> Trial:
-    """Mirrors view after view, as long as that explains the landmarks clearly better."""
+    """Mirrors one view after the other, as long as the cost decreases clearly. Returns the best
+    trial.
+    """
     views = np.arange(len(seen.points))
     while True:
         flips = [start.mirrored ^ (views == v) for v in views]
@@ -330,8 +345,8 @@ def _polished(trial: Trial) -> Trial:
 
 
 def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"]) -> float:
-    """Rms of the errors (c, k). The divisor counts the degrees of freedom that are left after
-    points and cameras were fitted.
+    """Returns the rms of the errors, (c, k). The divisor is the number of degrees of freedom that
+    are left after points and cameras were fitted.
     """
     views, shown = len(errors), weights.max(0) > SEEN
     numbers = 2 * (weights > SEEN).sum()
@@ -342,13 +357,15 @@ def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray,
 
 
 def _angle(rig: Rig) -> float:
-    """Largest angle between the directions from which two photos see the person, degrees."""
+    """Returns the largest angle between the directions from which two photos see the person,
+    degrees.
+    """
     towards = _directions(rig)
     return float(np.rad2deg(np.arccos(np.clip(towards @ towards.T, -1, 1))).max())
 
 
 def _directions(rig: Rig) -> Float[np.ndarray, "c 3"]:
-    """Unit vectors from the person towards the cameras, (c, 3)."""
+    """Returns unit vectors from the person towards the cameras, (c, 3)."""
     places = rig.places / np.linalg.norm(rig.places, axis=1, keepdims=True)
     return -np.einsum("cba,cb->ca", rig.rotations, places)
 
@@ -360,11 +377,12 @@ def _directions(rig: Rig) -> Float[np.ndarray, "c 3"]:
 def _focal_lengths(
     seen: PersonViews,
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Int[np.ndarray, " c"]]:
-    """Focal lengths (c,), stds of their logarithms, and kinds of cameras; photos without one are
-    like the others, or as usual.
+    """Returns focal lengths, (c,), pixels, standard deviations of their logarithms, (c,), and kinds
+    of cameras, (c,). Photos without a focal length get the median of the others, relative to the
+    diagonal, or else the usual one.
 
-    Lengths of EXIF share one factor. Those of photos without share another, photos of one size
-    taken for those of one camera.
+    All focal lengths from EXIF are of one kind. Those of photos without EXIF are of one kind for
+    each size of photos, which are taken to be from one camera.
     """
     diagonals = np.hypot(*np.asarray(seen.sizes, float).T)
     known = np.isfinite(seen.focal)
@@ -380,14 +398,16 @@ def _focal_lengths(
 
 
 def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Evidence, Rig]:
-    """Evidence with left and right of some views exchanged, and cameras to start from."""
+    """Returns the landmarks with left and right exchanged in some views, and cameras to start
+    from.
+    """
     # the landmarks of mirrored views, in the order of their mirror images
     focal, std, kinds = _focal_lengths(seen)
     mirror = [seen.names.index(mirrored_name(name)) for name in seen.names]
     order = np.where(mirrored[:, None], mirror, np.arange(len(mirror)))
 
     def pick(values: np.ndarray) -> np.ndarray:
-        """Values (c, k, ...) in the order of each view."""
+        """Returns values (c, k, ...) with the landmarks of mirrored views exchanged."""
         at = order.reshape(*order.shape, *[1] * (values.ndim - 2))
         return np.take_along_axis(values, at, axis=1)
 
@@ -438,7 +458,9 @@ def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
 def middle_of(
     points: Float[np.ndarray, "k 3"], names: Sequence[str], part: str
 ) -> Float[np.ndarray, "3"]:
-    """The middle of the left and the right of a part; NaN where neither is among the names."""
+    """Returns the middle of the left and the right landmark of a part, (3,). If only one is among
+    the names, returns that one. NaN if neither is.
+    """
     sides = [f"{side}_{part}" for side in ("left", "right") if f"{side}_{part}" in names]
     found = [points[names.index(name)] for name in sides]
     return np.mean(found, axis=0) if found else np.full(3, np.nan)
@@ -447,13 +469,17 @@ def middle_of(
 def only_known(
     points: Float[np.ndarray, "k 3"], names: Sequence[str], known: Bool[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "n 3"], tuple[str, ...]]:
-    """The landmarks that are known, (n, 3), and their names. Places of others mean nothing."""
+    """Returns the known landmarks, (n, 3), and their names. Positions of the others mean
+    nothing.
+    """
     kept = np.flatnonzero(known)
     return points[kept], tuple(names[i] for i in kept)
 
 
 def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
-    """The direction to the person's front: that of toes and nose; not a unit vector."""
+    """Returns the direction to the person's front, (3,), by toes and nose. It is not a unit vector,
+    and 0 if the names do not have these.
+    """
     ends = [
         (f"{side}_{toe}", f"{side}_heel")
         for toe in ("foot_index", "big_toe")
@@ -470,7 +496,9 @@ def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.n
 
 
 def across(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
-    """From the right side of the trunk to the left one, by the pairs that are among the names."""
+    """Returns the vector from the right side of the trunk to the left, (3,). It uses shoulders and
+    hips if both sides are among the names.
+    """
     total = np.zeros(3)
     for part in ("shoulder", "hip"):
         left, right = f"left_{part}", f"right_{part}"
@@ -480,8 +508,8 @@ def across(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.n
 
 
 def handedness(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> float:
-    """Positive if the left side is to the left of somebody who looks to the front; 0 if the names
-    do not tell.
+    """Returns a number that is positive if the left side is to the left of a person who looks to
+    the front, and negative if it is to the right. 0 if the names do not tell.
     """
     up = middle_of(points, names, "shoulder") - middle_of(points, names, "hip")
     if np.isnan(up).any():

@@ -1,8 +1,9 @@
-"""One state and one solver for every fit: shape, poses and, where a fit moves them, cameras and
-clothing.
+"""The state and the solver that all fits share. A state holds shape and poses and, if a fit moves
+them, cameras and clothing.
 
-A state holds deviations from an `Origin` in units of their expected size, so that zeros are the
-origin, solvers take steps of one length in all directions, and the square of a number is its prior.
+The numbers of a state are deviations from an `Origin` in units of their expected size. So zeros are
+the origin, solvers take steps of one length in all directions, and the square of a number is its
+prior.
 
     keypoints    betas, the pose of every frame               origin: the mean shape in its usual
                                                               pose
@@ -11,18 +12,20 @@ origin, solvers take steps of one length in all directions, and the square of a 
 The root turns by global_orient after the origin's rotation, because sums of rotation vectors near
 half a turn are no measure of small turns.
 
-The prior of poses is here, too: the usual rotation of every joint, its standard deviation, and its
-limits, as rotation vectors of SMPL-X's joints by name, in radians about the axes of the T-pose: x
-to the person's left, y up, z forward. Limits are boxes of rotation vectors, generous where axes mix
-(hips, shoulders). Written for the left side; the right is its mirror image (x, -y, -z). A knee
-bends about +x, the left elbow about -y, left fingers about -z; the left arm hangs at z = -1.4.
+The module also has the prior of poses: for every joint the usual rotation, its standard deviation
+and its limits. They are rotation vectors of SMPL-X's joints by name, in radians about the axes of
+the T-pose: x to the person's left, y up, z forward. Limits are boxes of rotation vectors, which are
+generous where axes mix (hips, shoulders). They are written for the left side. The right side is its
+mirror image (x, -y, -z). A knee bends about +x, the left elbow about -y, left fingers about -z. The
+left arm hangs at z = -1.4.
 
-The solver minimises half the square sum of residuals over a pytree of numbers of about unit size;
-robust losses enter as residuals whose squares they are:
+The solver minimises half the square sum of residuals over a pytree of numbers of about unit size. A
+robust loss enters as a residual whose square is the loss. There are two methods:
 
-    lbfgs   many unknowns, cheap under vmap; works through the renderer, which has a backward rule
-            only
-    lm      Levenberg and Marquardt by normal equations: few unknowns, quadratic near the solution
+    lbfgs   for many unknowns; cheap under vmap, and works through the renderer, which has a
+            backward rule only
+    lm      Levenberg and Marquardt by normal equations, for few unknowns; quadratic near the
+            solution
 """
 
 import dataclasses
@@ -45,20 +48,20 @@ from humangs_jax.geometry.camera import Camera
 
 T = TypeVar("T")
 NORMAL_MAD = 1.4826
-"""Standard deviations of a normal distribution per median absolute deviation."""
+"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 
 def half_squares(tree: PyTree) -> Float[Array, ""]:
-    """Half the square sum of all leaves."""
+    """Returns half the square sum of all leaves."""
     return sum((0.5 * jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
 
 
 def robust(errors: Float[Array, "*n d"], scale: Float[Array, ""] | float) -> Float[Array, "*n d"]:
-    """Residuals whose square is Geman and McClure's loss of the length of the errors: e c /
-    sqrt(c^2 + |e|^2), c the scale.
+    """Returns residuals whose square is Geman and McClure's loss of the errors' lengths: e c /
+    sqrt(c^2 + |e|^2), where c is the scale.
 
-    Like e near 0, and no longer than c far off: a keypoint on another person pulls no harder than
-    one that is a little off.
+    Near 0 they are like e, and they are never longer than c. So a keypoint on another person pulls
+    no harder than one that is a little off.
     """
     return errors * (
         scale / jnp.sqrt(scale * scale + jnp.sum(jnp.square(errors), axis=-1, keepdims=True))
@@ -74,12 +77,18 @@ def solve(
     tolerance: float = 1e-4,
     free: T | None = None,
 ) -> tuple[T, Float[Array, ""]]:
-    """Minimise from a start.
+    """Minimise half the square sum of residuals.
 
-    Arguments: residuals: any pytree. steps: at most. tolerance: of the unknowns and, relatively, of
-    the loss. free: pytree of booleans like start; the others stay.
-    Returns: the solution, or the start where that is no worse, and so finite numbers; and half its
-    square sum.
+    Args:
+        residuals: function that returns a pytree of residuals.
+        start: pytree of unknowns to begin with.
+        steps: largest number of steps.
+        method: see the module's docstring.
+        tolerance: change of the unknowns, and relative change of the loss, at which the solver
+            stops.
+        free: pytree of booleans like start. Numbers that are False stay. None: all move.
+    Returns: the solution and half its square sum. If the solution is not at least as good as the
+    start, or not finite, these are the start and its half square sum.
     """
     import lineax
     import optimistix
@@ -90,7 +99,7 @@ def solve(
         moving = None if free is None else ravel_pytree(free)[0]
 
         def held(y):
-            """The unknowns, where those that are not free stay as they are."""
+            """Returns the unknowns, with those that are not free as at the start."""
             return y if moving is None else jnp.where(moving, y, flat)
 
         def of(y):
@@ -115,16 +124,16 @@ def solve(
 
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
-"""The rotation vector of the mirrored rotation."""
+"""Factors that turn a rotation vector into that of the mirrored rotation."""
 _UNLIMITED = np.pi
-"""Radians: the limit of a component that has no other."""
+"""Limit of a rotation vector's component that has no other limit, radians."""
 
 
 Vector = tuple[float, float, float]
 
 
 class Range(NamedTuple):
-    """The prior of one joint's rotation vector, by axis."""
+    """The prior of one joint's rotation vector, by component."""
 
     mean: Vector
     """Usual rotation vector, radians."""
@@ -171,16 +180,16 @@ _RANGES = {
     **{f"left_{finger}1": _KNUCKLE for finger in FINGERS if finger != "thumb"},
     **{f"left_{finger}{k}": _FINGER for finger in FINGERS if finger != "thumb" for k in (2, 3)},
 }
-"""Ranges of everyday movement; wider than measured joint angles, because components of a rotation
-vector are not joint angles.
+"""Ranges of everyday movement, for the root and the left side. They are wider than measured joint
+angles, because components of a rotation vector are not joint angles.
 """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosePrior:
-    """The prior of the rotations of a body's j joints, in their order.
+    """The prior of the rotations of a body's j joints, in the body's order.
 
-    The root's is not used: every orientation is as likely.
+    The values of the root are not used: every orientation is as likely.
     """
 
     mean: Float[np.ndarray, "j 3"]
@@ -194,8 +203,8 @@ class PosePrior:
 
 
 def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
-    """The prior of a body. Joints with other names than SMPL-X's have mean 0, std 0.3 rad and no
-    limits.
+    """Returns the prior of a body. Joints with other names than SMPL-X's have mean 0, standard
+    deviation 0.3 rad and no limits.
     """
     rows = []
     for name in joint_names:
@@ -210,7 +219,9 @@ def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
 def limit_residuals(
     prior: PosePrior, joints: tuple[int, ...], rotations: Float[Array, "j 3"]
 ) -> Float[Array, "a 3"]:
-    """How far joints turn beyond their limits, in standard deviations."""
+    """Returns how far joints turn beyond their limits, (a, 3), in standard deviations. joints:
+    indices of the a joints. rotations: rotation vectors of all joints, radians.
+    """
     rows = np.asarray(joints, int)
     turned = rotations[rows]
     beyond = jnp.maximum(prior.lower[rows] - turned, turned - prior.upper[rows])
@@ -219,41 +230,43 @@ def limit_residuals(
 
 
 _RADIANS = math.pi / 180
-"""Per degree."""
+"""Radians in a degree."""
 SAME = 1e-4
-"""Relative difference of focal lengths, and radians and metres of cameras, below which two are the
-same.
+"""Largest difference of cameras that count as the same: relative for focal lengths, radians for
+rotations, metres for positions.
 """
 
 
 @pytree_dataclass
 class StateStd:
-    """Expected size of the deviations from an origin, as standard deviations.
+    """Expected sizes of the deviations from an origin, as standard deviations.
 
-    Numbers, or arrays () where one program is compiled for all of them.
+    They are numbers, or arrays () where one program is compiled for all values.
     """
 
     focal: Float[Array, ""] | float = 0.05
-    """Focal lengths, as a share."""
+    """Standard deviation of the logarithm of focal lengths."""
     camera_rotation: Float[Array, ""] | float = 2.0
-    """Rotation of a camera about each axis, degrees."""
+    """Standard deviation of a camera's rotation about each axis, degrees."""
     camera_center: Float[Array, ""] | float = 0.05
-    """Position of a camera along each axis, metres."""
+    """Standard deviation of a camera's position along each axis, metres."""
     global_orient: Float[Array, ""] | float = 3.0
-    """Orientation of the person about each axis, degrees."""
+    """Standard deviation of the person's orientation about each axis, degrees."""
     transl: Float[Array, ""] | float = 0.05
-    """Position of the person along each axis, metres."""
+    """Standard deviation of the person's position along each axis, metres."""
     body_pose: Float[Array, ""] | float = 4.0
-    """Rotation of each joint about each axis, degrees."""
+    """Standard deviation of each joint's rotation about each axis, degrees."""
     betas: Float[Array, ""] | float = 0.3
-    """Coefficients of the shape."""
+    """Standard deviation of the shape coefficients."""
     clothing: Float[Array, ""] | float = 0.03
-    """Thickness of clothes and hair on each segment of the body, metres."""
+    """Standard deviation of the thickness of clothes and hair on each segment of the body,
+    metres.
+    """
 
 
 FREE = StateStd(global_orient=math.degrees(0.3), transl=0.1, betas=1.0)
-"""Without a start: steps of the solver for orientation and position, which have no prior then, and
-the shape's own std.
+"""Units for a fit without a start. Orientation and position have no prior then: theirs are step
+lengths of the solver. The shape has its usual standard deviation.
 """
 
 
@@ -271,10 +284,10 @@ class CameraState:
 
 @pytree_dataclass
 class FitState:
-    """What a fit moves, in units of `StateStd`; parts that it does not move are None.
+    """The numbers that a fit moves, in units of `StateStd`. Parts that it does not move are None.
 
-    A fit of m frames has one shape and a leading axis (m, ...) of poses. a is the number of free
-    joints.
+    In a fit of m frames the poses have a leading axis (m, ...), and all frames share one shape. The
+    number of free joints is a.
     """
 
     betas: Float[Array, " s"]
@@ -286,16 +299,18 @@ class FitState:
     body_pose: Float[Array, "*m a 3"]
     """Deviations of the rotation vectors of the free joints, (a, 3) or (m, a, 3)."""
     cameras: CameraState | None = None
-    """Deviations of the cameras."""
+    """Deviations of the cameras. None if the fit does not move them."""
     clothing: Float[Array, " b"] | None = None
-    """Thickness of clothes on the segments of the root and of the free joints, (a + 1,)."""
+    """Thickness of clothes on the segments of the root and of the free joints, (a + 1,), in units
+    of `StateStd`. None without clothing.
+    """
     places: Float[Array, "g 3"] | None = None
     """Deviations of the places of groups of landmarks, (g, 3), see `LandmarkModel.moved`."""
 
 
 @pytree_dataclass
 class CameraOrigin:
-    """The cameras of v views where a fit begins, and which numbers of the state move each."""
+    """The cameras of v views where a fit begins, and the indices of their numbers in the state."""
 
     K: Float[Array, "v 3 3"]
     """Intrinsics, (v, 3, 3), pixels."""
@@ -311,7 +326,7 @@ class CameraOrigin:
 
 @pytree_dataclass
 class Origin:
-    """Where the zeros of a state are, and the unit of each of its numbers."""
+    """The values that zeros of a state stand for, and the unit of each of its numbers."""
 
     betas: Float[Array, " s"]
     """Shape coefficients, (s,)."""
@@ -320,32 +335,36 @@ class Origin:
     body_pose_std: Float[Array, "a 3"]
     """Standard deviations of the free joints' rotation vectors, (a, 3), radians."""
     cameras: CameraOrigin | None = None
-    """Cameras of the views; None for a fit that does not move cameras."""
+    """Cameras of the views. None for a fit without cameras."""
     segment: Int[Array, " j"] | None = None
-    """Which number of `FitState.clothing` covers what a joint moves, (j,); None without clothing.
-    """
+    """Index of each joint's number in `FitState.clothing`, (j,). None without clothing."""
     joints: tuple[int, ...] = static_field(default=())
-    """Indices of the a free joints; the root (joint 0) is free besides."""
+    """Indices of the a free joints. The root (joint 0) is always free and not among them."""
     std: StateStd = FREE
-    """Units of everything that moves but the joints."""
+    """Units of everything that moves but the joints' rotations."""
 
     @property
     def views(self) -> CameraOrigin:
-        """The cameras. Raises: ValueError if there are none."""
+        """The cameras.
+
+        Raises: ValueError if there are none.
+        """
         if self.cameras is None:
             raise ValueError("expected an origin with cameras")
         return self.cameras
 
 
 def usual_origin(prior: PosePrior, joints: tuple[int, ...], coefficients: int) -> Origin:
-    """The mean shape in its usual pose at the world's origin."""
+    """Returns the origin with the mean shape in the prior's usual pose at the world's origin.
+    joints: indices of the free joints. coefficients: number of shape coefficients.
+    """
     pose = BodyPose(from_host(prior.mean), _zeros(3))
     std = from_host(prior.std[np.asarray(joints, int)])
     return Origin(betas=_zeros(coefficients), pose=pose, body_pose_std=std, joints=joints)
 
 
 def zero_state(origin: Origin) -> FitState:
-    """The state of the origin."""
+    """Returns the state of zeros, which stands for the origin."""
     frames, a = origin.pose.translation.shape[:-1], len(origin.joints)
     cameras = None
     views = origin.cameras
@@ -365,23 +384,23 @@ def zero_state(origin: Origin) -> FitState:
 
 
 def _zeros(*shape: int) -> Float[Array, "..."]:
-    """Zeros that no program is compiled for."""
+    """Returns zeros from the host, for which JAX compiles no program."""
     return from_host(np.zeros(shape, np.float32))
 
 
 def frame_axes(state: FitState) -> FitState:
-    """`in_axes` of `jax.vmap` for a state with one shape and a batch of frames."""
+    """Returns `in_axes` of `jax.vmap` for a state with one shape and a batch of frames."""
     none = jax.tree.map(lambda leaf: None, state)
     return replace(none, global_orient=0, transl=0, body_pose=0)
 
 
 def betas_of(origin: Origin, state: FitState) -> Float[Array, " s"]:
-    """Shape coefficients."""
+    """Returns the shape coefficients of a state, (s,)."""
     return origin.betas + origin.std.betas * state.betas
 
 
 def pose_of(origin: Origin, state: FitState) -> BodyPose:
-    """The pose, or the batch of poses; differentiable everywhere.
+    """Returns the pose of a state, or the batch of poses. It is differentiable everywhere.
 
     Joints that are not free are as in the origin.
     """
@@ -397,9 +416,10 @@ def pose_of(origin: Origin, state: FitState) -> BodyPose:
 
 
 def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitState:
-    """The state of a shape and a pose, whose other joints are taken to be as in the origin.
+    """Returns the state of a shape and a pose, or a batch of poses. Joints that are not free are
+    ignored.
 
-    No cameras and no clothing.
+    The state has no cameras and no clothing.
     """
     joints, start = np.asarray(origin.joints, int), origin.pose
     conjugate = quaternion.from_axis_angle(-start.rotations[..., 0, :])
@@ -416,11 +436,11 @@ def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitSt
 def cameras_of(
     origin: Origin, state: FitState
 ) -> tuple[Float[Array, "v 3 3"], Float[Array, "v 4 4"]]:
-    """K and cam_from_world of every view: a camera turns about its centre, in its own axes, and the
-    centre moves.
+    """Returns K, (v, 3, 3), and cam_from_world, (v, 4, 4), of every view. A camera turns about its
+    centre, in its axes, and the centre moves.
 
-    A state without cameras leaves them where they are. Raises: ValueError if the origin is without
-    cameras.
+    If the state has no cameras, they are as in the origin.
+    Raises: ValueError if the origin has no cameras.
     """
     start, moved, std = origin.views, state.cameras, origin.std
     if moved is None:
@@ -443,8 +463,8 @@ def cameras_of(
 def clothing_thickness(
     origin: Origin, state: FitState, weights: Float[Array, "*p j"]
 ) -> Float[Array, "*p"]:
-    """Metres by which masks reach beyond the body, at points with these skinning weights; 0 without
-    clothing.
+    """Returns how far masks reach beyond the body at points with these skinning weights, (..., j),
+    metres. It is 0 without clothing.
     """
     if origin.segment is None or state.clothing is None:
         return jnp.zeros(weights.shape[:-1])
@@ -454,8 +474,8 @@ def clothing_thickness(
 
 
 def segments(parents: tuple[int, ...], joints: tuple[int, ...]) -> Int[np.ndarray, " j"]:
-    """(j,) 0 for the root, 1 + i for joint `joints[i]`, and for other joints the number of their
-    nearest such ancestor.
+    """Returns the segment of each joint, (j,): 0 for the root, 1 + i for joint `joints[i]`, and for
+    other joints the segment of their nearest ancestor that has one.
     """
     number = {joint: i + 1 for i, joint in enumerate(joints)} | {parents.index(-1): 0}
     found = []
@@ -467,7 +487,9 @@ def segments(parents: tuple[int, ...], joints: tuple[int, ...]) -> Int[np.ndarra
 
 
 def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"]) -> CameraOrigin:
-    """Views of equal K and cam_from_world are of one camera; equal focal lengths stay equal."""
+    """Returns the origin of cameras. Views with the same K and cam_from_world share a camera in the
+    state. Views with the same focal lengths share a focal length. frames: frame of each view, (v,).
+    """
     K, matrices = np.asarray(cameras.K, float), np.asarray(cameras.cam_from_world, float)
     camera = camera_numbers(K, matrices, SAME)
     focal = _numbered(np.log(K[:, [0, 1], [0, 1]]), SAME)
@@ -477,8 +499,8 @@ def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"]) -> CameraOrigi
 def camera_numbers(
     K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], same: float
 ) -> Int[np.ndarray, " v"]:
-    """(v,) from 0, equal for views of one camera that stood still. same: largest difference, see
-    below.
+    """Returns the number of each view's camera, (v,), from 0. Views of one camera that stood still
+    have the same number. same: difference below which two views are of one camera, see `SAME`.
     """
     focal = K[:, :1, 0]
     rows = [np.log(focal), K.reshape(len(K), -1) / focal, matrices.reshape(len(K), -1)]
@@ -486,7 +508,9 @@ def camera_numbers(
 
 
 def _numbered(rows: Float[np.ndarray, "n d"], same: float) -> Int[np.ndarray, " n"]:
-    """Numbers from 0 of rows (v, n): those that equal an earlier one have its number."""
+    """Returns a number for each row, (n,), from 0. Rows that differ by less than `same` in all
+    columns have the same number.
+    """
     numbers, known = np.zeros(len(rows), np.int32), np.empty((0, rows.shape[1]))
     for i, row in enumerate(rows):
         alike = np.flatnonzero(np.abs(known - row).max(axis=1) < same)

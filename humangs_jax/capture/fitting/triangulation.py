@@ -1,13 +1,16 @@
-"""Points in space from several views, and which people in several views are the same person.
+"""Triangulates points from several views, and finds which people in several views are the same
+person.
 
 A pixel is a ray. The point with the least weighted sum of squared distances to the rays solves 3 x
 3 equations. Weights of focal length over distance turn metres into pixels (Hartley and Zisserman,
-Multiple View Geometry, 12.2). Robustly: from the pair of views that most views agree with.
+Multiple View Geometry, 12.2). The robust solution begins with the pair of views that most views
+agree with.
 
-Landmarks of one person triangulate: seen from other cameras they fall on that person's landmarks,
-within a few hundredths of the person's size. Those of two people do not, nor do those of a person
-whose left and right one view takes for each other. Every pair of people in two views proposes
-points, as they are and with the sides of the second exchanged; the others join where they agree.
+The landmarks of one person triangulate: points in space project to that person's landmarks in other
+cameras, within a few hundredths of the person's size. The landmarks of two people do not, nor do
+those of a person whose left and right are exchanged in one view. Every pair of people in two views
+proposes points, once as they are and once with left and right of the second exchanged. People in
+other views join where they agree.
 """
 
 import dataclasses
@@ -26,19 +29,20 @@ from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.geometry.transform import EXACT
 
 PAIRS_AT_ONCE = 16
-"""Pairs of views whose proposals are compared with all views at once: memory does not grow with the
-number of pairs.
+"""Number of pairs of views whose proposals are compared with all views at once. It is fixed, so
+that memory does not grow with the number of pairs.
 """
 _MARGIN = 6.0
-"""A view agrees with a point within this many standard deviations of the noise."""
+"""Largest error at which a view agrees with a point, standard deviations of the noise."""
 
 
 def triangulate(
     observations: Observations, weights: Float[Array, "c k"] | None = None
 ) -> tuple[Float[Array, "k 3"], Float[Array, " k"]]:
-    """Least squares over all views: points (k, 3) in metres and how many views see each (k,).
+    """Triangulates points by least squares over all views. Returns the points, (k, 3), metres, and
+    how many views see each, (k,).
 
-    Arguments: weights: of the views of each point; default: the confidences.
+    Arguments: weights: of each point in each view, (c, k). None: the confidences.
     """
     weights = observations.confidences if weights is None else weights
     origins, directions = _rays(observations)
@@ -55,9 +59,10 @@ def triangulate(
 def triangulate_robustly(
     observations: Observations,
 ) -> tuple[Float[Array, "k 3"], Float[Array, " k"], Float[Array, "c k"]]:
-    """Points (k, 3), how many views agree with each (k,), and those views' weights (c, k).
+    """Triangulates points robustly. Returns the points, (k, 3), metres, how many views agree with
+    each, (k,), and the weights of these views, (c, k).
 
-    Every pair of views proposes a point; the proposal that the views agree with most is improved
+    Every pair of views proposes a point. The proposal that the views agree with most is improved
     from those views alone. A point that fewer than two views agree with has weights of 0.
     """
     views = observations.points.shape[0]
@@ -84,8 +89,8 @@ def triangulate_robustly(
 
 
 def agreement(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
-    """How well the views agree with points: their confidences, less for larger errors, 0 beyond the
-    margin.
+    """Returns how well views agree with points, (c, k): their confidences, which are less the
+    larger the errors are, and 0 beyond the margin.
     """
     errors = reprojection_errors(observations, points)
     return observations.confidences * jnp.maximum(
@@ -96,8 +101,8 @@ def agreement(observations: Observations, points: Float[Array, "k 3"]) -> Float[
 def reprojection_errors(
     observations: Observations, points: Float[Array, "k 3"]
 ) -> Float[Array, "c k"]:
-    """Distance in pixels between points as the views would show them and the detections; huge
-    behind a camera.
+    """Returns the distances between projected points and the detections, (c, k), pixels. They are
+    1e6 for points behind a camera.
     """
     seen = in_cameras(observations, points)
     depth = seen[..., 2]
@@ -136,20 +141,23 @@ def _nearest(
 
 @dataclasses.dataclass(frozen=True)
 class _SamePerson:
-    """When people in views of one moment are one person."""
+    """Limits that decide if people in views of one moment are one person."""
 
     agree: float = 0.06
-    """Median distance of landmarks from the triangulated points, a share of the person's size in
-    the photo, up to which a view shows the same person. Cameras that are off by a degree make 0.02
-    of it."""
+    """Largest median distance of a view's landmarks from the triangulated points of the same
+    person, a share of the person's size in the photo. Cameras that are off by a degree contribute
+    0.02.
+    """
     clearly: float = 0.5
-    """Sides are exchanged if the distance is then less than this share of what it is without."""
+    """Largest ratio of the distances with and without exchanged sides, for the sides to be
+    exchanged.
+    """
     rather: float = 0.8
-    """The same where the views do not agree without an exchange."""
+    """The ratio of `clearly` for views that do not agree without an exchange."""
     seen: float = 0.3
-    """Least visibility of a landmark that counts."""
+    """Least visibility of a landmark that is used."""
     fewest: int = 6
-    """Least number of landmarks that two views share to be compared."""
+    """Least number of landmarks that two views have to share to be compared."""
 
 
 _SAME_PERSON = _SamePerson()
@@ -157,59 +165,61 @@ _SAME_PERSON = _SamePerson()
 
 @dataclasses.dataclass(frozen=True)
 class _SameWay:
-    """When people in two frames that follow each other are one person."""
+    """Limits that decide if people in two successive frames are one person."""
 
     farthest: float = 1.0
-    """Metres between a person's places in two frames that follow each other, where several views
-    show where they are."""
+    """Largest distance between a person's positions in two successive frames, metres. It is used
+    where several views show the position.
+    """
     near: float = 0.5
-    """How far people go in the photo of one camera from one frame to the next, a share of their
-    size in it."""
+    """Largest movement in the photo of one camera between two successive frames, a share of the
+    person's size in it.
+    """
     resized: float = 1.5
-    """The most by which a person's size in the photo of one camera changes from one frame to the
-    next, a factor."""
+    """Largest ratio of a person's sizes in the photo of one camera in two successive frames."""
     shorter: float = 0.3
-    """How much shorter the ways of people between two frames have to be than if two of them were
-    exchanged, a share of the longest way."""
+    """How much longer the movements between two frames have to become if two people are exchanged,
+    for the people to be linked. A share of the largest movement.
+    """
     far: float = 3.0
-    """Multiple of the longest way from which on all ways count as equally long."""
+    """Multiple of the largest movement from which on all movements count as equally long."""
     still_degrees: float = 10.0
-    """A view that has turned by no more than this since the last frame is one camera's."""
+    """Largest rotation of a view between two frames that still counts as one camera, degrees."""
     still_metres: float = 0.3
-    """A view that has moved by no more than this since the last frame is one camera's."""
+    """Largest movement of a view between two frames that still counts as one camera, metres."""
 
 
 _SAME_WAY = _SameWay()
 
 
 class Seen(NamedTuple):
-    """The people of a view."""
+    """A view and the people that are seen in it."""
 
     K: Float[np.ndarray, "3 3"]
     """Intrinsics, (3, 3), pixels."""
     cam_from_world: Float[np.ndarray, "4 4"]
     """Camera pose, (4, 4), metres."""
     people: tuple[Float[np.ndarray, "k 3"], ...]
-    """Landmarks of each person, (k, 3): pixels and visibility."""
+    """Landmarks of each person, (k, 3): pixels (x, y) and visibility."""
 
 
 Key = tuple[int, int]
-"""A view, and a person in it."""
+"""Indices of a view, and of a person in it."""
 
 
 class Match(NamedTuple):
     """One person in several views."""
 
     members: tuple[int | None, ...]
-    """Index of the person in each view; None where the view does not have it."""
+    """Index of the person in each view. None where the view does not show the person."""
     mirrored: tuple[bool, ...]
-    """Whether left and right are exchanged, for each view."""
+    """Whether the person's left and right are exchanged, for each view."""
     error: float
-    """Median distance of the landmarks from the triangulated points, a share of the person's size;
-    infinite for a person of one view.
+    """Median distance of the landmarks from the triangulated points, a share of the person's size.
+    Infinite for a person who is seen in one view.
     """
     center: Float[np.ndarray, "3"]
-    """Median of the triangulated points, (3,), metres; NaN for a person of one view."""
+    """Median of the triangulated points, (3,), metres. NaN for a person who is seen in one view."""
 
 
 def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
@@ -257,8 +267,8 @@ def _gathered(
     points: Float[np.ndarray, "k 3"],
     known: Bool[np.ndarray, " k"],
 ) -> tuple[dict[Key, bool], float]:
-    """A pair, {(view, person): exchanged}, with the people of the other views who agree with its
-    points; and the error.
+    """Adds to a pair of people the people of other views who agree with its points. Returns the
+    group, {(view, person): exchanged}, and its mean error.
     """
     group, errors = dict(pair), [error]
     for v in set(range(len(views))) - {v for v, _ in pair}:
@@ -277,9 +287,10 @@ def _gathered(
 
 
 def _is_exchanged(plain: float, exchanged: float) -> bool:
-    """Whether sides are exchanged, by the errors without and with an exchange.
+    """Returns whether sides are exchanged. plain and exchanged: errors without and with an
+    exchange.
 
-    Left and right of a small or thin person hardly differ: then nothing is exchanged.
+    Left and right of a small or thin person hardly differ. Then nothing is exchanged.
     """
     most = (
         _SAME_PERSON.clearly * plain
@@ -315,7 +326,9 @@ def _match(
 def _triangulated(
     views: Sequence[Seen], rows: dict[int, Float[np.ndarray, "k 3"]]
 ) -> tuple[Float[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
-    """Points by linear least squares, and which of them all views see."""
+    """Triangulates points by linear least squares. Returns the points, (k, 3), metres, and which of
+    them all views see, (k,).
+    """
     known = np.logical_and.reduce([row[:, 2] >= _SAME_PERSON.seen for row in rows.values()])
     equations = []
     for v, row in rows.items():
@@ -334,8 +347,8 @@ def _error(
     points: Float[np.ndarray, "k 3"],
     known: Bool[np.ndarray, " k"],
 ) -> float:
-    """Median distance of landmarks from points over the size of the person; infinite behind the
-    camera or with few in common.
+    """Returns the median distance of landmarks from projected points, over the size of the person.
+    It is infinite if the person is behind the camera, or too few landmarks are shared.
     """
     seen = known & (row[:, 2] >= _SAME_PERSON.seen)
     if seen.sum() < _SAME_PERSON.fewest:
@@ -351,7 +364,7 @@ def _error(
 
 
 def comparable(first: Float[np.ndarray, "k 3"], second: Float[np.ndarray, "k 3"]) -> bool:
-    """Tells whether two views see enough of the same landmarks to say that they show two people."""
+    """Returns whether two views share enough landmarks to show that they see two people."""
     return (
         int(((first[:, 2] >= _SAME_PERSON.seen) & (second[:, 2] >= _SAME_PERSON.seen)).sum())
         >= _SAME_PERSON.fewest
@@ -361,14 +374,16 @@ def comparable(first: Float[np.ndarray, "k 3"], second: Float[np.ndarray, "k 3"]
 def in_order_of_time(
     frames: Sequence[list[Match]], shown: Sequence[Sequence[Seen]] | None = None
 ) -> list[list[Match | None]]:
-    """The matches of frames that follow each other, so that the i-th of each is one person.
+    """Orders the matches of successive frames so that the i-th match of each frame is the same
+    person.
 
-    The summed length of all ways is the shortest: in space, and in the photos of one camera for
-    people without a place in space. Where another choice is nearly as short, nobody is linked.
+    People are linked so that the sum of all movements is the least. Movements are measured in
+    space, or in the photos of one camera for people without a position in space. Where another
+    choice is nearly as short, nobody is linked.
 
-    Arguments: shown: the views of each frame; None: people are followed in space alone.
-    Returns: for each frame a match for each person, None where the frame does not have the person.
-    Whoever is linked to nobody is added at the end: that may be one of the others all the same.
+    Arguments: shown: the views of each frame. None: people are followed in space alone.
+    Returns: for each frame a match for each person, None where the frame does not show the person.
+    A match that is linked to nobody is added as a new person, who may still be one of the others.
     """
     people: list[list[Match | None]] = []
     for f, matches in enumerate(frames):
@@ -402,7 +417,9 @@ def in_order_of_time(
 
 
 def _last_center(person: Sequence[Match | None]) -> Float[np.ndarray, "3"]:
-    """Where several views last saw a person; NaN if they never did."""
+    """Returns the last position of a person that several views have seen, (3,), metres. NaN if
+    there is none.
+    """
     centers = [
         match.center for match in person if match is not None and np.isfinite(match.center).all()
     ]
@@ -410,8 +427,9 @@ def _last_center(person: Sequence[Match | None]) -> Float[np.ndarray, "3"]:
 
 
 def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tuple[int, int]]:
-    """People and their matches: those with the shortest ways of all together, where any others are
-    plainly longer.
+    """Returns pairs (person, match) with the least sum of movements. Pairs are left out if another
+    choice is nearly as short. ways: movement of each person to each match. longest: largest
+    movement.
     """
     # longer ways, and those that are not known, are all as unlikely
     ways = np.fmin(ways, _SAME_WAY.far * longest)
@@ -434,10 +452,10 @@ def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tu
 def _moved_in_photos(
     before: Sequence[Seen], first: Match, now: Sequence[Seen], second: Match
 ) -> float:
-    """How far one person would have gone in the photos of all cameras that show both, at the most,
-    a share of the size.
+    """Returns the largest movement that one person would have made in the photos of all cameras
+    that show both matches, a share of the person's size.
 
-    Infinite if no camera does, or if the size in a photo changed too much.
+    It is infinite if no camera shows both, or if the size in a photo changed too much.
     """
     moved = []
     for v, w in itertools.product(range(len(before)), range(len(now))):
@@ -455,7 +473,7 @@ def _moved_in_photos(
 
 
 def _stands_still(before: Seen, now: Seen) -> bool:
-    """Tells whether two views are one camera that hardly moved."""
+    """Returns whether two views are of one camera that hardly moved."""
     first, second = before.cam_from_world[:3], now.cam_from_world[:3]
     turn = first[:, :3] @ second[:, :3].T
     degrees = np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
@@ -466,7 +484,7 @@ def _stands_still(before: Seen, now: Seen) -> bool:
 
 
 def _box(row: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "2"], float]:
-    """The middle of the landmarks that are seen, pixels, and the longer side of the box around
+    """Returns the median of the seen landmarks, (2,), pixels, and the longer side of the box around
     them.
     """
     seen = row[row[:, 2] >= _SAME_PERSON.seen, :2]

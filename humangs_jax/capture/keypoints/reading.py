@@ -1,5 +1,5 @@
-"""Keypoints of a capture's views: from a detector's file, the image of each view and the one person
-in it.
+"""Reads the keypoints of a capture's views from a detector's file: finds the image of each view,
+and the one person in it.
 """
 
 import collections
@@ -30,42 +30,45 @@ from humangs_jax.io.images import PHOTO_SUFFIXES
 from humangs_jax.io.reading import check_limit, reading, walk
 
 _TRUNK_AND_LIMBS = frozenset(COCO_17.names)
-"""Points that tell people from ghosts. Hands, face and feet do not count: detectors leave them out
-where they are small, or were not asked for them.
+"""Points that tell people from ghosts, which are false finds of a detector. Hands, face and feet do
+not count: detectors leave them out where they are small, or were not asked for them.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class _Plausible:
-    """Which numbers can be pixels and scores of keypoints."""
+    """Limits of numbers that can be pixels and scores of keypoints."""
 
     least_extent: float = 2.0
-    """Pixels: if no coordinate of any view reaches this, they are shares of the image."""
+    """Least extent of pixels. If no coordinate of any view reaches it, the coordinates are shares
+    of the image.
+    """
     largest_pixel: float = 1e6
-    """Coordinates beyond it mean nothing, and are not to become inf in float32."""
+    """Largest coordinate, pixels. Larger ones mean nothing, and would become inf in float32."""
     outside: float = 0.5
-    """Detectors extrapolate a little beyond the image. Points further out than this share of its
-    size mean nothing.
+    """Largest distance of a point from its image, as a share of the image's size. Detectors
+    extrapolate a little beyond the image, but points further out mean nothing.
     """
     overshoot: float = 1.1
-    """Heat maps overshoot 1 a little (1.02 is common) and undershoot 0. Larger scores are of
-    another scale, such as the maxima of SimCC heads (RTMPose, RTMW, DWPose), and are divided by the
-    largest of the file.
+    """Largest score on the scale [0, 1]. Heat maps overshoot 1 a little (1.02 is common) and
+    undershoot 0. Larger scores are on another scale, such as the maxima of SimCC heads (RTMPose,
+    RTMW, DWPose), and are divided by the largest of the file.
     """
     largest_score: float = 20.0
-    """Numbers beyond this are no scores."""
+    """Largest number that can be a score."""
     smallest_score: float = -1.0
-    """Numbers below this are no scores."""
+    """Least number that can be a score."""
 
 
 _PLAUSIBLE = _Plausible()
 
 
 def read_detections(path: Path) -> Detections:
-    """The people in the images of a file or folder of one of the `KEYPOINTS`; its content decides
-    which one.
+    """Returns the people in the images of a file or folder. It may have any format of `KEYPOINTS`:
+    the content decides which one.
 
-    A folder, with its sub-folders, is all of its JSON files together. Raises: CaptureError.
+    All JSON files in a folder and its sub-folders are read together.
+    Raises: CaptureError if the content is not valid.
     """
     if not path.exists():
         raise CaptureError(path, "", "no such file or folder")
@@ -109,7 +112,7 @@ def read_detections(path: Path) -> Detections:
 
 
 def _amount(content: Any) -> int:
-    """How many people and images a JSON file has, before any is looked at."""
+    """Returns how many people and images a JSON file has, without looking at them."""
     lists = [content]
     if isinstance(content, dict):
         lists = [
@@ -127,23 +130,23 @@ def _amount(content: Any) -> int:
 def read_keypoints(
     path: str | Path, names: Sequence[str], width: int, height: int, *, person: int | None = None
 ) -> Keypoints:
-    """Keypoints of one person in the views of a capture.
+    """Read the keypoints of one person in the views of a capture.
 
     Arguments:
-        path: a file or folder of one of the `KEYPOINTS`.
-        names: of the capture's views. Images of the file are matched by name, or by the number in
-            the name where the file has only numbers; images of no view are ignored.
-        width, height: pixels of the capture's photos, which the keypoints have to be of; or of the
-            photos of several sizes that were padded to these when they were imported.
-        person: which one to take where several people are seen, counted from 0 in the order of the
-            file.
+        path: a file or folder in a format of `KEYPOINTS`.
+        names: names of the capture's views. Images of the file are matched by name, or by the
+            number in the name if the file has only numbers. Images that match no view are ignored.
+        width, height: size of the capture's photos, pixels. The keypoints have to be in photos of
+        this size, or in photos of several sizes that were padded to it when they were imported.
+        person: number of the person to take where several people are seen, from 0 in the order of
+            the file. None: the only person.
 
-    Returns: v views of k points. Views of which the file has nothing have confidence 0 and are in
-    `missing`.
+    Returns: keypoints of v views and k points. Views that the file says nothing about have
+    confidence 0 and are in `missing`.
 
-    Raises: CaptureError, one line naming file and field: a file of no known format, damaged, of no
-        view of this capture, of photos of another size, of several people (without `person`), or
-        without any usable point.
+    Raises: CaptureError, one line with file and field, if the file is damaged or has no known
+    format, if its images match no view or have another size, if it shows several people and
+    `person` is None, or if no point is usable.
     """
     path = Path(path)
     if person is not None and person < 0:
@@ -157,7 +160,7 @@ def read_keypoints(
 def _read(
     path: Path, names: Sequence[str], width: int, height: int, person: int | None
 ) -> Keypoints:
-    """Does what `read_keypoints` says, once its arguments are checked."""
+    """Does what `read_keypoints` describes, once its arguments are checked."""
     detections = read_detections(path)
     if detections.set is None:
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
@@ -201,8 +204,8 @@ def _read(
 
 
 def _largest_score(detections: Detections) -> float:
-    """The score that a confidence of 1 stands for: the largest, where scores are of another scale,
-    else 1.
+    """Returns the score that counts as confidence 1. This is the largest score of the file if
+    scores are on another scale than [0, 1], else 1.
     """
     scores = np.concatenate([each[:, 2] for image in detections.images for each in image.people])
     largest = float(scores[np.isfinite(scores)].max(initial=0.0))
@@ -217,10 +220,12 @@ def _chosen_people(
     kind: KeypointSet,
     person: int | None,
 ) -> list[int | None]:
-    """Which of the people of each view is meant: the one with this number, or the only one who is
-    more than a ghost. None where nobody is.
+    """Returns the index of the chosen person in each view, None where there is none. The chosen
+    person is the one with number `person`, or without a number the person with the most confidence,
+    if all others are ghosts.
 
-    Raises: CaptureError where several may be meant, or no view has this number.
+    Raises: CaptureError if a view without `person` shows several people, or if no view has the
+    number.
     """
     body = np.asarray([name in _TRUNK_AND_LIMBS for name in kind.names])
     chosen: list[int | None] = []
@@ -249,8 +254,9 @@ def _chosen_people(
 def _check_pixels(
     path: Path, detections: Detections, points: Float[np.ndarray, "n 2"], dropped: int, far: int
 ) -> None:
-    """Whether there are usable points, and whether they are pixels. dropped, far: how many points
-    were left out.
+    """Checks that there are usable points, and that their coordinates are pixels. dropped: number
+    of points that were left out because they are not finite. far: number of points left out because
+    they are far outside of the photos.
 
     Raises: CaptureError.
     """
@@ -268,8 +274,8 @@ def _check_pixels(
 
 
 def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> str:
-    """An image and its view whose numbers differ, because one is counted from 0 and the other from
-    1; "" if there is none.
+    """Returns a line about an image and its view whose numbers differ, because one is counted from
+    0 and the other from 1. "" if there is none.
     """
     for image, name in zip(images, names, strict=True):
         if image is None:
@@ -285,7 +291,11 @@ def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> st
 def _images_of_views(
     path: Path, detections: Detections, names: Sequence[str], width: int, height: int
 ) -> list[DetectedImage | None]:
-    """The image of each view, None where the file has none."""
+    """Returns the image of each view, None where the file has none.
+
+    Raises: CaptureError if an image has another size than the photos, or if no image matches a
+    view.
+    """
     try:
         views = match_views([image.image for image in detections.images], names)
     except ValueError as error:
@@ -323,7 +333,9 @@ def _images_of_views(
 
 
 def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
-    """Whether points of trunk and limbs are those of a person; others are a detector's ghosts."""
+    """Returns whether the points of trunk and limbs are those of a person, and not of a detector's
+    ghost. confidences: of these points.
+    """
     present = confidences[confidences > 0]
     # a person has more than a quarter of them, with a mean confidence of more than 0.3
     return len(present) > 0.25 * len(confidences) and float(present.mean()) > 0.3
@@ -332,12 +344,13 @@ def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
 def _usable_people(
     image: DetectedImage | None, view: str, offset: float, largest: float, size: tuple[int, int]
 ) -> Float[np.ndarray, "p k columns"] | None:
-    """The people of an image with pixel centres at +0.5, finite, and with confidences in [0, 1], 0
-    for points that cannot be used; None where there is nobody.
+    """Returns the people of an image, (p, k, columns), with pixel centres at +0.5 and all numbers
+    finite. Confidences are in [0, 1], and 0 for points that cannot be used. None if there is
+    nobody.
 
-    Arguments: offset: pixels that are added. largest: score of a confidence of 1. size: of the
-    photo, pixels.
-    Raises: CaptureError for scores that are none.
+    Arguments: offset: pixels that are added to the points. largest: score that counts as confidence
+    1. size: width and height of the photo, pixels.
+    Raises: CaptureError for numbers that cannot be scores.
     """
     if image is None or not image.people:
         return None
@@ -361,19 +374,19 @@ def _usable_people(
 
 
 def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int | None]:
-    """For each image the index of its view, None for images that are of no view.
+    """Returns for each image the index of its view, None for images that match no view.
 
     Views have names like "front", "000012" or, where that would be ambiguous, "images_cam0_000012"
     (folders joined by _). Images of keypoint files have names like "front.jpg", "cam0/000012.png"
     and "cam0_000000000012" (OpenPose counts a video's frames in twelve digits), or are mere numbers
     (COCO's image ids, the frames of a video).
 
-    Where a video's frames are counted from 0 and its photos from 1 (ffmpeg), or the other way
-    round, there are as many of either, without gaps, and they are matched in order, for each video
-    by itself. Mere numbers are matched in order, wherever they begin, if there is one for every
-    view, and the last numbers in the views' names have no gaps either.
+    The frames of a video may be counted from 0 and its photos from 1 (ffmpeg), or the other way
+    round. If there are as many frames as photos, without gaps, they are matched in order, for each
+    video separately. Mere numbers are matched in order, wherever they begin, if there is one for
+    every view, and neither they nor the last numbers in the views' names have gaps.
 
-    Raises: ValueError if two images are of one view, or a number could mean two views.
+    Raises: ValueError if two images match one view, or if a number matches two views.
     """
     find = _finder(names)
     shift = _shift_of_numbers(images, names)
@@ -402,8 +415,8 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
 
 
 def _shift_of_numbers(images: Sequence[str | int], names: Sequence[str]) -> int:
-    """What to add to mere numbers so that they are the numbers in the views' names: 0, unless there
-    is one for every view and neither have gaps.
+    """Returns what has to be added to mere numbers to get the numbers in the views' names. It is 0,
+    unless there is one number for every view and neither numbers nor names have gaps.
     """
     numbers = sorted({image for image in images if isinstance(image, int)})
     of_names = sorted(number for number in map(_last_number, names) if number is not None)
@@ -418,8 +431,8 @@ def _recounted_videos(
     names: Sequence[str],
     find: Callable[[str | int], list[int]],
 ) -> dict[str | int, list[int]]:
-    """The views of frames of videos that are counted from 0 where photos are counted from 1, or the
-    other way round. found: views of images by their names.
+    """Returns the views of frames in videos that are counted from 0 where the photos are counted
+    from 1, or the other way round. found: the views of each image by its name.
     """
     videos: dict[str, list[tuple[int, str]]] = {}
     for image in found:
@@ -448,7 +461,9 @@ def _recounted_videos(
 
 
 def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
-    """A function that finds the view of an image, or none; of a number it may find several."""
+    """Returns a function that finds the views of an image by its name or number. For a name it
+    finds one view or none. For a number it may find several.
+    """
     exact = {name: [i] for i, name in enumerate(names)}
     plain, ends, numbers = (collections.defaultdict(list) for _ in range(3))
     for i, name in enumerate(names):
@@ -494,7 +509,7 @@ def _split_number(name: str) -> tuple[str, int | None]:
 
 
 def _last_number(name: str) -> int | None:
-    """The last number in a name, None without any."""
+    """Returns the last number in a name, None if it has none."""
     found = re.findall(r"\d+", name)
     return int(found[-1]) if found else None
 
