@@ -1,11 +1,12 @@
-"""Whether a calibration is right: a camera that is turned sees all landmarks beside where the other
-cameras see them.
+"""Checks a calibration: finds cameras that are turned, because they see all landmarks beside where
+the other cameras see them.
 
-The rotations that would correct it come from linearised bundle adjustment, in which every landmark
-of every moment is a free point (Triggs et al. 2000, "Bundle Adjustment"). A detector's landmarks
-err too, but not together: a camera is only named where its rotation exceeds several times the
-standard error that the scatter over landmarks gives (a sandwich estimate, clustered by landmark).
-As few cameras are turned as explain the residuals, because turning all of them explains no more.
+The rotations that would correct them come from linearised bundle adjustment, in which every
+landmark of every moment is a free point (Triggs et al. 2000, "Bundle Adjustment"). A detector's
+landmarks err too, but not together. So a camera is only named if its rotation exceeds several times
+the standard error that the scatter over landmarks gives (a sandwich estimate, clustered by
+landmark). As few cameras are turned as explain the residuals, because turning all of them explains
+no more.
 """
 
 import dataclasses
@@ -31,32 +32,37 @@ from humangs_jax.geometry import quaternion, transform
 
 P = TypeVar("P", Photos, Capture)
 _PRIOR = np.radians(1.0)
-"""Expected size of rotations, radians: holds what cameras and points together can do without a
-residual.
+"""Expected size of rotations, radians. It holds movements of cameras and points together that
+change no residual.
 """
 _ITERATIONS = 8
-"""Iterations that reweight the residuals."""
+"""Number of iterations that reweight the residuals."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Decision:
-    """When a camera counts as turned."""
+    """Limits that decide if a camera counts as turned."""
 
     clear: float = 5.0
-    """Standard errors from which on a rotation is no chance."""
+    """Least size of a rotation that is not chance, standard errors."""
     least_gain: float = 25.0
-    """Fall of the cost from which on a rotation is no chance. A detector that errs alike in all
-    landmarks of a view imitates one: on five synthetic people in rooms with exact cameras the cost
-    fell by 5 to 16, on five photos of a man whose calibration is off by 32 to 121.
+    """Least fall of the cost through a rotation that is not chance. A detector with the same error
+    in all landmarks of a view looks like a rotation: for five synthetic people in rooms with exact
+    cameras the cost fell by 5 to 16, for five photos of a man whose calibration is off by 32 to
+    121.
     """
     least_degrees: float = 0.3
-    """Smaller errors hardly matter: a third of a degree is 1.5 cm at 3 m."""
+    """Least rotation that is reported, degrees. Smaller errors hardly matter: a third of a degree
+    is 1.5 cm at 3 m.
+    """
     most_degrees: float = 8.0
-    """With larger errors the calibration is something else than a little off."""
+    """Largest rotation, degrees. If one is larger, the calibration has another error, and nothing
+    is reported.
+    """
     alike: float = 0.9
     """Share of the gain from which on another camera explains as much."""
     most_cameras: int = 64
-    """Cameras up to which errors are looked for."""
+    """Largest number of cameras. With more, errors are not looked for."""
 
 
 _DECISION = _Decision()
@@ -64,28 +70,30 @@ _DECISION = _Decision()
 
 @dataclasses.dataclass(frozen=True)
 class CameraError:
-    """A camera that is turned."""
+    """A camera that is turned, with the rotation that turns it back."""
 
     views: tuple[int, ...]
-    """Indices of its views."""
+    """Indices of the camera's views."""
     names: tuple[str, ...]
-    """Names of its first view, and of those of other cameras that would explain as much."""
+    """Names of the camera's first view, and of the first views of other cameras that would explain
+    as much.
+    """
     rotation: tuple[float, float, float]
-    """Axis-angle in the camera's axes, radians, that turns it back."""
+    """Rotation that turns the camera back, as axis-angle in the camera's axes, radians."""
 
     @property
     def degrees(self) -> float:
-        """How far it is turned."""
+        """Angle by which the camera is turned, degrees."""
         return float(np.degrees(np.linalg.norm(self.rotation)))
 
     def __str__(self) -> str:
-        """One line."""
+        """Describes the error in one line."""
         return f"camera {' or '.join(self.names)} is off by {self.degrees:.1f} degrees"
 
 
 def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[CameraError, ...]:
-    """The cameras that keypoints show to be turned, those that explain most first; none with fewer
-    than three cameras.
+    """Returns the cameras that keypoints show to be turned, those that explain most first. Empty
+    with fewer than three cameras.
     """
     camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
     if not 3 <= camera_of.max() + 1 <= _DECISION.most_cameras:
@@ -126,7 +134,7 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
 
 
 def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
-    """The same photos with cameras turned about their centres as the errors say."""
+    """Returns the photos with cameras turned about their centres as the errors say."""
     rotations = np.zeros((len(photos.names), 3), np.float32)
     for error in errors:
         rotations[list(error.views)] = error.rotation
@@ -143,18 +151,18 @@ def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Seen:
-    """Keypoints of m moments in c views, with k landmarks, as float64."""
+    """Keypoints of k landmarks in m moments and c views, in float64."""
 
     points: Float[np.ndarray, "m c k 2"]
     """Detections, (m, c, k, 2), pixels."""
     weights: Float[np.ndarray, "m c k"]
-    """Confidences, (m, c, k); 0 where fewer than two views see a landmark."""
+    """Confidences, (m, c, k). 0 for landmarks that fewer than two views see."""
     K: Float[np.ndarray, "m c 3 3"]
     """Intrinsics, (m, c, 3, 3), pixels."""
     matrices: Float[np.ndarray, "m c 4 4"]
-    """Camera poses, from the world to the camera, (m, c, 4, 4)."""
+    """Camera poses from the world to the camera, (m, c, 4, 4), metres."""
     camera: Int[np.ndarray, "m c"]
-    """Number of each view's camera, below `count`, (m, c)."""
+    """Number of each view's camera, (m, c), from 0 to below `count`."""
     count: int
     """Number of cameras."""
 
@@ -165,7 +173,9 @@ class _Seen:
         keypoints: Keypoints,
         camera_of: Int[np.ndarray, " v"],
     ) -> "_Seen | None":
-        """Gathers what the cameras see of the person; None if that is too little."""
+        """Returns what the cameras see of the person, or None if that is too little. camera_of:
+        number of each view's camera, (v,).
+        """
         # landmarks that err independently: those of a face or a hand err together
         parts = (
             *("nose", "eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle"),
@@ -180,7 +190,7 @@ class _Seen:
         some = np.unique(np.linspace(0, len(views) - 1, 24).round().astype(int))
 
         def as_double(name: str) -> Float[np.ndarray, "..."]:
-            """A field of the observations, of those moments."""
+            """Returns a field of the observations for the chosen moments."""
             return np.asarray(getattr(observations, name), np.float64)[some]
 
         weights = as_double("confidences")[..., kinds]
@@ -197,7 +207,7 @@ class _Seen:
         )
 
     def equations(self) -> "_Equations":
-        """The equations of rotations from the cameras as they are given, weighted so that outliers
+        """Returns the equations of rotations about the given cameras, weighted so that outliers
         count little.
         """
         turned, points, weights = np.zeros((self.count, 3)), self._middle(), self.weights
@@ -217,7 +227,9 @@ class _Seen:
         return step.equations
 
     def _middle(self) -> Float[np.ndarray, "m k 3"]:
-        """(m, k, 3) the point nearest to the axes of all cameras, to begin with."""
+        """Returns the point nearest to the axes of all cameras, repeated for every landmark, (m, k,
+        3), metres. It is where the points begin.
+        """
         axes = self.matrices[..., 2, :3]
         centers = -np.einsum("mcba,mcb->mca", self.matrices[..., :3, :3], self.matrices[..., :3, 3])
         across = np.eye(3) - axes[..., :, None] * axes[..., None, :]
@@ -228,7 +240,9 @@ class _Seen:
     def _projected(
         self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]
     ) -> "_Projected":
-        """The points as cameras see them that are turned so, axis-angle in radians."""
+        """Returns the points as turned cameras see them. turned: rotation of each camera, (n, 3),
+        axis-angle in radians. points: (m, k, 3), metres.
+        """
         turn = Rotation.from_rotvec(turned).as_matrix()[self.camera]
         rotation = turn @ self.matrices[..., :3, :3]
         shift = np.einsum("mcab,mcb->mca", turn, self.matrices[..., :3, 3])
@@ -245,7 +259,9 @@ class _Seen:
         points: Float[np.ndarray, "m k 3"],
         weights: Float[np.ndarray, "m c k"],
     ) -> "_Linearized":
-        """Equations of the cameras about these rotations and points, with the points eliminated."""
+        """Returns the equations of the cameras about these rotations and points, with the points
+        eliminated.
+        """
         seen = self._projected(turned, points)
         by_point, by_turn = seen.derivatives()
         # a step of Gauss and Newton for each point, with the cameras held still
@@ -268,8 +284,8 @@ class _Seen:
     def _by_camera(
         self, of_views: Float[np.ndarray, "m c k 3"], of_pairs: Float[np.ndarray, "m c c k 3 3"]
     ) -> "_Equations":
-        """Gradients of views and Hessians of pairs of views, added up where several views are of
-        one camera.
+        """Adds up gradients of views and Hessians of pairs of views for the cameras that the views
+        belong to.
         """
         k, n = of_views.shape[2], self.count
         gradients, matrices = np.zeros((n, k, 3)), np.zeros((n, n, k, 3, 3))
@@ -300,8 +316,8 @@ class _Projected(NamedTuple):
     def derivatives(
         self,
     ) -> tuple[Float[np.ndarray, "m c k 2 3"], Float[np.ndarray, "m c k 2 3"]]:
-        """Derivatives of the pixels by the points in the world, and by small turns of the
-        cameras.
+        """Returns the derivatives of the pixels by the points in the world, (m, c, k, 2, 3), and by
+        small turns of the cameras, (m, c, k, 2, 3).
         """
         by_local = np.zeros((*self.depth.shape, 2, 3))
         by_local[..., [0, 1], [0, 1]] = self.focal / self.depth[..., None]
@@ -313,16 +329,18 @@ class _Projected(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Least squares about rotations of n cameras, landmark by landmark, in standard deviations."""
+    """Least squares equations about rotations of n cameras, one for each landmark, in standard
+    deviations.
+    """
 
     gradients: Float[np.ndarray, "k u"]
-    """Gradients of the cost, (k, 3 n)."""
+    """Gradient of the cost of each landmark, (k, 3 n)."""
     matrices: Float[np.ndarray, "k u u"]
-    """Hessians of Gauss and Newton, (k, 3 n, 3 n)."""
+    """Gauss and Newton's Hessian of the cost of each landmark, (k, 3 n, 3 n)."""
 
 
 class _Linearized(NamedTuple):
-    """Where an iteration of the adjustment arrives."""
+    """The result of one iteration of the adjustment."""
 
     equations: _Equations
     """Equations of the cameras."""
@@ -339,18 +357,18 @@ def _solve(
 
 
 class _Solved(NamedTuple):
-    """What turning some cameras achieves."""
+    """The result of turning some cameras."""
 
     rotations: Float[np.ndarray, "s 3"]
     """Rotations of the cameras, axis-angle, (s, 3), radians."""
     gain: float
-    """How much the cost falls."""
+    """Fall of the cost."""
     clear: float
     """Size of the last camera's rotation in standard errors."""
 
 
 def _solved(equations: _Equations, cameras: list[int]) -> _Solved:
-    """What turning these cameras achieves; the last one's rotation over its standard errors."""
+    """Returns the result of turning these cameras."""
     at = (3 * np.asarray(cameras)[:, None] + np.arange(3)).ravel()
     own, curved = equations.gradients[:, at], equations.matrices[:, at[:, None], at]
     total = curved.sum(0)

@@ -1,10 +1,9 @@
-"""Cameras of photos of one moment, from the person in them: no calibration, no board.
+"""Finds the cameras of photos of one moment from the person in them, without calibration or board.
 
-Where the cameras stand is known up to a similarity. Size and axes come from the person: metres by
-the detector's 3D landmarks, or by the person's height where that is given; y up by the cameras,
-which people hold level, and by the body.
-
-Which photos are of that moment, and the cameras up to that similarity: `person_moments`.
+`person_moments` finds which photos are of that moment, and the cameras up to a similarity. This
+module takes size and axes from the person. Metres come from the detector's 3D landmarks, or from
+the person's height if it is given. The direction y up comes from the cameras, which people hold
+level, and from the body.
 """
 
 import dataclasses
@@ -40,26 +39,29 @@ from humangs_jax.geometry.camera import Camera
 
 @dataclasses.dataclass(frozen=True)
 class _Std:
-    """Standard deviations of what places the person in the world."""
+    """Standard deviations of the observations that place the person in the world."""
 
     level: float = 4.0
-    """Of the roll of a camera, degrees."""
+    """Standard deviation of a camera's roll, degrees."""
     upright: float = 15.0
-    """Of the lean of a body, degrees."""
+    """Standard deviation of a body's lean, degrees."""
     bones: float = 0.01
-    """Of joints from those of a scaled person, metres."""
+    """Standard deviation of joints from those of a scaled person, metres."""
     stature: float = 0.001
-    """Of the stature from that of a scaled person, metres."""
+    """Standard deviation of the stature from that of a scaled person, metres."""
 
 
 _STD = _Std()
 
 
 _SHARES = {("shoulder", "hip"): 0.36, ("hip", "knee"): 0.315, ("knee", "ankle"): 0.325}
-"""Shares of trunk, thigh and shin in their sum, of the same person: what of it a photo does not
-show."""
+"""Usual shares of trunk, thigh and shin in the sum of the three lengths. They stand in for parts
+that a photo does not show.
+"""
 _LEAST_TRUNK = 2
-"""Landmarks of shoulders and hips, of the four, without which a photo says nothing of a pose."""
+"""Least number of the landmarks in `_TRUNK` that a photo has to show. With fewer it says nothing
+about the pose.
+"""
 _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 
 
@@ -67,35 +69,37 @@ _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 class PersonCameras:
     """Cameras around a person who stands on y = 0 at x = z = 0, facing +z.
 
-    All but `views` is of the c photos that are used.
+    All fields except `views` have one entry for each of the c photos that are used.
     """
 
     views: tuple[int, ...]
     """Indices of the photos that are used."""
     cameras: tuple[Camera, ...]
-    """One camera of each photo."""
+    """Camera of each photo."""
     landmarks: Float[np.ndarray, "c k 3"]
     """Landmarks of the person in each photo, (c, k, 3), metres."""
     mirrored: Bool[np.ndarray, " c"]
-    """Whether the detector exchanged left and right, (c,)."""
+    """Whether the detector exchanged left and right in each photo, (c,)."""
     moments: int
-    """1, or as many as photos: then each camera stands in a separate world."""
+    """Number of moments: 1, or the number of photos. In the second case each camera is in a
+    separate world.
+    """
     errors: Float[np.ndarray, " c"]
-    """Median distance of the landmarks from their pixels, (c,), pixels."""
+    """Median distance of the landmarks from their pixels in each photo, (c,), pixels."""
     warnings: tuple[str, ...]
-    """What a user should know, a line each."""
+    """Warnings for the user, one line each."""
 
 
 def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> PersonCameras:
-    """Cameras of photos from the person in them: of one moment, if one set of landmarks explains
-    them all, else each on its own.
+    """Returns the cameras of photos, found from the person in them. If one set of landmarks
+    explains all photos, they are of one moment. Otherwise each camera is found alone.
 
-    One photo of many that contradicts the others is left out.
+    If one photo of many contradicts the others, it is left out.
 
-    Arguments: height: of the person without shoes, metres. Without it the person has the size of
+    Arguments: height: height of the person without shoes, metres. None: the person has the size of
     the detector's 3D landmarks.
-    Raises: ValueError naming the photo, if one shows too little of the person, or where no camera
-    is found.
+    Raises: ValueError with the name of the photo, if it shows too little of the person, or if no
+    camera is found.
     """
     _check(seen, height)
     # photos that show too little are left out where others show more
@@ -132,7 +136,9 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
 
 
 def _cameras(seen: PersonViews, trial: Trial, height: float | None) -> PersonCameras:
-    """Cameras and landmarks of a trial of these photos, in the world of the person."""
+    """Returns cameras and landmarks of a trial, in the world of the person. height: see
+    `cameras_from_person`.
+    """
     rig = trial.rig
     if not all(np.isfinite(getattr(rig, field.name)).all() for field in dataclasses.fields(rig)):
         raise ValueError(
@@ -175,7 +181,7 @@ def _check(seen: PersonViews, height: float | None) -> None:
 
 
 def _little_shown(seen: PersonViews) -> dict[int, str]:
-    """The views that show too little of the person for a pose, and why."""
+    """Returns the views that show too little of the person for a pose, each with the reason."""
     trunk = [seen.names.index(name) for name in _TRUNK if name in seen.names]
     found = {}
     for view, known in enumerate(known_landmarks(seen)):
@@ -216,8 +222,9 @@ def _check_views(seen: PersonViews) -> None:
 def _in_world(
     seen: PersonViews, rig: Rig, height: float | None
 ) -> tuple[tuple[Camera, ...], Float[np.ndarray, "k 3"]]:
-    """Cameras, and landmarks (k, 3), of a person who stands upright at the origin, of this
-    height. What no photo shows of the person is as long as usual.
+    """Returns the cameras, and the landmarks, (k, 3), metres, in a world in which the person stands
+    upright at the origin. Parts that no photo shows are taken to have their usual length. height:
+    see `cameras_from_person`.
     """
     points, rotations, places, focal = rig.landmarks, rig.rotations, rig.places, rig.focal
     known, names = only_known(points, seen.names, np.any(known_landmarks(seen), axis=0))
@@ -273,7 +280,9 @@ def _in_world(
 def _lengths(
     points: Float[np.ndarray, "k 3"], names: Sequence[str]
 ) -> dict[tuple[str, str], float]:
-    """The lengths of those of trunk, thigh and shin whose ends are among the names."""
+    """Returns the lengths of trunk, thigh and shin, by the names of their ends. Parts whose ends
+    are not among the names are missing.
+    """
     found = {}
     for first, last in _SHARES:
         if first == "shoulder":
@@ -311,8 +320,8 @@ def _warnings(
 
 
 def scaled_to_height(capture: Capture, height: float) -> Capture:
-    """A capture in which the person is so tall at rest, metres: cameras, places and shape change
-    alike; photos show the same.
+    """Returns the capture scaled so that the person has this height at rest, metres. Cameras,
+    positions and shape change together, so that photos show the same.
     """
     betas = np.asarray(capture.betas, np.float64)
     before = shape_body(capture.body, jnp.asarray(betas, jnp.float32))

@@ -1,6 +1,7 @@
-"""One report for every fit: what was fitted, errors by evidence, limits, uncertainty and warnings.
+"""The report of every fit: what was fitted, errors by kind of evidence, limits, uncertainty and
+warnings.
 
-`str(report)` is what the command line prints, `report.to_json()` what is stored beside the result.
+`str(report)` is what the command line prints. `report.to_json()` is stored beside the result.
 """
 
 import dataclasses
@@ -23,7 +24,7 @@ from humangs_jax.data.capture_checks import few
 
 @dataclasses.dataclass(frozen=True)
 class _Worth:
-    """What in a fit is worth a line."""
+    """Limits that decide if something in a fit is worth a line of the report."""
 
     outliers: float = 0.3
     """A view with a larger share of outliers among its keypoints gives a warning. A fit tolerates
@@ -36,14 +37,16 @@ class _Worth:
     far_beyond: float = 10.0
     """A joint more than this many degrees beyond its limit gives a warning."""
     std: float = 0.03
-    """Metres: a joint whose std exceeds this is undetermined."""
+    """A joint whose standard deviation exceeds this is undetermined, metres."""
     determined: float = 0.1
     """A joint is undetermined if the determined share of its rotation is smaller than this. The
     share is a mean over three axes; knees and fingers turn about only one."""
     named: int = 5
-    """Items that are listed by name; the others are counted."""
+    """Number of items that are listed by name. Further items are counted."""
     rows: int = 24
-    """Rows of the printed table. If there are more views, it shows those that fit worst."""
+    """Number of rows of the printed table. If there are more views, it shows those that fit
+    worst.
+    """
 
 
 WORTH_A_LINE = _Worth()
@@ -54,17 +57,17 @@ _LABELS = {
     "silhouette_iou": ("silhouette IoU", "{:.3f}"),
     "loss": ("loss", "{:.4f}"),
 }
-"""How errors are printed."""
+"""Label and format of each error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """An error of the result, and of the start where there was one."""
+    """An error of the result, and that of the start if there was one."""
 
     after: float
     """Error of the result."""
     before: float | None = None
-    """Error of the start, None without one."""
+    """Error of the start. None without a start."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,20 +77,21 @@ class ViewReport:
     name: str
     """Name of the view."""
     frame: int
-    """Index of its frame."""
+    """Index of the view's frame."""
     keypoints: int = 0
     """Number of keypoints that were compared."""
     median: float = float("nan")
-    """Median error of the keypoints, pixels; NaN without any."""
+    """Median error of the keypoints, pixels. NaN without keypoints."""
     high: float = float("nan")
-    """90th percentile of the errors, pixels; NaN without any."""
+    """90th percentile of the errors, pixels. NaN without keypoints."""
     outliers: float = 0.0
     """Share of the keypoints that are outliers."""
     iou_before: float | None = None
-    """IoU of body and mask at the start; NaN without a mask, None if masks are not part of the fit.
+    """Intersection over union of body and mask at the start. NaN without a mask, None if masks are
+    not part of the fit.
     """
     iou_after: float | None = None
-    """The same for the result."""
+    """Intersection over union of body and mask for the result. NaN and None as in `iou_before`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,9 +103,9 @@ class Violation:
     joint: str
     """Name of the joint."""
     axis: str
-    """"x", "y" or "z"."""
+    """Name of the axis: "x", "y" or "z"."""
     degrees: float
-    """How far beyond the limit, degrees."""
+    """Angle beyond the limit, degrees."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,25 +113,25 @@ class FitReport:
     """What came of a fit."""
 
     fitted: Literal["keypoints", "refinement"]
-    """What the body was fitted to."""
+    """Evidence to which the body was fitted."""
     kept: bool = True
-    """False if the start was better and stays."""
+    """Whether the result is used. False if the start was better and stays."""
     errors: dict[str, Change] = dataclasses.field(default_factory=dict)
     """Errors by name, see `_LABELS`."""
     views: tuple[ViewReport, ...] = ()
     """A row for each view."""
     moved: dict[str, float] = dataclasses.field(default_factory=dict)
-    """How far parameters moved, by name, see `how_far`."""
+    """How far parameters moved, by name, see `how_far`. Empty if none moved."""
     violations: tuple[Violation, ...] = ()
-    """Joints beyond their limits."""
+    """Joints that exceed their limits."""
     swaps: tuple[Swap, ...] = ()
-    """What seems exchanged."""
+    """Sides or cameras that seem exchanged."""
     undetermined: tuple[str, ...] = ()
     """Joints, or groups of joints, that the views do not determine."""
     notes: tuple[str, ...] = ()
-    """Further results, a line each."""
+    """Further results, one line each."""
     warnings: tuple[str, ...] = ()
-    """What points to a mistake, a line each."""
+    """Signs of a mistake, one line each."""
 
     @property
     def ok(self) -> bool:
@@ -135,11 +139,11 @@ class FitReport:
         return not self.warnings
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; numbers that are not finite are None."""
+        """Returns the report as plain values for JSON. Numbers that are not finite are None."""
         return _plain(dataclasses.asdict(self))
 
     def __str__(self) -> str:
-        """A table of views, then errors, notes and warnings."""
+        """Returns a table of views, then errors, notes and warnings."""
         lines = _view_rows(self.views) if self.views else []
         for key, change in self.errors.items():
             label, form = _LABELS[key]
@@ -206,7 +210,7 @@ _GROUPS = {
 
 
 def limit_violations(joint_names: tuple[str, ...], poses: BodyPose) -> tuple[Violation, ...]:
-    """Violations of joint limits in a batch of poses, by frame."""
+    """Returns the joints that exceed their limits in a batch of poses, ordered by frame."""
     prior, rotations = pose_prior(joint_names), np.asarray(poses.rotations)
     beyond = np.rad2deg(np.maximum(prior.lower - rotations, rotations - prior.upper))
     found = np.argwhere(beyond > WORTH_A_LINE.beyond_limit)
@@ -221,11 +225,11 @@ def undetermined_joints(
     joint_std: Float[np.ndarray, "m j"],
     determined: Float[np.ndarray, "m j"],
 ) -> tuple[str, ...]:
-    """Names the joints that the views do not determine in m frames. Fingers and other groups are
-    named as one.
+    """Returns the names of the joints that the views do not determine in m frames. Fingers and
+    other groups have one name.
 
-    Arguments: joint_std: standard deviation of each joint, metres. determined: share of each
-    joint's rotation that the views determine.
+    Arguments: joint_std: standard deviation of each joint, (m, j), metres. determined: share of
+    each joint's rotation that the views determine, (m, j).
     """
     unknown = (joint_std > WORTH_A_LINE.std) | (determined < WORTH_A_LINE.determined)
     counts = {
@@ -251,9 +255,9 @@ def keypoint_warnings(
     violations: Sequence[Violation],
     swaps: Sequence[Swap],
 ) -> tuple[str, ...]:
-    """Returns a line for each thing in the keypoints that points to a mistake.
+    """Returns a line for each sign of a mistake in the keypoints.
 
-    expected: noise of the keypoints of each frame, pixels.
+    expected: noise that is expected of the keypoints of each frame, (m,), pixels.
     """
     found = [str(swap) for swap in swaps[: WORTH_A_LINE.named]]
     if len(swaps) > WORTH_A_LINE.named:
@@ -299,16 +303,18 @@ def _names(views: Sequence[ViewReport]) -> str:
 
 
 def _span(views: Sequence[ViewReport], field: str, form: str) -> str:
-    """Writes the smallest and the largest value of a field, or one value if they are equal."""
+    """Returns the smallest and the largest value of a field as text, or one value if they are
+    equal.
+    """
     ends = [form.format(of(getattr(view, field) for view in views)) for of in (min, max)]
     return ends[0] if ends[0] == ends[1] else " to ".join(ends)
 
 
 def how_far(start: Capture, refined: Capture) -> dict[str, float]:
-    """Says how far two captures of one person differ. Each value is a mean.
+    """Returns how far two captures of one person differ. Each value is a mean.
 
-    Keys: focal_factor, the ratio of the focal lengths; camera_degrees and camera_cm, the turn and
-    the move of the cameras; joint_degrees, the turn of the joints; transl_cm, the move of the root.
+    Keys: focal_factor, the ratio of the focal lengths. camera_degrees and camera_cm, the turn and
+    the move of the cameras. joint_degrees, the turn of the joints. transl_cm, the move of the root.
     """
     both = (start, refined)
     focal = [np.asarray(each.cameras.K, float)[:, 0, 0] for each in both]
@@ -328,10 +334,10 @@ def how_far(start: Capture, refined: Capture) -> dict[str, float]:
 
 
 def _mean_degrees(first: Rotation, second: Rotation) -> float:
-    """The mean angle between rotations, degrees."""
+    """Returns the mean angle between rotations, degrees."""
     return float(np.degrees((first.inv() * second).magnitude().mean()))
 
 
 def _mean_length(vectors: Float[np.ndarray, "*n 3"]) -> float:
-    """The mean length of vectors."""
+    """Returns the mean length of vectors."""
     return float(np.linalg.norm(vectors, axis=-1).mean())

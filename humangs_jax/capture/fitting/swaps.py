@@ -1,18 +1,18 @@
-"""Bookkeeping errors that keypoints reveal: exchanged sides, or exchanged cameras.
+"""Finds bookkeeping errors that keypoints reveal: exchanged sides, or exchanged cameras.
 
-Views of one frame that are right agree: the rays of a landmark meet. Exchanges that people and
-detectors make are undone on trial; while the views then agree clearly better, the clearest is kept.
-Cameras are reported in this order, then sides by view:
+Correct views of one frame agree: the rays of a landmark meet. Exchanges that people and detectors
+make are undone on trial. As long as the views then agree clearly better, the clearest exchange is
+kept. Exchanged cameras are reported first, then exchanged sides by view:
 
     sides     left and right of the keypoints of one view; needs two views, of which either may be
               the wrong one
-    cameras   of two views, which is the same as their photos; needs three views
+    cameras   of two views, which looks the same as exchanged photos; needs three views
     hands     left and right keypoints of the hands alone, in one view
 
-Left and right exchanged in all views agree as well: that is not found.
+If left and right are exchanged in all views, the views agree too, and nothing is found.
 
-A view agrees with a landmark by how near its keypoint is to the best of the points that pairs of
-views propose (`triangulation.triangulate_robustly`), so that outliers count little.
+A view agrees with a landmark if its keypoint is near the best of the points that pairs of views
+propose (`triangulation.triangulate_robustly`). So outliers count little.
 """
 
 import dataclasses
@@ -35,19 +35,24 @@ from humangs_jax.core.pytree import replace
 
 @dataclasses.dataclass(frozen=True)
 class _Clear:
-    """When an exchange explains a disagreement clearly."""
+    """Limits that decide if an exchange explains a disagreement clearly."""
 
     least_gain: float = 0.1
-    """Agreement of n keypoints has to grow by this + `chance` / sqrt(n) of what is attainable."""
+    """Least growth of the agreement, as a share of what is attainable: this number + `chance` /
+    sqrt(n) for n keypoints.
+    """
     chance: float = 0.8
-    """By chance, without an exchange, 17 keypoints with 20 % of outliers and three times the
-    expected noise gain up to 0.26; 67 keypoints gain nothing."""
+    """Share that exchanges gain by chance. Without an exchange, 17 keypoints with 20 % of outliers
+    and three times the expected noise gain up to 0.26, and 67 keypoints gain nothing.
+    """
     many: int = 5
-    """With this many views or more the right ones outvote an exchange: only exchanges that look
-    better at once are tried."""
+    """Number of views from which on the right views outvote an exchange. Then only exchanges that
+    look better at once are tried.
+    """
     alike: float = 0.9
-    """Another exchange with this share of the gain explains as much: in a ring of evenly spaced
-    cameras several are equivalent."""
+    """Share of the gain from which on another exchange explains as much. In a ring of evenly spaced
+    cameras several exchanges are equivalent.
+    """
 
 
 _CLEAR = _Clear()
@@ -55,14 +60,16 @@ _CLEAR = _Clear()
 
 @dataclasses.dataclass(frozen=True)
 class Swap:
-    """One exchange that explains a disagreement; `str()` is a sentence about it."""
+    """One exchange that explains a disagreement. `str()` is a sentence about it."""
 
     kind: Literal["sides", "cameras", "hands"]
     """What is exchanged."""
     views: tuple[str, ...]
-    """Names of the views; for cameras those of the first frame."""
+    """Names of the views that are exchanged. For cameras, those of the first frame."""
     instead: tuple[str, ...] = ()
-    """Alternatives that explain it as well: names of views; for cameras pairs ("a and b")."""
+    """Alternatives that explain the disagreement as well: names of views, or for cameras pairs ("a
+    and b").
+    """
     frames: int = 1
     """Number of frames in which the cameras are exchanged."""
 
@@ -89,11 +96,15 @@ def find_swaps(
     views: Int[np.ndarray, "m c"],
     names: tuple[str, ...],
 ) -> tuple[Swap, ...]:
-    """Exchanged cameras, the clearest first, and then sides by view. Frames need two views for
-    sides and three for cameras.
+    """Returns exchanged cameras, the clearest first, and then exchanged sides by view. Sides are
+    found in frames with two or more views, cameras in frames with three or more.
 
-    Arguments: observations: a batch of m frames. views: index into `names` of each view, -1: none,
-    see `group_by_frame`.
+    Args:
+        observations: keypoints, a batch of m frames.
+        kind: set of the keypoints.
+        views: index into `names` of each view, (m, c). -1 where there is none, see
+            `group_by_frame`.
+        names: names of all views.
     """
     mirror, cameras = np.asarray(kind.mirror), _camera_numbers(observations, views)
     order, exchanges = given(*views.shape), []
@@ -113,8 +124,8 @@ def find_swaps(
 
 
 def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[Swap, ...]:
-    """Views in which the hands' keypoints are at each other's wrists, as hand detectors on
-    exchanged crops leave them.
+    """Returns views in which the hands' keypoints are at each other's wrists. Hand detectors leave
+    them so when their crops are exchanged.
     """
     wanted = ("left_hand_root", "right_hand_root", "left_wrist", "right_wrist")
     if not set(wanted) <= set(keypoints.set.names):
@@ -132,12 +143,14 @@ def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[
 
 
 class Order(NamedTuple):
-    """Which keypoints the c cameras of m frames get."""
+    """The keypoints that each of c cameras gets in m frames."""
 
     source: Int[np.ndarray, "m c"]
-    """Camera that they come from, (m, c)."""
+    """Index of the camera from which they come, (m, c)."""
     mirrored: Bool[np.ndarray, "m c"]
-    """Whether left and right are exchanged, by source, (m, c)."""
+    """Whether left and right of the keypoints are exchanged, (m, c), by the camera from which they
+    come.
+    """
 
     def exchanged(
         self,
@@ -159,19 +172,21 @@ class Order(NamedTuple):
 
 
 def given(frames: int, views: int) -> Order:
-    """Every camera has its own keypoints."""
+    """Returns the order in which every camera has the keypoints that it was given."""
     return Order(np.tile(np.arange(views), (frames, 1)), np.zeros((frames, views), bool))
 
 
 def _arranged(
     observations: Observations, mirror: Int[np.ndarray, " k"], order: Order
 ) -> Observations:
-    """The keypoints of m frames in an order. mirror: index of each keypoint's mirror image."""
+    """Returns the keypoints of m frames in an order. mirror: index of each keypoint's mirror
+    image.
+    """
     rows = np.arange(len(order.source))[:, None]
     columns = np.where(order.mirrored[rows, order.source, None], mirror, np.arange(len(mirror)))
 
     def pick(values):
-        """Values of the keypoints in the order."""
+        """Returns values of the keypoints, (m, c, k, ...), in the order."""
         return from_host(np.asarray(values)[rows[..., None], order.source[..., None], columns])
 
     # where left and right are exchanged the detector may have seen the body turned round: its
@@ -188,33 +203,33 @@ def _arranged(
 
 
 class Agreement(NamedTuple):
-    """How well c views agree with the points that they agree on best: confidences summed over
-    keypoints, less for larger errors.
+    """How well c views agree with the points that they agree on best. Agreement is the sum of the
+    confidences over keypoints, which count less for larger errors.
 
-    Points are those of the keypoints as they are, not triangulated again for an exchange.
+    The points are triangulated from the keypoints as they are, and not again for an exchange.
     """
 
     own: Float[Array, " c"]
-    """Agreement with the keypoints as they are, (c,)."""
+    """Agreement of each view with its keypoints, (c,)."""
     crossed: Float[Array, "c c"]
-    """Agreement if the first view had the second's keypoints, (c, c)."""
+    """Agreement of the first view with the keypoints of the second, (c, c)."""
     mirrored: Float[Array, " c"]
-    """Agreement with left and right exchanged, (c,)."""
+    """Agreement of each view with left and right of its keypoints exchanged, (c,)."""
 
 
 @jax.jit
 def agreements(
     observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]
 ) -> Agreement:
-    """How well the views of each frame agree, a batch of m. mirror: index of each keypoint's mirror
-    image.
+    """Returns how well the views of each frame agree, a batch of m. mirror: index of each
+    keypoint's mirror image.
     """
 
     def of_frame(seen):
         points, counts, weights = triangulate_robustly(seen)
 
         def near(keypoints, confidences):
-            """Agreement (c,) of all views if each had these keypoints (k, 2)."""
+            """Returns the agreement of all views, (c,), if each had these keypoints, (k, 2)."""
             alike = replace(
                 seen,
                 points=jnp.broadcast_to(keypoints, seen.points.shape),
@@ -236,23 +251,26 @@ def agreements(
 
 
 class _Trial(NamedTuple):
-    """An exchange in some frames."""
+    """An exchange in some frames, and what it gains."""
 
     gain: float
-    """Agreement that it adds."""
+    """Agreement that the exchange adds."""
     frames: Int[np.ndarray, " e"]
     """Indices of the frames, (e,)."""
     a: Int[np.ndarray, " e"]
-    """Camera in each frame, (e,)."""
+    """Camera whose keypoints are exchanged in each frame, (e,)."""
     b: Int[np.ndarray, " e"] | None
-    """Camera with which it is exchanged, (e,); None for the sides of camera a."""
+    """Camera with which it is exchanged in each frame, (e,). None if left and right of camera a are
+    exchanged.
+    """
 
 
 class _Search:
     """Keypoints in an order, how well the views agree, and what exchanges would add.
 
-    cameras: (m, c) equal numbers for one camera that stands still, -1: no view. total: (m,)
-    agreement. views: (m, c) with keypoints. sides: (m, c) and pairs: (m, c, c) to be tried.
+    cameras: (m, c), equal numbers for one camera that stands still, -1 where there is no view.
+    total: (m,) agreement of each frame. views: (m, c), which views have keypoints. sides: (m, c)
+    and pairs: (m, c, c), which exchanges are tried.
     """
 
     def __init__(
@@ -294,17 +312,17 @@ class _Search:
         return (np.asarray(own).sum(-1) - self.total)[frames]
 
     def is_clear(self, trial: _Trial, of: Bool[np.ndarray, " k"]) -> bool:
-        """Whether an exchange of the keypoints `of` gains enough.
+        """Returns whether an exchange of the keypoints `of` gains enough.
 
         The gain is compared with what is attainable: agreement on all keypoints that another view
-        sees, too.
+        sees too.
         """
         seen = (self.confidences > 0) & of
         shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
         slots = [slot for slot in (trial.a, trial.b) if slot is not None]
 
         def total(values: np.ndarray) -> float:
-            """The sum over the views that are exchanged."""
+            """Returns the sum of values over the views that are exchanged."""
             return float(sum(values[trial.frames, slot].sum() for slot in slots))
 
         attainable, count = total((self.confidences * shared).sum(-1)), total(shared.sum(-1))
@@ -349,7 +367,7 @@ class _Search:
         return [trial for trial in (*together, *alone) if self.is_clear(trial, every)]
 
     def _pair(self, frame: int, a: int, b: int) -> tuple[int, ...]:
-        """The numbers of the cameras in two columns of a frame, sorted."""
+        """Returns the numbers of the cameras in two columns of a frame, sorted."""
         return tuple(sorted(self.cameras[frame, [a, b]].tolist()))
 
 
@@ -369,7 +387,7 @@ def _cameras(
     """
 
     def named(trial: _Trial) -> tuple[str, ...]:
-        """The two views in the first frame of an exchange."""
+        """Returns the names of the two views in the first frame of an exchange."""
         assert trial.b is not None
         return tuple(names[v] for v in sorted(views[trial.frames[0], [trial.a[0], trial.b[0]]]))
 
@@ -398,7 +416,9 @@ def _sides(
 def _camera_numbers(
     observations: Observations, views: Int[np.ndarray, "m c"]
 ) -> Int[np.ndarray, "m c"]:
-    """(m, c) equal for views of one camera that stands still; -1 where there is no view."""
+    """Returns the number of each view's camera, (m, c). Views of one camera that stands still have
+    the same number. -1 where there is no view.
+    """
     there = np.nonzero(views >= 0)
     matrices = (
         np.asarray(x, np.float64)[there] for x in (observations.K, observations.cam_from_world)

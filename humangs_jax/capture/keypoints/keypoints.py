@@ -1,18 +1,19 @@
-"""Keypoints in memory: of the views of a capture, and as files have them; and the sets of points
-that detectors are trained on.
+"""Keypoints in memory, of a capture's views and as files have them, and the sets of points that
+detectors are trained on.
 
-The names of points, for `side` left or right (the person's own):
+The names of points are, with `side` left or right (the person's own):
 
-nose, `side`_eye, _ear, _shoulder, _elbow, _wrist, _hip, _knee, _ankle, _big_toe, _small_toe, _heel;
-neck and mid_hip (the
-    middle of the shoulders and of the hips, OpenPose and Halpe); head_top (Halpe and BODY_25B);
-    upper_neck (BODY_25B)
-`side`_foot_index: the tip of the foot, between big and second toe (BlazePose only) face_0 to
-face_67: 300-W's landmarks; 0 is the jaw under the person's right ear `side`_hand_root;
-`side`_thumb_, index_, middle_, ring_, pinky_ with 1, 2, 3, tip: 1 is nearest to the palm
+    nose, `side`_eye, _ear, _shoulder, _elbow, _wrist, _hip, _knee, _ankle, _big_toe, _small_toe,
+        _heel
+    neck and mid_hip: the middle of the shoulders and of the hips (OpenPose and Halpe)
+    head_top (Halpe and BODY_25B), upper_neck (BODY_25B)
+    `side`_foot_index: the tip of the foot, between big and second toe (BlazePose only)
+    face_0 to face_67: 300-W's landmarks; 0 is the jaw under the person's right ear
+    `side`_hand_root, `side`_thumb_, index_, middle_, ring_, pinky_ with 1, 2, 3, tip: 1 is nearest
+        to the palm
 
-A point has the same name in every set that has it, though annotators of different sets do not mean
-quite the same by "hip".
+A point has the same name in every set that has it, although annotators of different sets mean
+slightly different places, for example by "hip".
 
 Sources: COCO's person_keypoints annotations; Fang-Haoshu/Halpe-FullBody; jin-s13/COCO-WholeBody's
 data format; OpenPose's "Demo - Output" page; MediaPipe's "Pose landmark detection" page.
@@ -38,7 +39,7 @@ from humangs_jax.data.capture_checks import CaptureError, checked_json, file_num
 from humangs_jax.data.formats import KEYPOINTS
 
 SIDES = ("left", "right")
-"""The person's left and right."""
+"""Names of the sides, seen from the person."""
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 """Fingers in the order of OpenPose's hands."""
 _FACE_POINTS = 68
@@ -66,34 +67,38 @@ _BODY_25 = (
 
 @dataclasses.dataclass(frozen=True)
 class KeypointSet:
-    """The points of a detector, in its order."""
+    """The points that a detector finds, in the detector's order."""
 
     name: str
-    """Name of the set, as our npz files have it."""
+    """Name of the set in our npz files."""
     names: tuple[str, ...]
     """Names of the k points."""
     mirror: tuple[int, ...]
-    """Index of each point's mirror image; a point in the middle of the body is its own."""
+    """Index of each point's mirror image. A point in the middle of the body is its own mirror
+    image.
+    """
     places: tuple[LandmarkDefinition, ...] = ()
     """Places on the body of points that may lie elsewhere than `body.landmarks` has them: where the
     detector is known to see them, or a fit has found that it does.
     """
     certainty: tuple[float, ...] = ()
-    """Certainty of the points, (k,), the reciprocal of each one's noise over that of all, if a fit
-    has found it; empty: as usual.
+    """Certainty of each point, (k,): the noise of all points over its noise, as a fit has found it.
+    Empty: as usual.
     """
 
     @property
     def offsets(self) -> Float[np.ndarray, "k 3"]:
-        """The offsets of the points' places, metres; 0 for points without a place."""
+        """Offsets of the points' places on the body, (k, 3), metres. 0 for points without a
+        place.
+        """
         known = {place.name: place.offset for place in self.places}
         return np.asarray([known.get(name, (0.0, 0.0, 0.0)) for name in self.names])
 
     def adapted(
         self, offsets: Float[np.ndarray, "k 3"], certainty: Float[np.ndarray, " k"]
     ) -> "KeypointSet":
-        """Returns the set as a detector is found to use it: with these offsets of the places,
-        metres, and this certainty.
+        """Returns the set with places and certainty as a fit has found them. offsets: of the
+        places, metres.
         """
         own = dict(zip(self.names, np.asarray(offsets, float).tolist(), strict=True))
         places = tuple(place._replace(offset=tuple(own[place.name])) for place in self.places)
@@ -103,8 +108,8 @@ class KeypointSet:
 
 
 def hand_names(side: str) -> tuple[str, ...]:
-    """The 21 points of one hand, from the palm to the tips, in the order of OpenPose and
-    COCO-WholeBody.
+    """Returns the names of the 21 points of a hand, from the palm to the tips, in the order of
+    OpenPose and COCO-WholeBody.
     """
     return (
         f"{side}_hand_root",
@@ -124,7 +129,7 @@ def _keypoint_set(
 
 
 COCO_17 = _keypoint_set("coco17", _COCO)
-"""COCO's 17 body points."""
+"""COCO's 17 points of the body."""
 
 COCO_WHOLEBODY_133 = _keypoint_set(
     "wholebody133",
@@ -136,8 +141,8 @@ COCO_WHOLEBODY_133 = _keypoint_set(
         *hand_names("right"),
     ),
 )
-"""COCO-WholeBody: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the left and 21
-of the right hand.
+"""COCO-WholeBody's 133 points: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the
+left and 21 of the right hand.
 """
 
 HALPE_26 = _keypoint_set(
@@ -150,7 +155,8 @@ HALPE_26 = _keypoint_set(
         *(f"{side}_{part}" for part in _FOOT for side in SIDES),
     ),
 )
-"""Halpe's 26 body points, of AlphaPose and RTMPose: COCO's, three of the middle, six of the feet.
+"""Halpe's 26 points of the body, which AlphaPose and RTMPose use: COCO's 17, three in the middle of
+the body, and six of the feet.
 """
 
 HALPE_136 = _keypoint_set(
@@ -162,12 +168,14 @@ HALPE_136 = _keypoint_set(
         *hand_names("right"),
     ),
 )
-"""Halpe's 136, of AlphaPose: the 26, 68 of the face, 21 of the left and 21 of the right hand."""
+"""Halpe's 136 points, which AlphaPose uses: the 26 of the body, 68 of the face, 21 of the left and
+21 of the right hand.
+"""
 
 OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
 """OpenPose's BODY_25 with its left and right hand.
 
-Its 70 points of the face are ignored: they are not in this set.
+OpenPose's 70 points of the face are not in this set, and are ignored.
 """
 
 OPENPOSE_60 = _keypoint_set(
@@ -182,12 +190,12 @@ OPENPOSE_67B = _keypoint_set(
 )
 """OpenPose's BODY_25B with its left and right hand.
 
-Files do not say which of both they have, see `orders`.
+Files do not tell if they have BODY_25 or BODY_25B, see `orders`.
 """
 
 
 def _both(part: str) -> tuple[str, str]:
-    """The left and the right point of a part."""
+    """Returns the names of the left and the right point of a part."""
     return f"left_{part}", f"right_{part}"
 
 
@@ -239,8 +247,8 @@ MEDIAPIPE_33 = _keypoint_set(
     ),
     _BLAZEPOSE_PLACES,
 )
-"""MediaPipe's 33 (BlazePose): the inner and outer corners of the eyes and the corners of the mouth
-are points of the face.
+"""MediaPipe's 33 points (BlazePose). The corners of the eyes and of the mouth have the names of the
+face's points.
 """
 
 _COARSE = ("pinky_1", "index_1", "thumb_2")
@@ -250,7 +258,8 @@ MEDIAPIPE_69 = _keypoint_set(
     (*(name for name in MEDIAPIPE_33.names if name.split("_", 1)[-1] not in _COARSE), *_HANDS),
     tuple(each for each in _BLAZEPOSE_PLACES if each.name.split("_", 1)[-1] not in _COARSE),
 )
-"""BlazePose's landmarks but those of hands, and mediapipe's 21 of the left and of the right hand.
+"""BlazePose's points without those of the hands, and mediapipe's 21 of the left and of the right
+hand.
 """
 
 _DETECTORS = (
@@ -265,13 +274,13 @@ _DETECTORS = (
     MEDIAPIPE_69,
 )
 KEYPOINT_SETS = {each.name: each for each in _DETECTORS}
-"""The sets by name, as our npz files name them."""
+"""All sets by name, as our npz files name them."""
 SETS_BY_COUNT = {
     len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136)
 }
-"""The set of a list of points without names.
+"""Sets by their number of points, for lists of points without names.
 
-OpenPose's 67 are not in it: its files keep body and hands apart.
+OpenPose's sets are not here: its files keep body and hands apart.
 """
 
 
@@ -281,87 +290,90 @@ OpenPose's 67 are not in it: its files keep body and hands apart.
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Keypoints:
-    """One person's keypoints in each of v views (numpy on the host)."""
+    """One person's keypoints in each of v views, as numpy arrays."""
 
     points: Float[np.ndarray, "v k 2"]
-    """Detections, (v, k, 2), float32 pixels, x right and y down, the centre of the first pixel at
-    (0.5, 0.5); finite, and to be ignored where the confidence is 0.
+    """Detected points, (v, k, 2), float32, pixels: x right and y down, with the centre of the first
+    pixel at (0.5, 0.5). They are finite, and have to be ignored where the confidence is 0.
     """
     confidences: Float[np.ndarray, "v k"]
-    """Confidences, (v, k), float32 in [0, 1]; 0: the point is missing."""
+    """Confidences, (v, k), float32 in [0, 1]. 0 where the point is missing."""
     set: KeypointSet
-    """What the k points are."""
+    """The set of the k points."""
     missing: tuple[str, ...] = ()
-    """Names of the views that the file has nothing for."""
+    """Names of the views that the file says nothing about."""
     world: Float[np.ndarray, "v k 3"] | None = None
-    """The detector's 3D landmarks, (v, k, 3), metres, if it gives any: a person of average size, in
-    axes whose z is the ray to the person, up to a translation.
+    """The detector's 3D landmarks, (v, k, 3), metres, of a person of average size. The z axis is
+    the ray to the person, and the translation is arbitrary. None if the detector has no such
+    landmarks.
     """
     warnings: tuple[str, ...] = ()
-    """Problems of a file that could be read, a line each."""
+    """Problems of a file that could still be read, one line each."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DetectedImage:
-    """The people in one image."""
+    """The people that a file has in one image."""
 
     image: str | int
-    """Name or path of the image as the file has it, or a number where the file has no more."""
+    """Name or path of the image as the file has it. A number if the file has only numbers."""
     file: Path
-    """File that the people are from."""
+    """File from which the people were read."""
     people: tuple[Float[np.ndarray, "k columns"], ...]
-    """Points of each person: (k, 3), x and y in pixels of the tool and confidence, not yet checked,
-    so that NaN and null are NaN; or (k, 6), with `Keypoints.world`.
+    """Points of each person, not yet checked: NaN and null are NaN. (k, 3) is x and y in the pixels
+    of the tool, and confidence. (k, 6) also has `Keypoints.world`.
     """
     size: tuple[int, int] | None = None
-    """(width, height) in pixels, where the file states it."""
+    """Width and height of the image, pixels. None if the file does not state them."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Detections:
-    """The images of a file or folder."""
+    """The people in the images of a file or folder."""
 
     set: KeypointSet | None
-    """What the points are; None if no image has a person."""
+    """The set of the points. None if no image has a person."""
     images: tuple[DetectedImage, ...]
-    """The images."""
+    """The images, in the order of the file."""
     offset: float = 0.5
-    """Pixels to add to x and y so that pixel centres are at +0.5: every tool that we read has the
-    centre of the first pixel at 0.
+    """Pixels that have to be added to x and y so that pixel centres are at +0.5. All tools whose
+    files we read have the centre of the first pixel at 0.
     """
     warnings: tuple[str, ...] = ()
-    """Problems of the files, a line each."""
+    """Problems of the files, one line each."""
     tool: str = ""
-    """Tool that has written the files, where they say so."""
+    """Name of the tool that has written the files. Empty if they do not say."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KeypointFile:
-    """What a reader of a format gets."""
+    """A file that is given to a reader of a format."""
 
     path: Path
-    """The file."""
+    """Path of the file."""
     name: str
-    """Name of the image or video that it may be of: the path in its folder without the suffix."""
+    """Name of the image or video that the file may be about: its path in the folder, without the
+    suffix.
+    """
     alone: bool
-    """Whether no other file is read with it: the frames of a video are known by their number, else
-    by name/number.
+    """Whether this is the only file that is read. Then the frames of a video are known by their
+    number, else by name/number.
     """
 
     @functools.cached_property
     def json(self) -> Any:
-        """The value of the file, None where its suffix is that of another format.
+        """The JSON value of the file. None if its suffix is that of another format.
 
-        Raises: CaptureError.
+        Raises: CaptureError if it is not valid JSON.
         """
         return None if self.path.suffix.lower() in KEYPOINTS.suffixes else checked_json(self.path)
 
 
 def detections_of(images: Sequence[DetectedImage], *more: KeypointSet) -> Detections:
-    """Detections of one keypoint set, chosen by the number of points of a person. more: sets beside
-    `SETS_BY_COUNT`.
+    """Returns detections with the keypoint set that has as many points as a person. more: sets
+    besides those of `SETS_BY_COUNT`.
 
-    Raises: CaptureError for other numbers, and for two sets.
+    Raises: CaptureError if no set has this number of points, or if people have different numbers.
     """
     people = [(len(person), image) for image in images for person in image.people]
     if not people:
@@ -384,9 +396,10 @@ def detections_of(images: Sequence[DetectedImage], *more: KeypointSet) -> Detect
 def triples(
     value: Any, file: Path, field: str, count: int | None = None
 ) -> Float[np.ndarray, "k 3"]:
-    """x, y and confidence of each point, from a flat list of them; null is NaN.
+    """Returns x, y and confidence of each point, (k, 3), from a flat list of numbers. null becomes
+    NaN. count: number of points. None: any.
 
-    Raises: CaptureError if these are no numbers, or not 3 * count (any multiple of 3 if count is
+    Raises: CaptureError if these are no numbers, or not 3 * count (a multiple of 3 if count is
     None).
     """
     array = file_numbers(value, file, field, nulls=True)

@@ -1,5 +1,5 @@
-"""Keypoints as evidence: observations of fixed shapes, so that frames and people can be vmapped,
-and their residuals.
+"""Keypoints as evidence: observations and their residuals. Observations have fixed shapes, so that
+frames and people can be vmapped.
 """
 
 import dataclasses
@@ -34,11 +34,13 @@ from humangs_jax.geometry.transform import EXACT
 
 AnyArray = Float[Array, "m c ..."] | Float[np.ndarray, "m c ..."]
 NEAR = 0.05
-"""Metres: depths are clamped to at least this."""
+"""Least depth, metres. Smaller depths are clamped to it."""
 NOISE = 0.005
-"""Expected std of detections, a share of the person's height in the photo: 2 pixels of 400."""
+"""Expected standard deviation of detections, a share of the person's height in the photo: 2 pixels
+of 400.
+"""
 LEAST_NOISE = 0.3
-"""Pixels: detections are expected to err by at least this."""
+"""Least expected standard deviation of detections, pixels."""
 OUTER = (0.03, 0.97)
 """Quantiles of the coordinates between which a person's size is measured, so that outliers do not
 count.
@@ -46,13 +48,15 @@ count.
 _NOISE_RANGE = (0.5, 8.0)
 """Bounds of the noise that a fit finds, multiples of the expected noise."""
 PLACE_STD = 0.02
-"""Metres: how far from where they are thought to be detectors see landmarks."""
+"""Standard deviation of the offset between where a detector sees a landmark and where it is
+expected to, metres.
+"""
 _WORLD_STD = 0.15
-"""Standard deviation of a detector's 3D landmarks, over the root mean square of their distances
-from their middle.
+"""Standard deviation of a detector's 3D landmarks, a share of the root mean square of their
+distances from their mean.
 """
 RAYLEIGH_MEDIAN = 1.1774
-"""Median length of a vector whose two components have a std of 1."""
+"""Median length of a vector whose two components have a standard deviation of 1."""
 
 
 @pytree_dataclass
@@ -60,9 +64,9 @@ class Observations(Batchable):
     """Keypoints of one frame in c views; a missing view has confidence 0."""
 
     points: Float[Array, "c k 2"]
-    """Detections, (c, k, 2), pixels, the centre of the first pixel at (0.5, 0.5)."""
+    """Detected points, (c, k, 2), pixels, with the centre of the first pixel at (0.5, 0.5)."""
     confidences: Float[Array, "c k"]
-    """Confidences, (c, k), in [0, 1]; 0: not seen."""
+    """Confidences, (c, k), in [0, 1]. 0 where a point is not seen."""
     K: Float[Array, "c 3 3"]
     """Intrinsics, (c, 3, 3), pixels."""
     cam_from_world: Float[Array, "c 4 4"]
@@ -70,8 +74,8 @@ class Observations(Batchable):
     noise: Float[Array, ""]
     """Standard deviation of the detections, (), pixels."""
     world: Float[Array, "c k 3"] | None = None
-    """Where the detector sees the landmarks in space, in the camera's axes, up to a translation and
-    a scale, (c, k, 3).
+    """Positions at which the detector sees the landmarks in space, (c, k, 3), in the camera's axes.
+    Translation and scale are arbitrary. None without such positions.
     """
 
 
@@ -82,7 +86,9 @@ def make_observations(
     cam_from_world: AnyArray,
     world: AnyArray | None = None,
 ) -> Observations:
-    """A batch of m frames from arrays (m, c, ...), with the noise that is expected of them."""
+    """Returns a batch of m frames from arrays (m, c, ...), with the expected noise of their
+    keypoints.
+    """
     noise = expected_noise(np.asarray(points), np.asarray(confidences))
     given = [points, confidences, K, cam_from_world, noise]
     if world is not None:
@@ -91,8 +97,10 @@ def make_observations(
 
 
 def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -> Observations:
-    """Keypoints of photos in pixels of resized cameras: a batch of views, each with one view (c =
-    1), and the noise of all.
+    """Returns keypoints of photos in pixels of resized cameras, a batch of views with one view each
+    (c = 1). All have the noise that is expected of the views together.
+
+    cameras: of the resized photos. photos: cameras of the photos.
     """
     scale = np.asarray(
         [cameras.width / photos.width, cameras.height / photos.height], keypoints.points.dtype
@@ -110,8 +118,8 @@ def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -
 def group_by_frame(
     photos: Photos | Capture, keypoints: Keypoints
 ) -> tuple[Observations, Int[np.ndarray, "m c"]]:
-    """Observations with a leading axis of frames (m, c, ...), and the view (m, c) of each, -1 where
-    there is none.
+    """Groups the keypoints of views by frame. Returns a batch of m frames, and the index of each
+    view, (m, c), -1 where there is none.
     """
     frames, count = np.asarray(photos.frames), photos.frame_count
     # frames with fewer views than others have missing ones, whose keypoints have confidence 0
@@ -141,8 +149,8 @@ def in_camera_axes(
     weights: Float[np.ndarray, "*b k"],
     K: Float[np.ndarray, "*b 3 3"],
 ) -> Float[np.ndarray, "*b k 3"]:
-    """Landmarks whose z axis is the ray to the mean of the weighted points, in the axes of the
-    camera.
+    """Turns landmarks whose z axis is the ray to the weighted mean of the points into the axes of
+    the camera, (..., k, 3).
     """
     total = weights.sum(-1, keepdims=True)
     middle = (weights[..., None] * points).sum(-2) / np.maximum(total, 1e-9)
@@ -158,8 +166,8 @@ def in_camera_axes(
 def expected_noise(
     points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]
 ) -> Float[np.ndarray, " m"]:
-    """The expected noise, pixels, from the size of the person in the views of a frame; 1 where
-    nothing is seen.
+    """Returns the expected noise of each frame, (m,), pixels. It follows from the size of the
+    person in the views, and is 1 where nothing is seen.
     """
 
     def of_frame(points, seen):
@@ -176,8 +184,9 @@ def expected_noise(
 
 
 def found_noise(lengths: Array | np.ndarray, expected: Array | np.ndarray | np.floating) -> Any:
-    """The noise, pixels, from the median of errors, which outliers hardly change; NaN is none, and
-    without any it is as expected. Arrays of numpy give one of numpy.
+    """Returns the noise, pixels, estimated from the median of errors, which outliers hardly change.
+    NaN marks a missing error. Without any error the noise is the expected one. Numpy arrays give a
+    numpy array.
     """
     xp: Any = jnp
     if isinstance(lengths, np.ndarray):
@@ -190,21 +199,21 @@ def found_noise(lengths: Array | np.ndarray, expected: Array | np.ndarray | np.f
 
 
 def in_cameras(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k 3"]:
-    """Points of the world in the coordinates of every camera."""
+    """Returns points of the world in the coordinates of every camera, (c, k, 3), metres."""
     rotation = observations.cam_from_world[:, :3, :3]
     translation = observations.cam_from_world[:, :3, 3]
     return jnp.einsum("cab,kb->cka", rotation, points, precision=EXACT) + translation[:, None]
 
 
 def focal_lengths(observations: Observations) -> Float[Array, "c 1 2"]:
-    """fx and fy of every view, pixels."""
+    """Returns fx and fy of every view, (c, 1, 2), pixels."""
     return jnp.stack([observations.K[:, 0, 0], observations.K[:, 1, 1]], axis=-1)[:, None]
 
 
 def keypoint_errors(
     observations: Observations, landmarks: Float[Array, "k 3"]
 ) -> Float[Array, "c k 2"]:
-    """Projected landmarks minus detections, pixels."""
+    """Returns projected landmarks minus detections, (c, k, 2), pixels."""
     seen = in_cameras(observations, landmarks)
     pixels = seen[..., :2] / jnp.maximum(seen[..., 2:], NEAR) * focal_lengths(observations)
     return pixels + observations.K[:, None, :2, 2] - observations.points
@@ -221,17 +230,21 @@ def body_errors(
         [Observations, Float[Array, "k 3"]], Float[Array, "c k ..."]
     ] = keypoint_errors,
 ) -> Float[Array, "n c k ..."]:
-    """`errors` of a person in the poses `frames` of a batch, for a batch of n observations."""
+    """Returns the `errors` of a person for a batch of n observations, (n, c, k, ...). frames: index
+    of each observation's pose in `poses`, (n,).
+    """
     landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
     return jax.vmap(errors)(seen, landmarks[frames])
 
 
 _TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")
-"""Landmarks that hardly depend on the pose."""
+"""Kinds of landmarks that hardly depend on the pose."""
 
 
 def trunk_weights(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
-    """(k,) 1 for landmarks of the trunk; others count, by 0.02, where the trunk is not seen."""
+    """Returns weights of landmarks, (k,): 1 for the trunk, and 0.02 for the others, which then only
+    decide where the trunk is not seen.
+    """
     return np.asarray([1.0 if kind_of(name) in _TRUNK else 0.02 for name in names], np.float32)
 
 
@@ -241,7 +254,9 @@ def keypoint_residuals(
     landmarks: Float[Array, "k 3"],
     scale: Float[Array, ""] | float,
 ) -> Float[Array, "c k 2"]:
-    """Errors of keypoints in standard deviations; scale: robust scale, in standard deviations."""
+    """Returns the errors of keypoints, (c, k, 2), in standard deviations. scale: robust scale, in
+    standard deviations.
+    """
     errors = (
         keypoint_errors(observations, landmarks) / observations.noise * model.certainty[:, None]
     )
@@ -250,7 +265,7 @@ def keypoint_residuals(
 
 
 def _roots(weights: Float[Array, "c k"]) -> Float[Array, "c k"]:
-    """Square roots, differentiable where they are 0."""
+    """Returns square roots of weights, which are differentiable at 0."""
     return jnp.where(weights > 0, jnp.sqrt(jnp.where(weights > 0, weights, 1.0)), 0.0)
 
 
@@ -260,18 +275,18 @@ def world_residuals(
     landmarks: Float[Array, "k 3"],
     scale: Float[Array, ""] | float,
 ) -> Float[Array, "c k"]:
-    """Depths of landmarks against those that the detector sees, of a person of the same size, in
-    standard deviations.
+    """Returns the differences between depths of landmarks and those that the detector sees, (c, k),
+    in standard deviations. Both are scaled to one size of the person.
     """
     weights = observations.confidences * np.asarray(model.known, np.float32)
     total = jnp.maximum(jnp.sum(weights, axis=1), 1e-6)
 
     def centered(x):
-        """Points about their weighted mean."""
+        """Returns points minus their weighted mean."""
         return x - jnp.sum(weights[..., None] * x, axis=1, keepdims=True) / total[..., None, None]
 
     def size(x):
-        """Root mean square of the distances from the mean, (c, 1)."""
+        """Returns the root mean square of the distances from the mean, (c, 1)."""
         square = jnp.sum(weights * jnp.sum(jnp.square(x), axis=-1), axis=1) / total
         return jnp.sqrt(square + NEAR**2)[:, None]
 
@@ -287,9 +302,9 @@ class Targets:
     points: Float[Array, "k 3"]
     """Positions, (k, 3), metres."""
     known: Float[Array, " k"] | Bool[Array, " k"]
-    """Weights, (k,); 0: not triangulated."""
+    """Weights, (k,). 0 for landmarks that were not triangulated."""
     pixel: Float[Array, ""]
-    """Metres per pixel at the person, ()."""
+    """Length at the person that one pixel shows, (), metres."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -301,21 +316,23 @@ class KeypointProblem:
     prior: PosePrior
     """Prior of poses and limits of joints."""
     origin: Origin
-    """Where the zeros of the state are."""
+    """The values that zeros of the state stand for."""
 
     @property
     def known(self) -> Float[np.ndarray, " k"]:
-        """(k,) 1 for landmarks that the body has."""
+        """1 for landmarks that the body has, 0 for others, (k,)."""
         return np.asarray(self.model.known, np.float32)
 
     def model_of(self, state: FitState) -> LandmarkModel:
-        """The landmarks, where the state has their places."""
+        """Returns the landmarks at the places of the state, or those of the problem if the state
+        has none.
+        """
         return self.model if state.places is None else self.model.moved(PLACE_STD * state.places)
 
     def landmarks_and_joints(
         self, state: FitState
     ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
-        """Landmarks and joints of a state, metres."""
+        """Returns landmarks, (k, 3), and joints, (j, 3), of a state, metres."""
         return pose_landmarks(
             self.model_of(state), betas_of(self.origin, state), pose_of(self.origin, state)
         )
@@ -328,7 +345,11 @@ def frame_residuals(
     scale: Float[Array, ""] | float,
     targets: Targets | None = None,
 ) -> dict[str, Float[Array, "..."]]:
-    """All residuals of one frame, by kind; half their square sum is the negative log posterior."""
+    """Returns all residuals of one frame, by kind. Half their square sum is the negative log
+    posterior.
+
+    scale: robust scale of keypoints, standard deviations. targets: triangulated landmarks, or None.
+    """
     betas, pose = betas_of(problem.origin, state), pose_of(problem.origin, state)
     landmarks, _ = pose_landmarks(problem.model_of(state), betas, pose)
     found = {
