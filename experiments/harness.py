@@ -1,24 +1,28 @@
-"""`python -m experiments NAME [options]`: one way to run all measurements. `python -m experiments`
-lists them.
+"""Runs all measurements by `python -m experiments NAME [options]`. `python -m experiments` lists
+them.
 
-An experiment is a function with `@entry`. Its first argument is a `Run`, the others are its
-options: those without a default are positional, annotations are numbers, paths, flags, `Literal`
-choices and tuples of these. A default that is a dataclass becomes one option for each of its
-fields. Lines `name: text` below `Options:` in a docstring are the help.
+An experiment is a function with `@entry`. Its first argument is a `Run`. Its other arguments are
+its options. Options without a default are positional. Annotations are numbers, paths, flags,
+`Literal` choices and tuples of these. A default that is a dataclass becomes one option for each
+field of the dataclass. Lines `name: text` below `Options:` in a docstring are the help.
 
-Its table has its name, unless a line `Tables: NAMES` of the docstring says otherwise.
+The table of an experiment has the experiment's name, unless the docstring has a line
+`Tables: NAMES`.
 
-Every experiment has --json OUT (rows, numbers, date, machine, versions; finished rows of the same
-settings are kept) and --publish (docs/results/TABLE.json, and the page that shows the table).
+Every experiment has the options --json OUT and --publish. --json writes rows, numbers, date,
+machine and versions, and keeps finished rows of the same settings. --publish writes
+docs/results/TABLE.json and the page that shows the table.
 """
 
 import argparse
 import ast
 import contextlib
 import dataclasses
+import functools
 import importlib
 import inspect
 import json
+import operator
 import re
 import traceback
 import types
@@ -35,31 +39,34 @@ Row = Any
 
 
 def entry(function: FunctionType) -> FunctionType:
-    """Marks an experiment: `listed` finds it by the name of the function."""
+    """Marks a function as an experiment, which `listed` finds by the decorator's name."""
     return function
 
 
 def summary(docstring: str | None) -> str:
-    """The first paragraph of a docstring, on one line."""
+    """Returns the first paragraph of a docstring on one line."""
     paragraph, _, _ = (docstring or "").partition("\n\n")
     return " ".join(paragraph.split())
 
 
 def listed() -> dict[str, tuple[str, str]]:
-    """Name -> (module, first paragraph of the docstring), without importing anything."""
+    """Returns {name: (module, first paragraph of the docstring)} of all experiments.
+
+    The files are parsed and not imported.
+    """
     found = {}
     for path in sorted(FOLDER.rglob("*.py")):
+        module = ".".join(("experiments", *path.relative_to(FOLDER).with_suffix("").parts))
         for node in ast.parse(path.read_text()).body:
-            if isinstance(node, ast.FunctionDef) and any(
-                ast.unparse(d) == "entry" for d in node.decorator_list
-            ):
-                module = ".".join(("experiments", *path.relative_to(FOLDER).with_suffix("").parts))
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            if "entry" in map(ast.unparse, node.decorator_list):
                 found[node.name] = module, summary(ast.get_docstring(node))
     return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line; the exit status."""
+    """Runs the command line and returns its exit status."""
     known = listed()
     parser = argparse.ArgumentParser(prog="python -m experiments", description=summary(__doc__))
     parser.add_argument("name", nargs="?", help="without one, all are listed")
@@ -78,9 +85,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def call(function: FunctionType, options: Sequence[str]) -> int:
-    """Runs an experiment; what it returns is the exit status (None: 0).
+    """Runs an experiment and returns its exit status, 0 where the experiment returns None.
 
-    Wrong options and files: one line, and status 2.
+    Wrong options and wrong files end the process with one line and status 2.
     """
     parser, given = parser_of(function)
     asked = parser.parse_args(options)
@@ -88,8 +95,10 @@ def call(function: FunctionType, options: Sequence[str]) -> int:
     try:
         if asked.publish:  # before long work
             named = re.findall(r"^Tables?: ([\w, ]+)", inspect.getdoc(function) or "", re.MULTILINE)
-            own = asked.table == function.__name__ and named
-            for table in named[0].split(", ") if own else [asked.table]:
+            tables = [asked.table]
+            if named and asked.table == function.__name__:
+                tables = named[0].split(", ")
+            for table in tables:
                 page_of(table)
         return function(run, **{name: make(asked) for name, make in given.items()}) or 0
     except (ValueError, OSError) as error:
@@ -100,7 +109,9 @@ def call(function: FunctionType, options: Sequence[str]) -> int:
 def parser_of(
     function: FunctionType,
 ) -> tuple[argparse.ArgumentParser, dict[str, Callable[[Any], Any]]]:
-    """The options of an experiment, and for each parameter what makes its value of them."""
+    """Returns the parser of an experiment, and {parameter: function from the parsed options to the
+    value of the parameter}.
+    """
     text = inspect.getdoc(function) or ""
     parser = argparse.ArgumentParser(
         prog=f"python -m experiments {function.__name__}",
@@ -117,7 +128,10 @@ def parser_of(
 
 
 def _add_parameters(parser, function):
-    """Adds options; name of a parameter -> its value from the namespace."""
+    """Adds the options of an experiment to its parser.
+
+    Returns {parameter: function from the parsed options to the value of the parameter}.
+    """
     given, kinds, texts = {}, typing.get_type_hints(function), _helps(function)
     for name, parameter in list(inspect.signature(function).parameters.items())[1:]:
         default = parameter.default
@@ -125,45 +139,56 @@ def _add_parameters(parser, function):
             fields = [field.name for field in dataclasses.fields(default)]
             kinds_of, texts_of = typing.get_type_hints(type(default)), _helps(type(default))
             for field in fields:
-                _add_option(
-                    parser, field, kinds_of[field], getattr(default, field), texts_of.get(field, "")
-                )
-            given[name] = lambda asked, d=default, f=fields: dataclasses.replace(
-                d, **{n: getattr(asked, n) for n in f}
-            )
+                value = getattr(default, field)
+                _add_option(parser, field, kinds_of[field], value, texts_of.get(field, ""))
+            given[name] = functools.partial(_dataclass_of, default, fields)
         else:
             _add_option(parser, name, kinds[name], default, texts.get(name, ""))
-            given[name] = lambda asked, name=name: getattr(asked, name)
+            given[name] = operator.attrgetter(name)
     return given
 
 
+def _dataclass_of(default, fields, asked):
+    """Returns a dataclass with the values that the parsed options have for its fields."""
+    return dataclasses.replace(default, **{name: getattr(asked, name) for name in fields})
+
+
 def _add_option(parser, name, kind, default, text):
-    required, many = default is inspect.Parameter.empty, typing.get_origin(kind) is tuple
+    """Adds one option to a parser, with the action and the type that its annotation asks for."""
+    required = default is inspect.Parameter.empty
     options: dict[str, Any] = {} if required else {"default": default}
-    if many:
-        kind, options["nargs"] = typing.get_args(kind)[0], "+" if required else "*"
+    # tuples take several values, and `X | None` is an X
+    if typing.get_origin(kind) is tuple:
+        kind = typing.get_args(kind)[0]
+        options["nargs"] = "+" if required else "*"
         options["action"] = _Tuple
     elif isinstance(kind, types.UnionType):
         kind = next(each for each in typing.get_args(kind) if each is not type(None))
     if typing.get_origin(kind) is typing.Literal:
-        options["choices"], kind = typing.get_args(kind), type(typing.get_args(kind)[0])
+        options["choices"] = typing.get_args(kind)
+        kind = type(options["choices"][0])
     if kind is bool:
         options["action"] = argparse.BooleanOptionalAction
     else:
         options["type"] = kind
-    shown = "" if required or default in (None, (), False) else " (default: %(default)s)"
-    parser.add_argument(
-        name if required else f"--{name.replace('_', '-')}", help=text + shown, **options
-    )
+
+    # an option that has a default shows it, and has a name with dashes
+    if required:
+        parser.add_argument(name, help=text, **options)
+        return
+    shown = "" if default in (None, (), False) else " (default: %(default)s)"
+    parser.add_argument(f"--{name.replace('_', '-')}", help=text + shown, **options)
 
 
 class _Tuple(argparse.Action):
+    """Stores several values as a tuple."""
+
     def __call__(self, parser, namespace, values, option_string=None):
         setattr(namespace, self.dest, tuple(values))
 
 
 def _helps(documented) -> dict[str, str]:
-    """Option -> its line; of a class also those of its bases."""
+    """Returns {option: help} from the docstring of a function, or of a class and its bases."""
     found = {}
     for one in reversed(getattr(documented, "__mro__", (documented,))):
         _, _, text = (inspect.getdoc(one) or "").partition("Options:")
@@ -173,7 +198,10 @@ def _helps(documented) -> dict[str, str]:
 
 @dataclasses.dataclass(eq=False)
 class Run:
-    """What the harness does for a running experiment. Without options: nothing is written."""
+    """Keeps rows, writes files and publishes tables for a running experiment.
+
+    Without `json` and `publish` nothing is written.
+    """
 
     name: str = ""
     table: str = ""
@@ -181,7 +209,7 @@ class Run:
     publish: bool = False
     options: Sequence[str] = ()
     pictures: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """What cases gave beside their rows."""
+    """{case: the pictures that it returned beside its row, or None}."""
     _written: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def rows(
@@ -190,11 +218,16 @@ class Run:
         settings: Mapping[str, Any] | None = None,
         again: bool = False,
     ) -> dict[str, Row]:
-        """Rows of all cases. Those that --json OUT has with the same settings are not measured
-        again; it is written after each.
+        """Returns the rows of all cases, {case: row}.
 
-        A case may give (row, pictures); these go to `pictures`. again: all cases are measured, for
-        the pictures.
+        Cases whose rows --json OUT has with the same settings are not measured again. OUT is
+        written after each case. A case may return (row, pictures): the pictures go to `pictures`.
+
+        Args:
+            cases: {case: function that measures it}
+            settings: what the rows depend on, written into OUT
+            again: measure all cases, because their pictures are needed
+
         Raises: ValueError if OUT is no file of this harness.
         """
         from humangs_jax.core.progress import bar
@@ -202,16 +235,21 @@ class Run:
         settings = json.loads(json.dumps(settings or {}))
         kept = self._kept(settings)
         self._written |= {"settings": settings, "rows": kept}
+        # a row that is made is written at once, so that a run which is stopped loses only one
         for name in bar(list(cases), desc=self.name, unit="case"):
             if name not in kept or again:
                 found = cases[name]()
-                kept[name], self.pictures[name] = (
-                    found if isinstance(found, tuple) else (found, None)
-                )
+                if not isinstance(found, tuple):
+                    found = found, None
+                kept[name], self.pictures[name] = found
                 self._write()
         return {name: kept[name] for name in cases}
 
     def _kept(self, settings):
+        """Returns the rows that OUT has of an earlier run with the same settings.
+
+        Rows of measurements that failed are left out.
+        """
         if self.json is None or not self.json.exists():
             return {}
         try:
@@ -235,7 +273,7 @@ class Run:
             write_json(self.json, run_record(self.name, self.options) | self._written)
 
     def show(self, text: str, numbers: Any = None, table: str | None = None) -> None:
-        """Prints a section; --json OUT gets its numbers, with --publish the docs get both."""
+        """Prints a section. --json OUT gets its numbers, with --publish the docs get both."""
         print(text)
         table = table or self.table
         self._written.setdefault("numbers", {})[table] = numbers
@@ -245,9 +283,10 @@ class Run:
 
 
 def means(rows: Sequence[Row]) -> Row:
-    """Of dicts of dicts of numbers: the same with means, None where one is None.
+    """Returns the means of rows, which are numbers or (nested) dicts of numbers.
 
-    Keys: those that all have.
+    The result has the keys that all rows have. A number is None where it is None in a row. A text
+    or flag is kept where all rows agree, and is None otherwise.
     """
     first = rows[0]
     if isinstance(first, dict):
@@ -262,8 +301,13 @@ def means(rows: Sequence[Row]) -> Row:
 def figure(
     path: Path, columns: int = 1, size: tuple[float, float] = (9, 3.5), legend: float = 0
 ) -> Generator[Any]:
-    """Axes of plots side by side, written when the block ends. legend: share of the height for one
-    legend below all.
+    """Yields the axes of plots side by side, and writes the figure when the block ends.
+
+    Args:
+        path: file to write
+        columns: number of plots
+        size: width and height in inches
+        legend: share of the height for one legend below all plots, 0: no legend
     """
     import matplotlib
 
@@ -284,7 +328,7 @@ def figure(
 
 
 def staircase(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Of (time, quality) the points that are better than all that are faster."""
+    """Returns those points (time, quality) that are better than all faster points."""
     steps: list[tuple[float, float]] = []
     for x, y in sorted(points, key=lambda point: (point[0], -point[1])):
         if not steps or y > steps[-1][1]:
