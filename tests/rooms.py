@@ -10,7 +10,8 @@ CORE = (
 WINGS = ("capture", "motion", "synthetic", "viewer")
 """Rooms that the core does not import."""
 NEEDS_WINGS = re.compile(
-    rf"humangs_jax\.({'|'.join((*WINGS, 'apps', 'cli'))})\b|from experiments|command_line|motion_cases"
+    rf"humangs_jax\.({'|'.join((*WINGS, 'apps', 'cli'))})\b"
+    r"|from experiments|command_line|motion_cases"
 )
 """What the text of a test has that looks at the core and a wing, or a command, together."""
 

@@ -195,7 +195,9 @@ BAD_USAGE = {
         "a file that holds the whole motion"
     ),
     "export me.npz --out x.ply --mesh": "expected a name ending in .glb, .vrma or .obj",
-    "export me.npz --out x.sog": "expected a name ending in .ply, .splat, .spz, .glb, .vrma or .obj",
+    "export me.npz --out x.sog": (
+        "expected a name ending in .ply, .splat, .spz, .glb, .vrma or .obj"
+    ),
     "export me.npz --out x.ply --motion jump.npz --frame 9": "--frame 9: jump.npz has 4 frames",
     "export me.npz --out x.spz --rest": "--rest: x.spz has no such fields",
     "export me.npz --out x.ply --spz-version 4": (
@@ -236,7 +238,9 @@ BAD_USAGE = {
     "fit someone --refine": "--refine: is called --to-masks now",
     "fit someone --to-masks --bare": "--bare: is called --tight-clothes now",
     "fit someone --tight-clothes": "--tight-clothes is for --to-masks, not for --keypoints",
-    "fit someone --to-masks --smoothness 0.1": "--smoothness is for --keypoints, not for --to-masks",
+    "fit someone --to-masks --smoothness 0.1": (
+        "--smoothness is for --keypoints, not for --to-masks"
+    ),
     f"{FIT} --smoothness -1 --out new": "--smoothness -1: expected at least 0",
 }
 REFUSED = [(line, cli.BAD_DATA, said) for line, said in BAD_DATA.items()]

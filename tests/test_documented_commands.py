@@ -73,7 +73,8 @@ def commands_of(path):
     for line, whole in lines:
         for part in re.split(SEPARATOR, line.split(" #")[0]):
             words = part.strip(' "').split(" ")
-            if program := PROGRAM.fullmatch(words[0]):
+            program = PROGRAM.fullmatch(words[0])
+            if program:
                 yield Command(path.name, (program[1], *shlex.split(" ".join(words[1:]))), whole)
 
 

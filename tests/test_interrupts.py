@@ -120,7 +120,11 @@ def test_a_run_that_saves_for_longer_than_our_patience_is_not_ended(tmp_path):
 def test_an_interrupt_that_python_drops_is_repeated():
     collecting = """
         import gc, time
-        gc.callbacks.append(lambda *_: done.append(1) or len(done) == 1 and signal.raise_signal(signal.SIGINT))
+        def interrupt_once(*_):
+            done.append(1)
+            if len(done) == 1:
+                signal.raise_signal(signal.SIGINT)
+        gc.callbacks.append(interrupt_once)
         gc.collect()
         time.sleep(300)
     """

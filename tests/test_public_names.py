@@ -45,7 +45,8 @@ avatar = hg.refine(hg.reconstruct(variables, config, capture), capture, steps=0)
 gaussians = hg.animate(avatar, capture.pose(0))
 splat = hg.plan_buffers(gaussians, capture.cameras[0])
 image = hg.render(gaussians, capture.cameras[0], splat).rgb
-ablation = hg.ablate("tiny", {"no token": {"model.architecture.encoder.transformer.class_token": False}})
+class_token = "model.architecture.encoder.transformer.class_token"
+ablation = hg.ablate("tiny", {"no token": {class_token: False}})
 gain = ablation.rows[0].difference
 """
 USED = (

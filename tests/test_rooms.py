@@ -21,12 +21,13 @@ sys.meta_path.insert(0, rooms.HiddenWings())
 import humangs_jax as hg
 
 root = pathlib.Path(hg.__file__).parent
-modules = [".".join(path.relative_to(root.parent).with_suffix("").parts) for path in root.rglob("*.py")]
-for name in modules:
+for path in root.rglob("*.py"):
+    name = ".".join(path.relative_to(root.parent).with_suffix("").parts)
     if name.split(".")[1] in rooms.CORE and not name.endswith("__init__"):
         __import__(name)
-hidden = [name for name in sys.modules if name.split(".")[1:2] and name.split(".")[1] in rooms.WINGS]
-assert not [name for name in hidden if name.startswith("humangs_jax.")], hidden
+ours = [name for name in sys.modules if name.startswith("humangs_jax.")]
+hidden = [name for name in ours if name.split(".")[1] in rooms.WINGS]
+assert not hidden, hidden
 print("alone")
 """
 

@@ -75,9 +75,8 @@ def test_windows_lie_around_the_person_and_show_the_same(masks):
 
 
 def test_a_window_stays_in_the_photo():
-    close, corners = around_person(
-        capture := hall(middles=((5, 5), (398, 298))), {0: boxes().template}
-    )
+    capture = hall(middles=((5, 5), (398, 298)))
+    close, corners = around_person(capture, {0: boxes().template})
     size = np.asarray([close.cameras.width, close.cameras.height])
     assert (
         (corners >= 0).all()

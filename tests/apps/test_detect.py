@@ -403,7 +403,7 @@ def test_two_photos_never_share_a_mask(tmp_path):
 
 
 def test_others_hide_the_person_where_they_stand_unless_they_are_behind(tmp_path):
-    """What is hidden is written beside the masks of a capture, and without the mask's own pixels."""
+    """Hidden pixels are written beside the masks of a capture, without the mask's own pixels."""
     person, other = found(1, 90.0), found(2, 80.0, corner=(7, 12))
     shown = photo("a", person, other)
     hidden = detect.hidden_by_others(shown, 0)

@@ -219,7 +219,8 @@ def test_what_is_missing_is_found_in_the_photos_and_what_is_given_wins(
     names, mine, detected, capsys
 ):
     shutil.rmtree(mine)
-    write_material(mine, truth := load_capture("demo_capture"), landmarks_in(truth))
+    truth = load_capture("demo_capture")
+    write_material(mine, truth, landmarks_in(truth))
     without(mine, *names)
     options = ["--person", "1"] if len(names) == 2 else []  # what is given says who is meant
     assert cli.execute(["start", str(mine), "--out", "me", *options]) == cli.BAD_DATA
@@ -394,7 +395,8 @@ def test_what_is_no_video_of_a_person_is_one_line(tmp_path, monkeypatch, capsys)
         for name, content in files.items():
             Path("clips", name).write_bytes(content)
         assert cli.execute(["start", "clips", "--out", "me"]) == cli.BAD_DATA
-        assert problem in (said := capsys.readouterr().err) and said.count("\n") == 1
+        message = capsys.readouterr().err
+        assert problem in message and message.count("\n") == 1
         assert list(Path().iterdir()) == [Path("clips")]
 
 
@@ -445,7 +447,8 @@ def test_masks_that_are_there_may_be_left_out(mine, capsys):
 def test_a_notebook_reads_the_same_steps(mine, detected):
     """Each is printed as `humangs start` shows it; what is wrong is an error with the argument."""
     shutil.rmtree(mine)
-    write_material(mine, truth := load_capture("demo_capture"), landmarks_in(truth))
+    truth = load_capture("demo_capture")
+    write_material(mine, truth, landmarks_in(truth))
     without(mine, "keypoints")
     steps = []
     with pytest.raises(ValueError, match="the fit"):
@@ -464,7 +467,8 @@ def test_from_photos_to_the_page(mine, capsys, monkeypatch):
     import webbrowser
 
     shutil.rmtree(mine)
-    write_material(mine, truth := load_capture("demo_capture"), landmarks_in(truth))
+    truth = load_capture("demo_capture")
+    write_material(mine, truth, landmarks_in(truth))
     opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
     assert cli.execute(["start", str(mine), "--out", "me"]) == 0, capsys.readouterr().err

@@ -33,7 +33,7 @@ def seen_at(x, side=16.0):
 
 
 class Scene:
-    """A detector of this test: a large person walks to the right, a smaller one stands at the left."""
+    """A made-up detector: a large person walks to the right, a smaller one stands at the left."""
 
     def __init__(self):
         self.looks, self.frame, self.hidden, self.stop = 0, -1, (), None

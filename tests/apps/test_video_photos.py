@@ -30,7 +30,7 @@ def seen_person(world):
 
 @pytest.fixture
 def clip(tmp_path, monkeypatch):
-    """A video of noise in which somebody is seen who turns once around, by a detector of this test."""
+    """A video of noise, and a made-up detector that sees a person in it who turns once around."""
     frames = np.random.default_rng(0).uniform(0, 1, (COUNT, 32, 32, 3))
     write_video(tmp_path / "me.mp4", list(frames), 10)
     world = turning(np.linspace(0, 2 * np.pi, COUNT, endpoint=False))

@@ -314,7 +314,8 @@ def test_numbers_that_files_cannot_hold_are_not_written(name, tmp_path):
             replace(own, colors=colors),
         ]
         people = [replace(avatar, gaussians=gaussians) for gaussians in wrong]
-        if mesh := name.startswith("mesh"):
+        mesh = name.startswith("mesh")
+        if mesh:
             people = [
                 people[2],
                 replace(avatar, rest_vertices=avatar.rest_vertices.at[0, 0].set(value)),

@@ -327,9 +327,11 @@ def test_khronos_validator_finds_nothing(tmp_path):
     write_glb(tmp_path / "gaussians.glb", avatar().gaussians)
     found = {}
     for name in ("mesh", "gaussians"):
+        file = json.dumps(str(tmp_path / f"{name}.glb"))
         program = f"""const validator = require({json.dumps(str(VALIDATOR.resolve()))});
-        const data = new Uint8Array(require("fs").readFileSync({json.dumps(str(tmp_path / f"{name}.glb"))}));
-        validator.validateBytes(data).then((report) => console.log(JSON.stringify(report.issues.messages)));"""
+        const data = new Uint8Array(require("fs").readFileSync({file}));
+        validator.validateBytes(data)
+          .then((report) => console.log(JSON.stringify(report.issues.messages)));"""
         done = subprocess.run(["node", "-e", program], capture_output=True, text=True, check=True)
         found[name] = json.loads(done.stdout)
     assert found["mesh"] == []
@@ -355,12 +357,15 @@ armature = next(part for part in bpy.data.objects if part.type == "ARMATURE")
 body = next(part for part in bpy.data.objects if part.type == "MESH" and part.vertex_groups)
 scene.frame_set(2)
 shown = body.evaluated_get(bpy.context.evaluated_depsgraph_get())
-save(f"{folder}/frame.npy", array([shown.matrix_world @ vertex.co for vertex in shown.to_mesh().vertices]))
+vertices = shown.to_mesh().vertices
+save(f"{folder}/frame.npy", array([shown.matrix_world @ vertex.co for vertex in vertices]))
 bpy.ops.export_scene.gltf(filepath=f"{folder}/theirs.glb", export_format="GLB")
 for part in bpy.data.objects:
     part.select_set(part is armature)
 bpy.context.view_layer.objects.active = armature
-bpy.ops.export_anim.bvh(filepath=f"{folder}/theirs.bvh", frame_start=0, frame_end=3, rotate_mode="NATIVE")
+bpy.ops.export_anim.bvh(
+    filepath=f"{folder}/theirs.bvh", frame_start=0, frame_end=3, rotate_mode="NATIVE"
+)
 """
 
 

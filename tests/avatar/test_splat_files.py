@@ -57,8 +57,10 @@ CASES = [(suffix, count) for suffix in STEPS for count in COUNTS if suffix != ".
 def test_what_is_saved_comes_back_and_stays(suffix, count, tmp_path):
     """A second time nothing changes: the steps of the format are taken once."""
     path, again = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
-    hg.save_gaussians(path, before := scene(count))
-    hg.save_gaussians(again, back := hg.load_gaussians(path))
+    before = scene(count)
+    hg.save_gaussians(path, before)
+    back = hg.load_gaussians(path)
+    hg.save_gaussians(again, back)
     assert_close(back, before, STEPS[suffix])
     assert_close(hg.load_gaussians(again), back, (2e-6, 0.01, 1e-6, 1e-6, 1e-6))
     assert_close(
@@ -73,7 +75,8 @@ def test_what_is_saved_comes_back_and_stays(suffix, count, tmp_path):
 @pytest.mark.parametrize("suffix", STEPS)
 def test_worlds_with_y_up_come_back_and_stand_upright_everywhere(suffix, tmp_path):
     """The head of a person who is exported is above the feet for viewers of every format."""
-    hg.save_gaussians(tmp_path / f"a{suffix}", before := scene(), y_up=True)
+    before = scene()
+    hg.save_gaussians(tmp_path / f"a{suffix}", before, y_up=True)
     assert_close(hg.load_gaussians(tmp_path / f"a{suffix}", y_up=True), before, STEPS[suffix])
     plain = np.asarray(hg.load_gaussians(tmp_path / f"a{suffix}").means)
     sign = -1 if suffix in (".ply", ".splat") else 1  # y of what viewers read
@@ -451,7 +454,10 @@ BAD = {
         "limit parts",
     ),
     "glb of a node in itself": (lambda: glb(scene(), {"children": [0]}), "lies below itself"),
-    "text": (lambda: b"hello", "expected a file ending in .ply, .splat, .spz, .glb, .sog, .pt, .pth or .ckpt"),
+    "text": (
+        lambda: b"hello",
+        "expected a file ending in .ply, .splat, .spz, .glb, .sog, .pt, .pth or .ckpt",
+    ),
 }  # fmt: skip
 
 
@@ -547,7 +553,7 @@ def test_gaussians_that_are_not_finite_are_left_out_and_counted(suffix, tmp_path
 
 @pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
 def test_the_smoothing_filter_of_mip_splatting_is_in_scales_and_opacities(form, tmp_path):
-    """By the formula of Mip-Splatting's `save_fused_ply`: the filter has twenty scales, 0 among them."""
+    """By the formula of Mip-Splatting's `save_fused_ply`, for twenty filter sizes from 0 on."""
     kept, filters = scene(), np.arange(20)[:, None] / 40
     (tmp_path / "a.ply").write_bytes(ply(kept, form=form, extra={"filter_3D": filters[:, 0]}))
     scales, found = np.asarray(kept.scales, np.float64), hg.load_gaussians(tmp_path / "a.ply")

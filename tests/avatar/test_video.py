@@ -185,7 +185,8 @@ def test_frames_are_taken_one_by_one(tmp_path, name):
 
     def drawn():
         for frame in frames:
-            alive.append(weakref.ref(copy := frame.copy()))
+            copy = frame.copy()
+            alive.append(weakref.ref(copy))
             yield copy
             del copy
             assert sum(each() is not None for each in alive) <= 2

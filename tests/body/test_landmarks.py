@@ -86,9 +86,7 @@ def test_a_place_is_beside_its_joint_and_turns_with_its_bones(small, joints, tur
         np.testing.assert_array_equal(nose, same)
 
 
-def test_a_place_beside_a_vertex_is_carried_by_the_same_bones_and_one_of_joints_that_a_body_lacks_is_ignored(
-    small,
-):
+def test_places_beside_a_vertex_move_with_its_bones_and_those_of_missing_joints_are_ignored(small):
     names = ("left_index_tip", "nose")
     places = (
         LandmarkDefinition(names[0], names[0], (0.0, 0.01, 0.0)),
@@ -125,7 +123,8 @@ def test_mirror_images_share_one_offset_with_x_turned_round(body, kind):
     x = {name: at_rest(model)[i, 0] for i, name in enumerate(model.names)}
     for name, (group, side) in groups.items():
         assert groups[mirrored_name(name)][0] == group
-        if (other := mirrored_name(name)) != name:
+        other = mirrored_name(name)
+        if other != name:
             np.testing.assert_allclose(moved[other], moved[name] * [-1, 1, 1], atol=1e-6)
             assert side * x[name] > 0, name
 

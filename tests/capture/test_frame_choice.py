@@ -1,4 +1,4 @@
-"""Frames of a video by the way the person faces: even over the directions, sharp, of usual poses."""
+"""Frames of a video are chosen evenly over the directions, sharp, and of usual poses."""
 
 import numpy as np
 import pytest

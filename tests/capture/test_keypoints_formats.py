@@ -200,12 +200,11 @@ def test_nobody_is_found_in_a_view(tool, tmp_path):
     values = known(67 if tool == "openpose" else 17)
     for name, each in zip(NAMES, values, strict=True):
         nobody = name == "back"
-        people = (
-            openpose(*[] if nobody else [openpose_person(each)])
-            if tool == "openpose"
-            else instances(each)
-        )
-        write(tmp_path / f"{name}.json", [] if nobody and tool == "mmpose" else people)
+        if tool == "openpose":
+            content = openpose() if nobody else openpose(openpose_person(each))
+        else:
+            content = [] if nobody else instances(each)
+        write(tmp_path / f"{name}.json", content)
     keypoints = read(tmp_path)
     assert keypoints.missing == ("back",) and not keypoints.confidences[1].any()
     np.testing.assert_array_equal(keypoints.points[[0, 2]], values[[0, 2], :, :2] + 0.5)

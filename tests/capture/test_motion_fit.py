@@ -20,8 +20,9 @@ BETAS = np.where(np.isin(np.arange(22), (4, 6)), 1.0, 0.0).astype(np.float32)
 
 
 def walker(frames):
-    """Somebody who walks before a camera that looks down by 10 degrees: joints in the camera's axes and
-    in the world, metres, and the keypoints of a detector with its noise.
+    """A person who walks before a camera that looks down by 10 degrees.
+
+    Returns the joints in the camera's axes and in the world, metres, and noisy keypoints.
     """
     walk, model = load_motion(), landmark_model(BODY, MEDIAPIPE_33.names, MEDIAPIPE_33.places)
     again = np.arange(frames) % len(walk.translations)

@@ -171,7 +171,7 @@ def test_at_the_minimum_nothing_near_it_costs_less(views):
         assert residuals(evidence, near, SCALE).cost > cost * (1 - 1e-7)
 
 
-def test_cameras_of_one_kind_keep_the_ratio_of_their_focal_lengths_and_kinds_do_not_move_each_other():
+def test_focal_lengths_of_one_kind_keep_their_ratio_and_kinds_do_not_move_each_other():
     evidence, rig = problem(4, known=2)
     one = moved(
         evidence,

@@ -359,7 +359,7 @@ def test_an_edge_before_the_body_is_no_boundary():
     assert len(boundary.positions) == COUNT and boundary.ends.max() < 4
 
 
-def test_a_disc_s_boundary_is_its_circle_to_a_tenth_of_a_pixel_without_specks_and_the_edge_of_the_image():
+def test_a_disc_s_boundary_is_its_circle_without_specks_and_the_edge_of_the_image():
     boundary = mask_boundary(disc(30.0), COUNT)
     offsets = boundary.positions - SIDE / 2
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), 30.0, atol=0.1)

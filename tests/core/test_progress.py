@@ -53,7 +53,8 @@ def test_errors_of_files_are_printable():
 def test_one_module_writes_to_the_terminal():
     """Else a call site could forget what `say` does."""
     writes = re.compile(
-        r"\bprint\(|std(out|err)\.write|\bbar\.write|tqdm\.write|os\.write\([12],|logging\.StreamHandler"
+        r"\bprint\(|std(out|err)\.write|\bbar\.write|tqdm\.write"
+        r"|os\.write\([12],|logging\.StreamHandler"
     )
     found = {
         f"{path.relative_to(PACKAGE)}: {line.strip()}"

@@ -236,10 +236,7 @@ def test_a_structure_comes_back_with_its_static_fields():
 
 @pytest.mark.wings
 def test_every_public_pytree_has_a_name_in_files_of_jax_export():
-    public = [
-        value
-        for name in hg.__all__
-        if isinstance(value := getattr(hg, name), type) and value in pytree._PYTREES
-    ]
+    values = [getattr(hg, name) for name in hg.__all__]
+    public = [value for value in values if isinstance(value, type) and value in pytree._PYTREES]
     assert len(public) >= 5
     assert {f"humangs_jax.{each.__name__}" for each in public} <= set(pytree._EXPORTABLE)

@@ -124,9 +124,12 @@ def person():
     rest = shape_body(body, jnp.zeros(0))
     g = len(body.template)
     gaussians = Gaussians(
-        rest.vertices, jnp.tile(f32([1, 0, 0, 0]), (g, 1)), jnp.full((g, 3), 0.004), jnp.full(g, 0.9),
-        jnp.full((g, 3), 0.5),
-    )  # fmt: skip
+        means=rest.vertices,
+        quats=jnp.tile(f32([1, 0, 0, 0]), (g, 1)),
+        scales=jnp.full((g, 3), 0.004),
+        opacities=jnp.full(g, 0.9),
+        colors=jnp.full((g, 3), 0.5),
+    )
     return Avatar(
         gaussians, body.skinning_weights, rest.vertices, rest.joints, body.faces, body.parents,
         body.joint_names,
@@ -168,8 +171,8 @@ def test_an_exported_body_has_the_shapes_as_morph_targets(tmp_path, talking, mon
     vertices, n = np.asarray(avatar.rest_vertices), len(avatar.rest_vertices)
     flat = mesh.BodyMesh(
         vertices, np.tile(np.float32([0, 0, 1]), (n, 1)), np.asarray(avatar.faces),
-        np.zeros((n, 2), np.float32), np.zeros((4, 4, 3), np.uint8), np.asarray(avatar.skinning_weights),
-        np.arange(n),
+        np.zeros((n, 2), np.float32), np.zeros((4, 4, 3), np.uint8),
+        np.asarray(avatar.skinning_weights), np.arange(n),
     )  # fmt: skip
     mesh.write_mesh_glb(tmp_path / "talk.glb", avatar, flat, talking)
     data = (tmp_path / "talk.glb").read_bytes()

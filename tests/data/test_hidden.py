@@ -1,4 +1,7 @@
-"""Pixels where somebody may stand in front of the person: nothing is concluded from them, and they are kept with a capture."""
+"""Pixels where somebody may stand in front of the person.
+
+Nothing is concluded from them, and they are kept with a capture.
+"""
 
 import dataclasses
 
@@ -22,7 +25,10 @@ from humangs_jax.refinement.photos import crop_to_person, photos_of
 
 @pytest.fixture
 def hidden(demo):
-    """The demo with a bar before the left half of the person in the first photo: the same masks without it, and unknown."""
+    """The demo with a bar before the left half of the person in the first photo.
+
+    Pixels of the bar are unknown, white, and outside of the mask.
+    """
     unknown = np.zeros(demo.masks.shape, bool)
     columns = np.flatnonzero((demo.masks[0] > 0.5).any(0))
     left, right = columns[0] - 4, (columns[0] + columns[-1]) // 2

@@ -109,9 +109,9 @@ def test_leaving_the_loop_ends_all_threads():
     next(steps)
     steps.close()
     deadline = time.time() + 10
-    while (left := set(threading.enumerate()) - before) and time.time() < deadline:
+    while set(threading.enumerate()) - before and time.time() < deadline:
         time.sleep(0.05)
-    assert not left
+    assert not set(threading.enumerate()) - before
 
 
 SHARDED = """
@@ -126,10 +126,13 @@ for spec in (PartitionSpec("data"), PartitionSpec(("data", "model")), PartitionS
     loader = Loader(CountingSource(), 4, seed=1, sharding=NamedSharding(mesh, spec))
     assert loader.rows == (0, 1, 2, 3)
     (_, batch), = loader.batches(3, 4)
-    assert all(leaf.sharding.is_equivalent_to(loader.sharding, leaf.ndim) for leaf in jax.tree.leaves(batch))
+    for leaf in jax.tree.leaves(batch):
+        assert leaf.sharding.is_equivalent_to(loader.sharding, leaf.ndim)
     assert same(batch, plain.batch_at(3))
+    last = mesh.devices[-1, -1]
+    rows = lambda x: loader.sharding.devices_indices_map(x.shape)[last]
     assert same(jax.tree.map(lambda x: x.addressable_shards[-1].data, batch),
-                jax.tree.map(lambda x: x[loader.sharding.devices_indices_map(x.shape)[mesh.devices[-1, -1]]], batch))
+                jax.tree.map(lambda x: x[rows(x)], batch))
 
 
 class Half:

@@ -141,9 +141,7 @@ def before_a_wall(colors, masks, rim=0.0, color=WALL, where=True):
 @pytest.mark.parametrize("rim", [2.0, 4.0])
 @pytest.mark.parametrize("kind", ["rim light", "piping", "on one side"])
 def test_exact_masks_stay_where_the_rim_looks_like_the_wall(person, kind, rim):
-    """A stripe of the color of the wall is found by the fingers, which a mask that is too large would
-    not have.
-    """
+    """A stripe of the wall's color is no sign that the mask is too large: the fingers show that."""
     colors, masks = person
     side = np.arange(masks.shape[2]) < np.median(np.nonzero(masks > 0.5)[2])
     how = {"rim light": {"color": 0.97}, "piping": {}, "on one side": {"where": side}}[kind]

@@ -109,9 +109,13 @@ def test_the_centred_window(seed):
     for (first, last), size, side in zip(bounds(mask > 0), wanted, mask.shape, strict=True):
         before = (size - (last + 1 - first)) // 2
         after = size - (last - first) - before
-        corner.append(
-            0 if first - before < 0 else side - size if last + after > side else first - before
-        )
+        # a window that would reach beyond the image is moved to its edge
+        if first - before < 0:
+            corner.append(0)
+        elif last + after > side:
+            corner.append(side - size)
+        else:
+            corner.append(first - before)
     expected = image[corner[0] : corner[0] + 70, corner[1] : corner[1] + 30]
     found = CentredWindow(70, 30, 100).cut(image, mask, 0.0)
     assert found.shape == (70, 30, 3)

@@ -50,7 +50,8 @@ def browser(found, tmp_path_factory):
 def column(browser, heading):
     """The cells of a column of the images, as shown."""
     return browser.run(
-        f"""const heads = [...document.querySelectorAll('#images th')].map((head) => head.textContent);
+        f"""const heads = [...document.querySelectorAll('#images th')]
+          .map((head) => head.textContent);
         return {TABLE}.map((row) => row.cells[heads.indexOf(given[0])].textContent);""",
         heading,
     )
@@ -84,7 +85,8 @@ def test_images_load_and_grow(browser):
     pictures = browser.run(
         f"""for (const image of document.images) image.loading = "eager";
         await Promise.all([...document.images].map((image) => image.decode()));
-        return {TABLE}.map((row) => [...row.querySelectorAll("img")].map((image) => image.naturalWidth));"""
+        const widths = (row) => [...row.querySelectorAll("img")].map((image) => image.naturalWidth);
+        return {TABLE}.map(widths);"""
     )
     assert [len(row) for row in pictures] == [5] * 5 + [0] and min(
         min(row) for row in pictures[:5]

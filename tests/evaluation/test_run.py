@@ -29,7 +29,7 @@ from humangs_jax.io.images import write_png
 
 NAMES = ("front", "left", "back", "right")
 evaluate = functools.partial(hg.evaluate, protocol="lhm")
-"""Of all protocols the one whose LPIPS no package brings: that of VGG takes most of the time here."""
+"""No package has the LPIPS network of this protocol, so that no time is spent on it here."""
 
 
 @pytest.fixture(scope="module")

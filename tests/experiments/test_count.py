@@ -73,7 +73,10 @@ def test_a_module_is_counted():
 
 
 def test_tokens_are_code_without_comments_docstrings_and_layout():
-    text = '"""A module."""\n\nx = 1  # one\n\n\ndef f(a):\n    """A function."""\n    return "a" + a\n'
+    text = (
+        '"""A module."""\n\nx = 1  # one\n\n\n'
+        'def f(a):\n    """A function."""\n    return "a" + a\n'
+    )
     assert code_tokens(text) == len(
         ["x", "=", "1", "def", "f", "(", "a", ")", ":", "return", "'a'", "+", "a"]
     )

@@ -9,9 +9,11 @@ from experiments.real_capture import VideoCamera, background, careful_mask, read
 PIXEL = 1e-6
 CALIBRATION = """<calibration><cameras><camera serial="cam07">
 <fov_video bottom="1919" left="8" right="1087" top="0"/>
-<transform r11="1" r12="0" r13="0" r21="0" r22="0" r23="1" r31="0" r32="-1" r33="0" x="0" y="-3000" z="1500"/>
-<intrinsic centerPointU="34560" centerPointV="61440" focalLengthU="107520" focalLengthV="107520" radialDistortion1="-0.05"
- radialDistortion2="0.1" tangentalDistortion1="0.001" tangentalDistortion2="0.002"/></camera></cameras></calibration>"""
+<transform r11="1" r12="0" r13="0" r21="0" r22="0" r23="1" r31="0" r32="-1" r33="0"
+ x="0" y="-3000" z="1500"/>
+<intrinsic centerPointU="34560" centerPointV="61440" focalLengthU="107520" focalLengthV="107520"
+ radialDistortion1="-0.05" radialDistortion2="0.1"
+ tangentalDistortion1="0.001" tangentalDistortion2="0.002"/></camera></cameras></calibration>"""
 
 
 def test_a_camera_of_the_file_looks_at_what_is_before_it(tmp_path):

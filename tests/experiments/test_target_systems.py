@@ -148,7 +148,7 @@ def test_every_target_is_its_own_pass_and_the_order_of_photos_is_irrelevant(name
 
 
 @pytest.mark.slow
-def test_body_and_pose_change_nothing_of_lvsm_and_the_target_s_position_map_tells_humanram_the_pose():
+def test_humanram_knows_the_pose_from_the_target_s_position_map_and_lvsm_knows_none():
     for name, differs in (("lvsm", False), ("humanram", True)):
         variables, inputs = random_variables(small(name)), inputs_of(name)
         images = [drawing(name)(variables, inputs, asked) for asked in (QUERIES, OTHER_POSE)]

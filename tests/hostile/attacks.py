@@ -1,5 +1,7 @@
-"""The table of attacks: files that would run code, leave their folder, or cost more than they weigh,
-and files whose numbers no person has.
+"""The table of attacks: files that a reader must refuse.
+
+They would run code, write outside of their folder, cost more memory or time than their size allows,
+or hold numbers that no person has.
 
 `ATTACKS` has a row for each: name, reader of `readers.FORMATS`, maker of the file, and what may
 happen to it.
@@ -121,7 +123,7 @@ def with_values(reader, changes):
 
 
 def with_arrays(reader, **changes):
-    """The valid arrays of a reader, some exchanged, or by functions of the old ones; no checksum."""
+    """The valid arrays of a reader without checksum, some replaced by a value or by a function."""
 
     def change(data):
         with np.load(io.BytesIO(data)) as archive:

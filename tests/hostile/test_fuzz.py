@@ -70,9 +70,9 @@ def of_pickle(draw, data):
 
 def places(value, path=()):
     yield path
-    keys = (
-        value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
-    )
+    keys = value if isinstance(value, dict) else ()
+    if isinstance(value, list):
+        keys = range(len(value))
     for key in keys:
         yield from places(value[key], (*path, key))
 

@@ -1,5 +1,7 @@
-"""What reading a file may do: no program, no connection, no writing outside of the file's folder, and
-bounded memory and time.
+"""Watches what reading a file does.
+
+A reader may start no program, open no connection, write only in the file's folder, and take bounded
+memory and time.
 """
 
 import contextlib

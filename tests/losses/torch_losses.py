@@ -77,7 +77,11 @@ def features(name, image):
     used = {key: torch.from_numpy(x) for key, x in made_up_state(name).items()}
     missing, unexpected = layers.load_state_dict(used, strict=False)
     assert not unexpected and all(int(key.split(".")[0]) >= cuts[-1] for key in missing)
-    return [image := layers[start:end](image) for start, end in zip((0, *cuts), cuts, strict=False)]
+    found = []
+    for start, end in zip((0, *cuts), cuts, strict=False):
+        image = layers[start:end](image)
+        found.append(image)
+    return found
 
 
 def colors(*values):

@@ -290,7 +290,8 @@ def test_a_body_of_other_joints_is_refused_by_name(tmp_path):
     (tmp_path / "walk.fbx").write_text("Kaydara")
     with pytest.raises(
         MotionError,
-        match=r"expected a file .npz, .pkl, .pickle, .*, .bvh, .glb, .vrma, .csv or a folder, got .fbx",
+        match=r"expected a file .npz, .pkl, .pickle, .*, .bvh, .glb, .vrma, .csv or a folder, "
+        r"got .fbx",
     ):
         load_motion(tmp_path / "walk.fbx")
 

@@ -32,9 +32,11 @@ def by_scipy(d, degree):
     for n in range(1, degree + 1):
         for m in range(-n, n + 1):
             value = sph_harm_y(n, abs(m), theta, phi)
-            found.append(
-                value.real if m == 0 else np.sqrt(2) * (value.real if m > 0 else value.imag)
-            )
+            if m:
+                part = value.real if m > 0 else value.imag
+                found.append(np.sqrt(2) * part)
+            else:
+                found.append(value.real)
     return np.stack(found, axis=-1)
 
 

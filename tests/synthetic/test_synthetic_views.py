@@ -254,7 +254,7 @@ def test_the_splits_share_no_seed():
 
 
 def test_nobody_is_written_beyond_the_end_of_a_split(tmp_path, monkeypatch):
-    fast(monkeypatch, made := [])
+    fast(monkeypatch, [])
     with pytest.raises(ValueError, match="reach beyond the split"):
         writer.write_set(
             tmp_path, 3, LAYOUT, "test", len(SPLITS["test"]) - 2, body=BODY, progress=False

@@ -239,7 +239,8 @@ def test_gradients_are_known_where_a_stage_takes_and_gives():
             )
         return terms["a"] + terms["b"], recorder.given
 
-    loss(recorder=(dry := Recorder()))
+    dry = Recorder()
+    loss(recorder=dry)
     assert list(dry.given) == ["reader.first", "reader.second", "reader", "loss: a", "loss: b"]
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), dry.shapes)
     sent = jax.grad(lambda probes: loss(probes)[0])(zeros)
@@ -308,7 +309,8 @@ def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, t
     assert diagnosis.step == 3 and first_failed_step(tmp_path / "log.jsonl") == 3
     assert diagnosis.fault is not None and diagnosis.fault.leaf.name == "targets.images"
     (tmp_path / "log.jsonl").write_text("")
-    assert (healthy := diagnose_run(tmp_path, body, source(99))).step == 5 and healthy.fault is None
+    healthy = diagnose_run(tmp_path, body, source(99))
+    assert healthy.step == 5 and healthy.fault is None
 
 
 @pytest.mark.slow

@@ -194,11 +194,13 @@ def test_keys_and_mouse_do_what_the_help_says(browser):
 def drop(browser, name, content):
     """Drops a file; returns the page's words about it."""
     return browser.run(
-        """const bytes = Uint8Array.from(atob(given[1]), (c) => c.charCodeAt(0)), data = new DataTransfer();
+        """const bytes = Uint8Array.from(atob(given[1]), (c) => c.charCodeAt(0));
+        const data = new DataTransfer();
         data.items.add(new File([bytes], given[0]));
         document.getElementById("message").textContent = "";
         window.dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true }));
-        while (!document.getElementById("message").textContent) await new Promise((resolve) => setTimeout(resolve, 20));
+        while (!document.getElementById("message").textContent)
+          await new Promise((resolve) => setTimeout(resolve, 20));
         return document.getElementById("message").textContent;""",
         name,
         base64.b64encode(content).decode(),
@@ -313,7 +315,8 @@ def test_a_dropped_glb_moves_and_its_other_animations_are_offered(browser, avata
         const select = document.getElementById("clip");
         select.value = "1";
         select.dispatchEvent(new Event("change"));
-        while (!document.getElementById("message").textContent) await new Promise((resolve) => setTimeout(resolve, 20));"""
+        while (!document.getElementById("message").textContent)
+          await new Promise((resolve) => setTimeout(resolve, 20));"""
     )
     np.testing.assert_allclose(
         matrices(shown_pose(browser, 2)[0]), matrices(clips[1][2]), atol=ANGLE

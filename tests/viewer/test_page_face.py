@@ -31,9 +31,12 @@ def person():
     rest = shape_body(body, jnp.zeros(0))
     g = len(body.template)
     gaussians = Gaussians(
-        rest.vertices, jnp.tile(f32([1, 0, 0, 0]), (g, 1)), jnp.full((g, 3), 0.004), jnp.full(g, 0.9),
-        jnp.full((g, 3), 0.5),
-    )  # fmt: skip
+        means=rest.vertices,
+        quats=jnp.tile(f32([1, 0, 0, 0]), (g, 1)),
+        scales=jnp.full((g, 3), 0.004),
+        opacities=jnp.full(g, 0.9),
+        colors=jnp.full((g, 3), 0.5),
+    )
     avatar = Avatar(
         gaussians, body.skinning_weights, rest.vertices, rest.joints, body.faces, body.parents,
         body.joint_names,
@@ -102,9 +105,10 @@ def test_the_script_moves_what_python_moves(person, shapes, tmp_path):
         page_script("kinematics", "face")
         + f"""
 const scene = JSON.parse(require("fs").readFileSync({json.dumps(str(tmp_path / "scene.json"))}));
-scene.means = Float32Array.from(scene.means); scene.shapedMeans = Float32Array.from(scene.shapedMeans);
-const changed = applyFace(scene, {json.dumps(expression)});
-console.log(JSON.stringify([changed, Array.from(scene.means), applyFace(scene, {json.dumps(expression)})]));
+scene.means = Float32Array.from(scene.means);
+scene.shapedMeans = Float32Array.from(scene.shapedMeans);
+const changed = applyFace(scene, {json.dumps(expression)}), means = Array.from(scene.means);
+console.log(JSON.stringify([changed, means, applyFace(scene, {json.dumps(expression)})]));
 """
     )
     (tmp_path / "page.js").write_text(code)

@@ -102,7 +102,8 @@ def saved(browser, button):
         document.getElementById(given[0]).click();
         while (!saved[0]?.name) await new Promise((resolve) => setTimeout(resolve, 20));
         const bytes = new Uint8Array(await saved[0].blob.arrayBuffer());
-        return [saved[0].name, btoa(bytes.reduce((text, byte) => text + String.fromCharCode(byte), ""))];""",
+        const text = bytes.reduce((text, byte) => text + String.fromCharCode(byte), "");
+        return [saved[0].name, btoa(text)];""",
         button,
     )
     return name, base64.b64decode(content)
@@ -145,7 +146,8 @@ def visible(browser, ids):
 def lower_the_resolution(browser):
     """Play as on a machine that is too slow, until the page has halved its resolution."""
     return browser.run(
-        """const canvas = document.getElementById("view"), slow = (time) => { while (performance.now() < time); };
+        """const canvas = document.getElementById("view");
+        const slow = (time) => { while (performance.now() < time); };
         document.querySelector("[data-mode=motion]").click();
         if (!document.body.classList.contains("playing")) document.getElementById("play").click();
         for (let i = 0; i < 120 && canvas.width > 0.5 * innerWidth; i++) {
@@ -297,7 +299,8 @@ def drop(browser, name, **arrays):
     content = io.BytesIO()
     np.savez(content, **arrays)
     browser.run(
-        """const bytes = Uint8Array.from(atob(given[1]), (c) => c.charCodeAt(0)), data = new DataTransfer();
+        """const bytes = Uint8Array.from(atob(given[1]), (c) => c.charCodeAt(0));
+        const data = new DataTransfer();
         data.items.add(new File([bytes], given[0]));
         window.dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true }));""",
         name,

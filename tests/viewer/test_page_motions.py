@@ -37,7 +37,8 @@ scene.order = jointOrder(scene.parents);
   const found = [];
   for (const [name, content, rate, clip] of given.files) {
     const bytes = Buffer.from(content, "base64");
-    const file = { name, size: bytes.length, arrayBuffer: async () => new Uint8Array(bytes).buffer };
+    const arrayBuffer = async () => new Uint8Array(bytes).buffer;
+    const file = { name, size: bytes.length, arrayBuffer };
     found.push(await readMotionFile(file, scene, rate ?? null, clip ?? 0)
       .catch(({ message, asksRate }) => ({ error: message, asksRate })));
   }
