@@ -1,7 +1,8 @@
-"""Chromium without a screen, drawing WebGL in software: for tests and measurements of the page that
-shows avatars.
+"""Runs Chromium without a screen, drawing WebGL in software, for tests and measurements of the page
+that shows avatars.
 
-Debian: `apt-get install chromium chromium-driver`; the Python side is selenium (extra `dev`).
+Debian installs it by `apt-get install chromium chromium-driver`. It is driven by selenium (extra
+`dev`).
 """
 
 import base64
@@ -20,7 +21,7 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
     "--force-color-profile=srgb",
     "--hide-scrollbars",
-    # it asks nobody for anything
+    # no requests of the browser itself
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-extensions",
@@ -29,11 +30,11 @@ FLAGS = (
     "--no-first-run",
 )
 PATIENCE = 300.0
-"""Seconds for a script: software WebGL on a busy machine."""
+"""Seconds that a script may take: software WebGL is slow on a busy machine."""
 
 
 def missing() -> str | None:
-    """Why there is no browser to test in; None if there is one."""
+    """Returns why there is no browser to test in, or None if there is one."""
     if not any(map(shutil.which, BROWSERS)) or not shutil.which("chromedriver"):
         return f"needs a browser ({', '.join(BROWSERS)}) and chromedriver on the PATH"
     try:
@@ -44,7 +45,7 @@ def missing() -> str | None:
 
 
 class Chromium:
-    """A browser with one page; a context manager."""
+    """A browser with one page. It is a context manager, which quits the browser."""
 
     def __init__(
         self, width: int = 1280, height: int = 800, pixel_ratio: float = 1.0, mobile: bool = False
@@ -75,7 +76,7 @@ class Chromium:
     def resize(
         self, width: int, height: int, pixel_ratio: float = 1.0, mobile: bool = False
     ) -> None:
-        """The size of the page in CSS pixels."""
+        """Sets the size of the page in CSS pixels, and the screen's pixels per CSS pixel."""
         metrics = {
             "width": width,
             "height": height,
@@ -85,9 +86,9 @@ class Chromium:
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
 
     def open(self, page: Path | str) -> None:
-        """Load a file or an address and wait for the first image.
+        """Loads a file or an address and waits for the first image.
 
-        Raises: RuntimeError with the page's own words.
+        Raises: RuntimeError with the message of the page.
         """
         self.driver.get(page.resolve().as_uri() if isinstance(page, Path) else page)
         problem = self.run("return humangs.ready.then(() => null, (error) => String(error))")
@@ -95,9 +96,11 @@ class Chromium:
             raise RuntimeError(problem)
 
     def run(self, script: str, *arguments: Any) -> Any:
-        """Run the body of an async function in the page; its value, promises awaited.
+        """Runs the body of an async function in the page and returns its value.
 
-        Raises: RuntimeError if it throws.
+        The script has the arguments as `given`. Promises are awaited.
+
+        Raises: RuntimeError if the script throws.
         """
         code = "const done = arguments[arguments.length - 1], given = [...arguments].slice(0, -1);"
         code += (
@@ -110,15 +113,16 @@ class Chromium:
         return value
 
     def screenshot(self) -> np.ndarray:
-        """What the window shows, (h, w, 3) in [0, 1]."""
+        """Returns what the window shows, (h, w, 3) in [0, 1]."""
         from PIL import Image
 
         data = base64.b64decode(self.driver.get_screenshot_as_base64())
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), np.float32) / 255
 
     def problems(self) -> list[str]:
-        """Errors and warnings on the console since the last call, but for notes on speed (tests
-        read pixels back).
+        """Returns the errors and warnings on the console since the last call.
+
+        Notes that reading pixels back is slow are left out, because tests do so on purpose.
         """
         entries = self.driver.get_log("browser")
         return [

@@ -1,15 +1,14 @@
-"""What a traced JAX program costs: multiplications and additions of its matrix products and
-convolutions, and what it sends.
+"""Counts what a traced JAX program costs: the multiplications and additions of its matrix products
+and convolutions, and the bytes that it sends between devices.
 
     costs = costs_of(jax.jit(f).trace(*arguments))
 
-XLA's own `cost_analysis()` counts the body of a loop once; here it counts as often as it runs. The
-program is counted as it is
-written: what nothing reads is left out, what XLA fuses makes no difference. Conditionals cost what
-their dearest branch does. A loop whose length depends on data counts once, and `unknown_trips` says
-how many there are. Zeros between the inputs of a transposed convolution do not count, so that the
-gradients of a convolution cost what it costs itself; padding does. Operations and messages inside
-of `shard_map` are those of one device.
+XLA's `cost_analysis()` counts the body of a loop once. Here it counts as often as it runs. The
+program is counted as it is written: what nothing reads is left out, and fusion by XLA makes no
+difference. A conditional costs what its most expensive branch costs. A loop whose length depends on
+data counts once, and `unknown_trips` is the number of such loops. Zeros between the inputs of a
+transposed convolution do not count, so that the gradients of a convolution cost as much as the
+convolution. Padding counts. Operations and messages inside of `shard_map` are those of one device.
 """
 
 import dataclasses
@@ -26,25 +25,29 @@ PASSES = {
     "pmin": 2,
     "all_to_all": 1,
 }
-"""Of each message, how often the whole array passes a device, but for its own share of it."""
+"""{kind of message: how often the array passes a device, except for the device's share of it}."""
 MEBI = 1 / 2**20
+"""MiB of a byte."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Costs:
-    """dots, convolutions: operations. messages: calls by kind. sent: bytes that one device sends,
-    by kind.
-    """
+    """Costs of a program, which can be added."""
 
     dots: int = 0
+    """Multiplications and additions of matrix products."""
     convolutions: int = 0
+    """Multiplications and additions of convolutions."""
     unknown_trips: int = 0
+    """Loops whose length depends on data."""
     messages: Counter = dataclasses.field(default_factory=Counter)
+    """{kind: number of messages}."""
     sent: Counter = dataclasses.field(default_factory=Counter)
+    """{kind: bytes that one device sends}."""
 
     @property
     def flops(self) -> int:
-        """Of products and convolutions."""
+        """Multiplications and additions of products and convolutions together."""
         return self.dots + self.convolutions
 
     def __add__(self, other: "Costs") -> "Costs":
@@ -53,7 +56,9 @@ class Costs:
         )
 
     def times(self, count: int) -> "Costs":
-        """That often."""
+        """Returns the costs of running the program this many times, with its loops of unknown
+        length counted once.
+        """
 
         def often(counter):
             return Counter({key: count * number for key, number in counter.items()})
@@ -68,7 +73,7 @@ class Costs:
 
 
 def costs_of(traced: Any) -> Costs:
-    """Costs of `jax.jit(f).trace(...)`."""
+    """Returns the costs of a program `jax.jit(f).trace(...)`."""
     from jax.interpreters.partial_eval import dce_jaxpr
 
     jaxpr = traced.jaxpr.jaxpr
@@ -76,20 +81,20 @@ def costs_of(traced: Any) -> Costs:
 
 
 def temporary_mb(compiled: Any) -> float:
-    """MiB that a compiled program needs besides its arguments and results."""
+    """Returns the MiB that a compiled program needs besides its arguments and results."""
     return MEBI * compiled.memory_analysis().temp_size_in_bytes
 
 
 def _of_jaxpr(jaxpr, devices) -> Costs:
-    return sum(
-        (_of_equation(equation, devices) for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns),
-        Costs(),
-    )
+    """Returns the costs of all equations of a program."""
+    equations = getattr(jaxpr, "jaxpr", jaxpr).eqns
+    return sum((_of_equation(equation, devices) for equation in equations), Costs())
 
 
 def _of_equation(equation, devices) -> Costs:
-    """devices: how many an axis of the mesh has."""
+    """Returns the costs of an equation. `devices` is {axis of the mesh: its number of devices}."""
     name, given, results = equation.primitive.name, equation.params, equation.outvars
+    # operations of one device
     if name == "dot_general":
         left = equation.invars[0].aval.shape
         contracted = math.prod(left[axis] for axis in given["dimension_numbers"][0][0])
@@ -97,35 +102,29 @@ def _of_equation(equation, devices) -> Costs:
     if name == "conv_general_dilated":
         kernel, spec = equation.invars[1].aval.shape, given["dimension_numbers"].rhs_spec
         taps = kernel[spec[1]] * math.prod(kernel[axis] for axis in spec[2:])
-        count = (
-            2
-            * results[0].aval.size
-            * taps
-            // math.prod(given["lhs_dilation"])
-            // given["batch_group_count"]
-        )
+        # zeros between the inputs do not count
+        skipped = math.prod(given["lhs_dilation"])
+        count = 2 * results[0].aval.size * taps // skipped // given["batch_group_count"]
         return Costs(convolutions=count)
+    # messages between devices
     if name in PASSES or name == "ppermute":
         return _message(equation, devices)
+    # loops, conditionals and calls of other programs
     if name == "scan":
         return _of_jaxpr(given["jaxpr"], devices).times(given["length"])
     if name == "while":
         parts = _of_jaxpr(given["cond_jaxpr"], devices) + _of_jaxpr(given["body_jaxpr"], devices)
         return parts + Costs(unknown_trips=1)
     if name == "cond":
-        return max(
-            (_of_jaxpr(branch, devices) for branch in given["branches"]),
-            key=lambda costs: costs.flops,
-        )
+        branches = [_of_jaxpr(branch, devices) for branch in given["branches"]]
+        return max(branches, key=lambda costs: costs.flops)
     if name == "shard_map":
         devices = devices | dict(given["mesh"].shape)
     return sum((_of_jaxpr(inner, devices) for inner in _inner(given)), Costs())
 
 
 def _inner(given):
-    """The programs that an equation calls; of a function with a custom gradient, the
-    function.
-    """
+    """Returns the programs that an equation calls. Custom gradients are left out."""
     for key in ("jaxpr", "call_jaxpr", "call"):
         if key in given:
             return [given[key]]
@@ -133,17 +132,18 @@ def _inner(given):
 
 
 def _message(equation, devices) -> Costs:
+    """Returns the message of an equation, and the bytes that each device sends for it."""
     name, given = equation.primitive.name, equation.params
     axes = given.get("axes", given.get("axis_name"))
-    named = [
-        axis for axis in (axes if isinstance(axes, tuple) else (axes,)) if not isinstance(axis, int)
-    ]
+    if not isinstance(axes, tuple):
+        axes = (axes,)
+    named = [axis for axis in axes if not isinstance(axis, int)]
     if not named:  # vmap has made it a sum over an axis of the array
         return Costs()
     size = math.prod(devices[axis] for axis in named)
-    whole = sum(x.aval.size * x.aval.dtype.itemsize for x in equation.invars) * (
-        size if name == "all_gather" else 1
-    )
+    whole = sum(x.aval.size * x.aval.dtype.itemsize for x in equation.invars)
+    if name == "all_gather":
+        whole *= size
     share = 1 if name == "ppermute" else PASSES[name] * (size - 1) / size
     kind = name.removesuffix("_invariant")
     return Costs(messages=Counter({kind: 1}), sent=Counter({kind: math.ceil(whole * share)}))

@@ -1,4 +1,4 @@
-"""How much code there is and how plain it is, counted from the files."""
+"""Counts from the files how much code there is and how plain it is."""
 
 import ast
 import inspect
@@ -22,45 +22,46 @@ FORMER_WINGS = (
     *("data/calibration", "data/keypoints", "data/motion"),
     *("detection", "fitting", "people"),
 )
-"""Where the files of the wings were before there were wings."""
+"""Folders that had the files of the wings in earlier revisions."""
 COLUMNS = 100
-"""Width from which on a line is too long."""
+"""Largest width of a line."""
 LONG = 30
-"""Lines from which on a function needs a comment."""
+"""Most lines of a function without a comment."""
 LAYOUT = {
     *(tokenize.COMMENT, tokenize.NL, tokenize.INDENT, tokenize.DEDENT),
     *(tokenize.ENCODING, tokenize.ENDMARKER),
 }
 """Kinds of tokens that are no code."""
 FSTRING_START = getattr(tokenize, "FSTRING_START", None)
-"""Begins an f-string, from Python 3.12 on; before, an f-string is one token."""
+"""Kind of the token that begins an f-string. Before Python 3.12 an f-string is one token."""
 FSTRING_END = getattr(tokenize, "FSTRING_END", None)
-"""Ends an f-string, from Python 3.12 on."""
+"""Kind of the token that ends an f-string, from Python 3.12 on."""
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 @entry
 def count(run: Run, before: str | None = None, details: bool = False, walks: bool = False) -> None:
-    """Code tokens, names, assignments, long lines, comments and described fields of the package,
-    and code tokens of its tests.
+    """Counts code tokens, names, assignments, long lines, comments and described fields of the
+    package, and code tokens of its tests.
 
-    Only files that git knows. Code tokens: without comments, docstrings and newlines. Names,
-    functions and classes: those of modules, without methods. Lines of a function: its body with
-    its docstring.
+    Only files that git knows are counted. Code tokens do not include comments, docstrings and
+    newlines. Names, functions and classes are those of modules, without methods. The lines of a
+    function are those of its body with its docstring.
 
     Tables: size
 
     Options:
-    before: commit, branch or tag whose numbers stand beside those of the files as they are
-    details: names of the long functions without a comment, and of the functions of walks
-    walks: also how many functions a datum enters, see `walked`; a minute, and of the files as they
-    are alone
+    before: commit, branch or tag whose numbers stand beside those of the present files
+    details: print the names of the long functions without a comment, and of the functions of walks
+    walks: also count the functions that a datum enters, see `walked`; takes a minute, and is done
+    for the present files only
     """
     columns = {} if before is None else {"before": measure(sources(REPOSITORY, before))}
     columns["now"] = measure(sources(REPOSITORY))
     if walks:
         columns["now"] |= all_walks()
 
+    # lists of names are printed, the table has their lengths
     if details:
         for name, value in columns["now"].items():
             if isinstance(value, list):
@@ -78,7 +79,7 @@ def count(run: Run, before: str | None = None, details: bool = False, walks: boo
 
 
 def _number(value: int | float | list[str]) -> int | float:
-    """Gives a value as a number: of a list of names how many there are."""
+    """Returns a value as a number, for a list of names their number."""
     return len(value) if isinstance(value, list) else value
 
 
@@ -223,17 +224,16 @@ def described_fields(node: ast.stmt) -> Iterator[bool]:
 
 
 def walked(call: Callable[[], object], *datum: type) -> list[str]:
-    """Functions of the package that a datum enters while `call` runs and JAX traces: each counts
-    once, wherever it is called.
+    """Runs `call` and returns the functions of the package that a datum enters, each once.
 
-    A function counts that gets an object of one of the classes as an argument, also in a tuple,
-    list or dict. Methods of the datum itself do not, nor lambdas, nor what only JAX calls, to take
-    pytrees apart.
+    A datum is an object of one of the classes. It enters a function as an argument, also inside of
+    a tuple, list or dict. Methods of the datum do not count, nor do lambdas and the functions that
+    JAX calls to flatten pytrees. Calls while JAX traces count too.
     """
     root, found = str(REPOSITORY / PACKAGE), {}
 
     def holds(value):
-        """Whether a value is the datum, or a tuple, list or dict of it."""
+        """Whether a value is a datum, or a tuple, list or dict with one inside."""
         inside = ()
         if isinstance(value, dict):
             inside = value.values()
@@ -244,6 +244,8 @@ def walked(call: Callable[[], object], *datum: type) -> list[str]:
         )
 
     def watch(frame: FrameType, event: str, _: object) -> None:
+        """Notes the function of a frame that is entered with a datum."""
+        # only functions of the package with a name
         code = frame.f_code
         inside = (
             code.co_filename.startswith(root)
@@ -267,8 +269,8 @@ def walked(call: Callable[[], object], *datum: type) -> list[str]:
 
 
 def all_walks() -> dict[str, list[str]]:
-    """The walks of photos to an avatar, of Gaussians to an image, and of a training example to the
-    loss.
+    """Returns {walk: functions that a datum enters} for three walks: from photos to an avatar, from
+    Gaussians to an image, and from a training example to the loss.
     """
     import jax
 
@@ -281,6 +283,7 @@ def all_walks() -> dict[str, list[str]]:
     from humangs_jax.training.config import tiny
     from humangs_jax.training.state import init_state
 
+    # a tiny network, small photos and one example
     config, capture = tiny(), hg.load_capture("demo_capture").resized(64)
     state = init_state(config)
     body, views = gaussian_body(capture.body, config.model), to_network_views(capture, 32)
@@ -305,10 +308,9 @@ def all_walks() -> dict[str, list[str]]:
     def loss():
         return jax.eval_shape(lambda state: step.train_step(state, batch, body, config), state)
 
+    # the step of training has compiler options, with which JAX cannot trace it alone
     traced = jax.jit(step.update, static_argnames=("config", "mesh"))
-    with mock.patch.object(
-        step, "compiled_update", lambda: traced
-    ):  # which cannot be traced alone: it has compiler options
+    with mock.patch.object(step, "compiled_update", lambda: traced):
         found["walk: an example to the loss"] = walked(
             loss, Example, SubjectViews, HumanGSInputs, Drawn
         )

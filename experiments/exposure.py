@@ -1,5 +1,5 @@
-"""Photos of one person in several lights that share no point of the body: how alike its colors come
-out.
+"""Measures how alike the colors of a person come out from photos in several lights that share no
+point of the body.
 """
 
 import dataclasses
@@ -40,21 +40,22 @@ from humangs_jax.synthetic.writer import View, capture_views, sample_pose
 LIGHT_STREAM, CAMERA_STREAM, BALANCE_STREAM = 101, 102, 103
 """Independent random streams of a seed."""
 BALANCE, METERING = (0.15, 0.05, 0.15), 0.15
-"""Standard deviations of the logarithms of a photo's white balance, red, green and blue, and of its
-exposure, besides those of its light."""
+"""Standard deviations of the logarithms of a photo's white balance (red, green and blue) and of its
+exposure. The light of the photo varies besides.
+"""
 AMBIENT = 0.85
-"""Brightness of a light without directions, in which a part has the color that it is painted in."""
+"""Brightness of a light without directions, which shows a part in the color of its texture."""
 SETS = {
     "front, back": (0, 180),
     "two of the front, two of the back": (0, 25, 180, 205),
     "left, right": (90, 270),
     "all around": (0, 90, 180, 270),
 }
-"""Degrees around the person, of its cameras."""
+"""{set of photos: degrees of its cameras around the person, 0: from the front}."""
 
 
 class Off(NamedTuple):
-    """How far the color of one side of the person is off that of the other, as logarithms."""
+    """Difference between the colors of two sides of a person, in logarithms."""
 
     tint: float
     """Root mean square over red, green and blue, without their mean."""
@@ -70,12 +71,13 @@ def exposure(
     size: int = 320,
     split: Literal["test", "validation"] = "test",
 ) -> None:
-    """Photos of one person, each in a light, white balance and exposure of another day: how far the
-    colors of one side are off those of the other.
+    """Measures how far the colors of one side of a person are off those of the other, in photos
+    that each have the light, white balance and exposure of another day.
 
-    Of the typical part of the body, against the same photos in one light without directions.
-    "Common points": what points that two photos both show say about their gains. "In one light": of
-    the same photos in one light the largest logarithm by which a gain of parts is not one.
+    The numbers are those of the typical part of the body, against the same photos in one light
+    without directions. "common points" corrects by the gains that points give which two photos
+    both show. "now" corrects by the gains of the package. "in one light" takes the same photos in
+    one light and shows the largest logarithm of the gains that parts add to those of common points.
 
     Options:
     subjects: how many people
@@ -96,6 +98,8 @@ def exposure(
         for seed in seeds_of(split, first, subjects)
     }
     rows = run.rows(cases, settings)
+
+    # root mean squares over the people, and the largest gain where none is needed
     table, numbers = [], {}
     for name in SETS:
         found = [row[name] for row in rows.values()]
@@ -119,7 +123,7 @@ def exposure(
 
 
 def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, object]]:
-    """Of each set of photos of a person what `exposure` shows."""
+    """Returns {set of photos: the numbers of a person that `exposure` shows}."""
     # cameras around the person, from the front on
     subject = make_subject(seed, body)
     posed = sample_pose(subject, 0)
@@ -130,7 +134,7 @@ def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, objec
     cameras = cameras_around(rng, posed.vertices, azimuth + np.radians(degrees), size)
 
     def photographed(lights: Sequence[Lights]) -> Capture:
-        """The photos, each in a light and as a moment."""
+        """Returns the photos from all cameras, each in its light and with a pose of its moment."""
         photos = []
         for i, light in enumerate(lights):
             lit = dataclasses.replace(subject, lights=light)
@@ -161,7 +165,8 @@ def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, objec
     rows = {}
     for name, angles in SETS.items():
         views = [degrees.index(angle) for angle in angles]
-        back = np.asarray([90 < angle < 270 or angle == 270 for angle in angles], int)
+        # "left, right" has its photos at 90 and 270 degrees, which are two sides
+        back = np.asarray([90 < angle <= 270 for angle in angles], int)
         photos = days.select(views)
         # how far colors of points are from their true ones, by what gives the gains
         colors, seen = points_of(photos)
@@ -185,14 +190,14 @@ def measured(seed: int, body: BodyModel, size: int) -> dict[str, dict[str, objec
 
 
 def other_day(subject: SyntheticSubject, rng: np.random.Generator) -> Lights:
-    """A light of another day, with the white balance and exposure of another camera."""
+    """Returns a light of another day, with the white balance and exposure of another camera."""
     lights = sample_lights(rng)
     camera = np.exp(rng.normal(0, BALANCE) + rng.normal(0, METERING))
     return replace(lights, gain=lights.gain * jnp.asarray(camera, jnp.float32))
 
 
 def together(photos: Sequence[Capture]) -> Capture:
-    """Captures of one photo each as one capture, with a frame for each."""
+    """Joins captures of one photo each into one capture, with a frame for each photo."""
     first = photos[0]
 
     def joined(name):
@@ -218,8 +223,15 @@ def off(
     parts: Int[np.ndarray, " n"],
     sides: Int[np.ndarray, " v"],
 ) -> Off:
-    """How far the colors of one side are off those of the other, where they are the same in truth:
-    the median over the parts of the body that both sides show.
+    """Returns how far the colors of one side are off those of the other, compared with their true
+    difference: the median over the parts of the body that both sides show.
+
+    Args:
+        colors: colors of the points in each view
+        truth: the same in a light without directions
+        seen: (v, n) which view shows which point
+        parts: part of the body of each point
+        sides: side of the person of each view, 0 or 1
     """
     found, expected = (part_colors(each, seen, parts, sides) for each in (colors, truth))
     errors = []

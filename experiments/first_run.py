@@ -1,5 +1,7 @@
-"""What a user waits for the first time, and every time after: the time line of commands, each in a
-process of its own, with an empty cache of compiled programs and with a full one.
+"""Measures what a user waits for, the first time and every time after.
+
+Every command runs in a new process, with an empty cache of compiled programs and with a full one.
+The result is a time line of the command's stages.
 """
 
 import json
@@ -18,11 +20,11 @@ from experiments.speed import checkout
 Command = Literal["demo", "start", "animate"]
 PROGRAMS = REPOSITORY / "experiments" / "programs.py"
 TIMES = {"empty": "the first time", "full": "every time after"}
-"""State of the cache -> how the table calls it."""
+"""{state of the cache: its name in the table}."""
 LABELLED = 0.04
-"""A stage has its name in the figure from this share of the longest run on."""
+"""Share of the longest run that a stage needs to have its name in the figure."""
 LETTERS = 9
-"""Letters that fit into such a stage."""
+"""Letters that fit into a stage of that share."""
 
 
 @entry
@@ -32,17 +34,18 @@ def first_run(
     before: str | None = None,
     small: bool = False,
 ) -> None:
-    """What `humangs demo`, `start` on four photos and `animate` wait for: seconds by stage,
-    programs, and seconds of compiling, the first time and every time after.
+    """Measures what `humangs demo`, `start` on four photos and `animate` wait for: seconds by
+    stage, programs, and seconds of compiling, the first time and every time after.
 
-    CPU seconds are those of all threads; other work beside changes them least. Compiling is part
-    of the stages' seconds, and counts reading from the cache on disk.
+    CPU seconds are those of all threads. Other work on the machine changes them least. Compiling is
+    part of the stages' seconds, and includes reading from the cache on disk.
 
     Options:
-    command: which
+    command: which commands
     before: commit, branch or tag to compare with, measured in turns
     small: no refinement and small frames, for a rehearsal
     """
+    # every command with both states of the cache, first of the other revision
     with checkout(before) as other:
         places = {"before": other} if other else {}
         places["now"] = REPOSITORY
@@ -65,9 +68,9 @@ def first_run(
 
 
 def measured(folder: Path, place: Path, command: Command, state: str, small: bool) -> dict:
-    """Numbers of a command of the package at a place, in a process of its own.
+    """Runs a command of the package that lies at `place` in a new process, and returns its numbers.
 
-    folder: holds the cache, and what earlier commands made, which `animate` shows.
+    `folder` holds the cache, and the results of earlier commands, which `animate` shows.
 
     Raises: OSError with the end of the command's errors.
     """
@@ -89,7 +92,11 @@ def measured(folder: Path, place: Path, command: Command, state: str, small: boo
 
 
 def words_of(command: Command, folder: Path, small: bool) -> list[str]:
-    """The command line. `animate` shows what `demo` made, `start` gets the demo's photos alone."""
+    """Returns the command line of a command.
+
+    `animate` shows the avatar of an earlier command. `start` gets the demo's photos without
+    anything beside them.
+    """
     frames = ["--size", "64"] if small else []
     if command == "demo":
         return ["demo", "--out", str(folder / "demo"), *frames, *(["--refine", "0"] * small)]
@@ -104,7 +111,7 @@ def words_of(command: Command, folder: Path, small: bool) -> list[str]:
 
 
 def write_photos(folder: Path, size: int) -> None:
-    """The demo's four photos, enlarged to `size` pixels, without anything beside them."""
+    """Writes the demo's four photos, enlarged to `size` pixels, without anything beside them."""
     from PIL import Image
 
     folder.mkdir()
@@ -114,7 +121,7 @@ def write_photos(folder: Path, size: int) -> None:
 
 
 def summary(ran: dict[str, Any]) -> dict[str, Any]:
-    """What is published of a run of `experiments.programs`."""
+    """Returns the numbers that are published of a run of `experiments.programs`."""
     programs = ran["programs"]
     largest = sorted(programs, key=lambda each: -each["seconds"])[:8]
     stages = {
@@ -137,7 +144,7 @@ def summary(ran: dict[str, Any]) -> dict[str, Any]:
 
 
 def table_of(rows: dict[str, dict[str, Any]]) -> str:
-    """A line for each run, then the stages of the runs with a full cache and an empty one."""
+    """Formats a table with a line for each run, and one with a line for each stage of each run."""
     header = ["", "CPU s", "wall s", "programs", "from disk", "compile s"]
     lines = [
         [
@@ -161,7 +168,7 @@ def table_of(rows: dict[str, dict[str, Any]]) -> str:
 
 
 def shown(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Rows by how the table calls them."""
+    """Returns the rows by their names in the table."""
     names = {}
     for name in rows:
         head, _, state = name.rpartition(", ")
@@ -170,11 +177,11 @@ def shown(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def draw_time_lines(path: Path, rows: dict[str, dict[str, Any]]) -> None:
-    """Draws a bar for each run: its stages one after the other, the compiling of each darker.
+    """Draws a bar for each run, with its stages one after the other and their compiling darker.
 
-    What is not in a stage, starting Python and importing, comes first, in grey. Programs that a
-    second thread compiled meanwhile do not prolong a stage: a stage is dark for as long as it took
-    at most.
+    Time outside of the stages, for starting Python and importing, comes first, in grey. Programs
+    that a second thread compiled at the same time do not make a stage longer: the dark part ends
+    where the stage ends.
     """
     shortest = LABELLED * max(row["wall"] for row in rows.values())
     with figure(path, 1, (12, 0.5 * len(rows) + 1.2)) as axis:

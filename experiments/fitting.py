@@ -1,5 +1,6 @@
-"""How exactly bodies are found from 2D keypoints: synthetic people whose keypoints are known,
-detections with errors; and where a detector puts its landmarks.
+"""Measures how exactly bodies are found from 2D keypoints, and where a detector puts its landmarks.
+
+The people are synthetic. Their keypoints are known, and the detections have random errors.
 """
 
 import dataclasses
@@ -36,24 +37,29 @@ SIZE = 512
 
 @dataclasses.dataclass(frozen=True)
 class FitCase:
-    """One person in m frames seen by c cameras. betas (s,), rotations (m, j, 3), translations (m,
-    3), joints (m, j, 3), landmarks (m, k, 3) are true; K (m, c, 3, 3) and cam_from_world (m, c, 4,
-    4).
-    """
+    """The truth about one person in m frames that c cameras see."""
 
     betas: np.ndarray
+    """(s,) shape coefficients."""
     rotations: np.ndarray
+    """(m, j, 3) rotation vectors of the joints."""
     translations: np.ndarray
+    """(m, 3) translations in metres."""
     joints: np.ndarray
+    """(m, j, 3) joints in the world, metres."""
     landmarks: np.ndarray
+    """(m, k, 3) landmarks in the world, metres."""
     K: np.ndarray
+    """(m, c, 3, 3) intrinsics of the cameras."""
     cam_from_world: np.ndarray
+    """(m, c, 4, 4) extrinsics of the cameras."""
 
 
 def make_case(seed, body, model, frames, views) -> FitCase:
-    """The person of a seed in random poses, each with other cameras, as of the published
+    """Returns the person of a seed in random poses, each seen by other cameras, as in the published
     protocol.
     """
+    # each frame has random streams for its pose and its cameras
     subject = make_subject(seed, body)
     rotations, translations, extrinsics, intrinsics = [], [], [], []
     for frame in range(frames):
@@ -68,10 +74,9 @@ def make_case(seed, body, model, frames, views) -> FitCase:
         translations.append(shift)
         extrinsics.append(np.asarray(cameras.cam_from_world))
         intrinsics.append(np.asarray(cameras.K))
-    rotations, translations = (
-        np.asarray(rotations, np.float32),
-        np.asarray(translations, np.float32),
-    )
+
+    rotations = np.asarray(rotations, np.float32)
+    translations = np.asarray(translations, np.float32)
     landmarks, joints = _posed(model, subject.betas, rotations, translations)
     return FitCase(
         subject.betas,
@@ -85,8 +90,8 @@ def make_case(seed, body, model, frames, views) -> FitCase:
 
 
 def walking(model, seed) -> FitCase:
-    """The person of a seed in the first frames of the shipped walk; cameras stand still all
-    around.
+    """Returns the person of a seed in the first frames of the shipped walk, seen by four cameras
+    that stand still around the person.
     """
     motion, rng = load_motion(), np.random.default_rng([seed, POSE_STREAM])
     rotations, translations = (
@@ -114,40 +119,42 @@ def walking(model, seed) -> FitCase:
 
 @jax.jit
 def _pose_all(model, betas, rotations, translations):
+    """Returns the landmarks and the joints of all frames."""
     return jax.vmap(lambda r, t: pose_landmarks(model, betas, BodyPose(r, t)))(
         rotations, translations
     )
 
 
 def _posed(model, betas, rotations, translations):
-    return tuple(
-        np.asarray(x) for x in _pose_all(model, jnp.asarray(betas), rotations, translations)
-    )
+    """Returns the landmarks (m, k, 3) and the joints (m, j, 3) of all frames as NumPy arrays."""
+    posed = _pose_all(model, jnp.asarray(betas), rotations, translations)
+    return tuple(np.asarray(x) for x in posed)
 
 
 def detect(case, seed, noise_px, outliers, outlier_px=100.0):
-    """Keypoints (m, c, k, 2) as a detector with errors would give them: noise everywhere, a share
-    displaced by up to so far.
+    """Returns keypoints (m, c, k, 2) in pixels as a detector with errors would give them.
+
+    Args:
+        case: the truth
+        seed: seed of the errors
+        noise_px: standard deviation of the noise of all keypoints
+        outliers: share of the keypoints that are displaced
+        outlier_px: largest displacement
     """
     rng = np.random.default_rng([seed, ERROR_STREAM])
-    seen = (
-        np.einsum("mcab,mkb->mcka", case.cam_from_world[..., :3, :3], case.landmarks)
-        + case.cam_from_world[..., None, :3, 3]
-    )
-    pixels = (
-        seen[..., :2] / seen[..., 2:] * case.K[..., None, [0, 1], [0, 1]] + case.K[..., None, :2, 2]
-    )
+    turns, shifts = case.cam_from_world[..., :3, :3], case.cam_from_world[..., None, :3, 3]
+    seen = np.einsum("mcab,mkb->mcka", turns, case.landmarks) + shifts
+    focal, middle = case.K[..., None, [0, 1], [0, 1]], case.K[..., None, :2, 2]
+    pixels = seen[..., :2] / seen[..., 2:] * focal + middle
     pixels = pixels + rng.normal(0, 1, pixels.shape) * noise_px
     wild = rng.random(pixels.shape[:-1]) < outliers
-    angle, radius = (
-        rng.uniform(0, 2 * np.pi, wild.shape),
-        outlier_px * np.sqrt(rng.random(wild.shape)),
-    )
+    angle = rng.uniform(0, 2 * np.pi, wild.shape)
+    radius = outlier_px * np.sqrt(rng.random(wild.shape))
     return pixels + (wild * radius)[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
 def observe(people, seed, noise_px, outliers, model):
-    """Observations (people, m, c, ...) of cases, with the errors of a detector."""
+    """Returns the observations (people, m, c, ...) of cases, with the errors of a detector."""
     points = np.stack([detect(case, seed + i, noise_px, outliers) for i, case in enumerate(people)])
     confidences = np.broadcast_to(np.asarray(model.known, np.float32), points.shape[:-1])
     noise = np.stack([expected_noise(p, c) for p, c in zip(points, confidences, strict=True)])
@@ -159,27 +166,32 @@ def observe(people, seed, noise_px, outliers, model):
 
 
 VIEWS, NOISES = (1, 2, 3, 4, 8), (0.0, 1.0, 2.0, 5.0, 10.0)
+"""Numbers of views, and standard deviations of the noise in pixels, of the curves."""
 ALL = "wholebody133"
+"""The set of keypoints with the most landmarks."""
 FIRST = 4_000_000
+"""Seed of the first person."""
 
 
 @entry
 def fit_keypoints(run: Run, people: int = 4, frames: int = 16, curves: bool = True) -> None:
-    """How exactly a body is found from 2D keypoints: synthetic people of the fitting seeds, random
-    poses, errors of a detector.
+    """Measures how exactly a body is found from 2D keypoints of synthetic people of the fitting
+    seeds in random poses, with the errors of a detector.
 
-    Errors over views, over noise and over keypoint sets: of all 55 joints in the world, of the
-    body's 22 and of the hands', beside plain and robust triangulation of the same keypoints;
-    seconds per frame of all people and frames in one batch, compilation apart. 8 minutes on two
-    cores.
+    The table has errors over views, over noise and over keypoint sets: of all 55 joints in the
+    world, of the 22 of the body and of those of the hands. Beside them are plain and robust
+    triangulation of the same keypoints. Seconds per frame are those of all people and frames in one
+    batch, without compilation. Takes 8 minutes on two cores.
 
     Options:
-    people: of the fitting seeds
-    frames: of each person
-    curves: over views, noise and sets; without, four views of COCO-WholeBody alone
+    people: number of people of the fitting seeds
+    frames: frames of each person
+    curves: vary views, noise and sets; otherwise only four views of COCO-WholeBody
     """
     if min(people, frames) < 1:
         raise ValueError("--people and --frames: expected at least 1")
+
+    # settings (keypoint set, views, noise in pixels, share of outliers), and their names
     asked = [(ALL, 4, 2.0, share) for share in (0.2, 0.0)]
     if curves:
         asked += [(ALL, views, 2.0, share) for views in VIEWS for share in (0.0, 0.2)]
@@ -194,35 +206,42 @@ def fit_keypoints(run: Run, people: int = 4, frames: int = 16, curves: bool = Tr
         name: functools.partial(_errors, people, frames, each) for each, name in settings.items()
     }
     rows = run.rows(cases, {"people": people, "frames": frames})
+
+    def shown(value):
+        return "-" if value is None else f"{value:.1f}"
+
+    # a line for each setting, and a sentence about times
     table = []
     for (kind, views, noise, share), name in settings.items():
-        shown = [
-            "-" if rows[name].get(key) is None else f"{rows[name][key]:.1f}" for key in COLUMNS
-        ]
-        table.append([kind, views, f"{noise:g}", f"{share:.0%}", *shown])
+        errors = [shown(rows[name].get(key)) for key in COLUMNS]
+        table.append([kind, views, f"{noise:g}", f"{share:.0%}", *errors])
     four = rows[settings[(ALL, 4, 2.0, 0.2)]]
-    said = (
+    summary = (
         f"{people} people of {frames} frames each in one batch: {four['seconds_per_frame']:.2f} s a"
         f" frame with four views, after a first call of {four['first_call_s']:.0f} s that compiles."
     )
     if curves:
         alone = rows[settings[(ALL, 1, 2.0, 0.0)]]["root_aligned_mean_joint_error_mm"]
-        said += f" With one view and the pelvis put in its place the mean is {alone:.0f} mm."
+        summary += f" With one view and the pelvis put in its place the mean is {alone:.0f} mm."
     header = ["keypoints", "views", "noise, px", "outliers", *COLUMNS.values()]
-    run.show(f"{markdown_table(header, table)}\n\n{said}", rows)
+    run.show(f"{markdown_table(header, table)}\n\n{summary}", rows)
 
 
 @functools.cache
 def _model(kind):
+    """Returns the landmark model of a keypoint set."""
     return landmark_model(load_body(), KEYPOINT_SETS[kind].names)
 
 
 @functools.cache
 def _people(kind, views, count, frames):
+    """Returns the first people in random poses."""
     return [make_case(FIRST + i, load_body(), _model(kind), frames, views) for i in range(count)]
 
 
 def _errors(count, frames, setting):
+    """Fits all people with a setting, and returns errors in millimetres and times in seconds."""
+    # the first fit compiles
     kind, views, noise, outliers = setting
     model, people = _model(kind), _people(kind, views, count, frames)
     seen = observe(people, FIRST, noise, outliers, model)
@@ -231,11 +250,12 @@ def _errors(count, frames, setting):
     for _ in range(2):
         fit = jax.block_until_ready(fit_all(seen))
         times.append(time.perf_counter())
+
+    # errors in the world, and with the pelvis where the true one is: what a single view can know
     truth, joints = np.stack([case.joints for case in people]), np.asarray(fit.joints)
-    errors, off = (
-        1000 * np.linalg.norm(joints - x, axis=-1)
-        for x in (truth, truth + joints[..., :1, :] - truth[..., :1, :])
-    )
+    errors = 1000 * np.linalg.norm(joints - truth, axis=-1)
+    moved = truth + joints[..., :1, :] - truth[..., :1, :]
+    aligned_errors = 1000 * np.linalg.norm(joints - moved, axis=-1)
     found = {
         "mean_joint_error_mm": float(errors.mean()),
         "p95_joint_error_mm": float(np.quantile(errors, 0.95)),
@@ -244,9 +264,7 @@ def _errors(count, frames, setting):
         "worst_frame_mean_mm": float(errors.mean(-1).max()),
     }
     found |= landmark_errors(model, people, seen, fit)
-    found["root_aligned_mean_joint_error_mm"] = float(
-        off.mean()
-    )  # pelvis where the true one is: what a single view can know
+    found["root_aligned_mean_joint_error_mm"] = float(aligned_errors.mean())
     return found | {
         "seconds_per_frame": (times[2] - times[1]) / (count * frames),
         "first_call_s": times[1] - times[0],
@@ -254,8 +272,9 @@ def _errors(count, frames, setting):
 
 
 def landmark_errors(model, people, seen, fit) -> dict:
-    """Millimetres between true landmarks and fitted or triangulated ones; None of triangulation
-    from one view.
+    """Returns the mean millimetres between the true landmarks and the fitted and triangulated ones.
+
+    Triangulation is left out where there is one view.
     """
     truth, known = np.stack([case.landmarks for case in people]), np.asarray(model.known)
 
@@ -264,9 +283,8 @@ def landmark_errors(model, people, seen, fit) -> dict:
 
     found = {"mean_landmark_error_mm": off(fit.landmarks)}
     if seen.points.shape[2] > 1:
-        plain, robust = (
-            jax.jit(jax.vmap(jax.vmap(f))) for f in (triangulate, triangulate_robustly)
-        )
+        plain = jax.jit(jax.vmap(jax.vmap(triangulate)))
+        robust = jax.jit(jax.vmap(jax.vmap(triangulate_robustly)))
         found |= {
             "triangulated_mm": off(plain(seen)[0]),
             "robustly_triangulated_mm": off(robust(seen)[0]),
@@ -283,10 +301,11 @@ COLUMNS = {
     "triangulated_mm": "triangulated",
     "robustly_triangulated_mm": "robustly",
 }
+"""{number of a row: its heading in the table}."""
 
 
 FRAMES, OTHER = 7, (0.8, 0.0, 0.5)
-"""Frames of the walk, and how far from the person somebody else stands, metres."""
+"""Frames of the walk, and where somebody else stands relative to the person, metres."""
 CASES = {
     "all frames seen": (4, 1.0, ()),
     "frame 3 without keypoints": (4, 1.0, (3,)),
@@ -299,7 +318,7 @@ CASES = {
     "one camera, frame 3 without keypoints": (1, 1.0, (3,)),
     "4 px of noise": (4, 4.0, ()),
 }
-"""Views, noise of the detections in pixels of 512, and which frames are spoilt."""
+"""{case: (views, noise of the detections in pixels of 512, frames that are spoilt)}."""
 
 
 @entry
@@ -309,18 +328,20 @@ def fit_sequences(
     people: int = 3,
     cases: tuple[str, ...] = (),
 ) -> None:
-    """What `humangs fit --smoothness` makes of sequences with frames that are badly seen: the
-    shipped walk with known keypoints.
+    """Measures what `humangs fit --smoothness` makes of sequences with frames that are badly seen.
+    The sequence is the shipped walk with known keypoints.
 
-    Mean error over all 55 joints of the frames that the case leaves alone and of those that it
-    spoils, and of the joints' accelerations where no frame is spoilt (how much they tremble), with
-    frames fitted one by one and with smooth motion. 15 minutes.
+    The table has mean errors over all 55 joints, of the frames that the case leaves alone and of
+    those that it spoils. Where no frame is spoilt it also has the error of the accelerations, which
+    shows how much the joints tremble. Frames are fitted one by one and with smooth motion. Takes 15
+    minutes.
 
     Options:
     smoothness: expected acceleration, metres per frame squared
-    people: of the fitting seeds
-    cases: names; default: all
+    people: number of people of the fitting seeds
+    cases: names of the cases; default: all
     """
+    # every case, fitted one by one and with each smoothness
     model, made = _model(ALL), [walking(_model(ALL), seed) for seed in range(FIRST, FIRST + people)]
     ways = {"alone": 0.0} | {f"smooth {s:g}": s for s in smoothness}
     names = cases or tuple(CASES)
@@ -336,6 +357,7 @@ def fit_sequences(
             return "-"
         return f"{value:.0f}" if value >= 99.5 else f"{value:.1f}"
 
+    # a line for each case
     keys = {"others_mm": "frames left alone", "spoilt_mm": "spoilt", "tremble_mm": "acceleration"}
     table = [
         [name, *(show(rows[f"{name}: {way}"][key]) for key in keys for way in ways)]
@@ -344,16 +366,18 @@ def fit_sequences(
     header = ["case"]
     for what in keys.values():
         header += [f"{what}: one by one", *(f"{s:g}" for s in smoothness)]
-    said = (
+    about = (
         f"{people} people, {FRAMES} frames, {ALL}, one by one and with these values of"
         " `--smoothness`; mean errors in millimetres, and millimetres per frame squared."
     )
-    run.show(f"{markdown_table(header, table)}\n\n{said}", rows)
+    run.show(f"{markdown_table(header, table)}\n\n{about}", rows)
 
 
 def measure(model, people, name: str, smoothness: float) -> dict:
-    """Mean errors of the frames left alone, of the spoilt ones and of accelerations, millimetres;
-    the acceleration held to.
+    """Fits a case and returns mean errors in millimetres, and the smoothness that the fits used.
+
+    The errors are those of the frames left alone, of the spoilt ones and of accelerations. They are
+    None where the case has no such frames, and the accelerations where a frame is spoilt.
     """
     _, _, spoilt = CASES[name]
     seen = spoiled(model, people, name)
@@ -372,59 +396,58 @@ def measure(model, people, name: str, smoothness: float) -> dict:
 
 
 def spoiled(model, people, name: str):
-    """Observations (people, m, c, ...) of a case."""
+    """Returns the observations (people, m, c, ...) of a case."""
     views, noise, spoilt = CASES[name]
     seen = observe(people, FIRST, noise, 0.0, model)
     points, confidences = np.array(seen.points), np.array(seen.confidences)
     rows = list(spoilt)
+    # spoil frames as the name of the case says
     if "without" in name:
         confidences[:, rows] = 0
     elif "one view" in name:
         confidences[:, rows, 1:] = 0
     elif "somebody else" in name:
-        others = observe(
-            [moved(case, OTHER) for case in people[1:] + people[:1]], FIRST + 1, noise, 0.0, model
-        )
-        points[:, rows] = np.asarray(others.points)[
-            :, [(row + FRAMES // 2) % FRAMES for row in rows]
-        ]
+        # the next person, beside and in another frame of the walk
+        neighbours = [moved(case, OTHER) for case in people[1:] + people[:1]]
+        others = observe(neighbours, FIRST + 1, noise, 0.0, model)
+        later = [(row + FRAMES // 2) % FRAMES for row in rows]
+        points[:, rows] = np.asarray(others.points)[:, later]
     elif "px off" in name:
         points[:, rows] = np.asarray(observe(people, FIRST, noise, 0.2, model).points)[:, rows]
-    noises = np.stack(
-        [
-            expected_noise(p, c)
-            for p, c in zip(points[:, :, :views], confidences[:, :, :views], strict=True)
-        ]
+
+    # only the views of the case
+    points, confidences = points[:, :, :views], confidences[:, :, :views]
+    noises = np.stack([expected_noise(p, c) for p, c in zip(points, confidences, strict=True)])
+    return replace(
+        seen,
+        points=points,
+        confidences=confidences,
+        K=seen.K[:, :, :views],
+        cam_from_world=seen.cam_from_world[:, :, :views],
+        noise=noises,
     )
-    each = {
-        "points": points,
-        "confidences": confidences,
-        "K": seen.K,
-        "cam_from_world": seen.cam_from_world,
-    }
-    return replace(seen, **{key: value[:, :, :views] for key, value in each.items()}, noise=noises)
 
 
 def moved(case, by):
+    """Returns a case whose person stands elsewhere, shifted by (3,) metres."""
     by = np.asarray(by, np.float32)
     return dataclasses.replace(case, joints=case.joints + by, landmarks=case.landmarks + by)
 
 
 CLEAR, SCALE, ITERATIONS, STEP = 0.5, 0.02, 15, 0.01
-"""Least visibility; scale of the robust weights and step of the derivatives, metres; iterations of
-reweighting.
+"""Least visibility of a landmark, scale of the robust weights in metres, iterations of reweighting,
+and step of the derivatives in metres.
 """
 RIDGE, WRONG = 1e-3, 0.05
-"""Keeps offsets near 0 along directions that no view shows.
-
-Median error, a share of the person's height, of views left out.
+"""Weight that keeps offsets near 0 along directions that no view shows, and the median error, as a
+share of the person's height, above which a view is left out.
 """
 
 
 @entry
 def landmark_places(run: Run, captures: tuple[Path, ...]) -> None:
-    """Where a detector puts its landmarks on bodies that are known: the places of
-    `KeypointSet.places`, measured.
+    """Measures where a detector puts its landmarks on bodies that are known. These are the places
+    of `KeypointSet.places`.
 
     Every landmark is looked for in every view of the captures, whose bodies and cameras are taken
     for the truth. The offset from the base of its place, in the axes of the bones that carry it, is
@@ -434,19 +457,22 @@ def landmark_places(run: Run, captures: tuple[Path, ...]) -> None:
     Options:
     captures: capture folders, or folders of them
     """
+    # what the views of all captures say about each landmark
     networks, seen = Networks(), {place.name: [] for place in MEDIAPIPE_33.places}
-    for folder in (
-        file.parent for each in captures for file in sorted(each.glob("**/capture.json"))
-    ):
-        for name, row in landmark_rows(networks, folder):
-            seen[name].append(row)
+    for each in captures:
+        for file in sorted(each.glob("**/capture.json")):
+            for name, row in landmark_rows(networks, file.parent):
+                seen[name].append(row)
+
+    # a landmark and its mirror image are solved together, by the name that comes first
     places, rows = {}, []
     for name, own in seen.items():
-        if (other := mirrored_name(name)) in places:
+        other = mirrored_name(name)
+        if other in places:
             continue
-        mirrored = (
-            [(change * [-1, 1, 1], error) for change, error in seen[other]] if name != other else []
-        )
+        mirrored = []
+        if name != other:
+            mirrored = [(change * [-1, 1, 1], error) for change, error in seen[other]]
         if own or mirrored:
             offset, scatter = solved_offset(own + mirrored)
             places[name] = {
@@ -459,9 +485,13 @@ def landmark_places(run: Run, captures: tuple[Path, ...]) -> None:
 
 
 def landmark_rows(networks, folder):
-    """(name, (change of the image with the offset (2, 3), error (2,))) of a capture's clear
-    landmarks, metres at the person.
+    """Yields (name, (change of the image with the offset (2, 3), error (2,))) of the clear
+    landmarks of a capture.
+
+    Errors are in metres at the distance of the person. Views without a person, or with a detection
+    that is far off, are left out.
     """
+    # the model without offsets, and with a small offset along each axis
     capture, kind = load_capture(folder), MEDIAPIPE_33
     plain = tuple(place._replace(offset=(0.0, 0.0, 0.0)) for place in kind.places)
     model = landmark_model(capture.body, kind.names, plain)
@@ -476,10 +506,8 @@ def landmark_rows(networks, folder):
         pose, camera = capture.pose(int(capture.frames[view])), capture.cameras[view]
         betas = jnp.asarray(capture.betas)
         points = [pose_landmarks(each, betas, pose)[0] for each in (model, *moved)]
-        pixels, depths = (
-            np.asarray(x, float)
-            for x in jax.vmap(functools.partial(project, camera))(jnp.stack(points))
-        )
+        projected = jax.vmap(functools.partial(project, camera))(jnp.stack(points))
+        pixels, depths = (np.asarray(x, float) for x in projected)
         changes = np.moveaxis(pixels[1:] - pixels[0], 0, -1) / STEP
         errors = people[0].pixels + 0.5 - pixels[0]
         if np.median(np.linalg.norm(errors, axis=-1)) > WRONG * np.ptp(pixels[0], axis=0).max():
@@ -490,8 +518,8 @@ def landmark_rows(networks, folder):
 
 
 def solved_offset(rows):
-    """The offset that explains the errors best, and the median length of what is left,
-    millimetres.
+    """Returns the offset (3,) that explains the errors best, and the median length of the errors
+    that are left, in millimetres.
     """
     changes, errors = (np.stack(each) for each in zip(*rows, strict=True))
     weights, offset = np.ones(len(rows)), np.zeros(3)

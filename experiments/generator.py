@@ -1,4 +1,4 @@
-"""Synthetic people: what is wrong with them, contact sheets."""
+"""Counts the faults of synthetic people, and draws contact sheets of them."""
 
 import functools
 from pathlib import Path
@@ -19,7 +19,8 @@ from humangs_jax.synthetic.writer import sample_motion, sample_pose
 
 DEMO = SPLITS["demo"]
 DEPTH, HOLLOW_DEPTH = 0.06, 0.01
-"""Metres: how far behind poking skin its cloth may lie; how much nearer the missing body must be.
+"""Metres that cloth may lie behind skin that pokes through it, and metres that the missing body
+must be nearer than the inner side of cloth that is seen.
 """
 FAULTS = {
     "poking": (
@@ -38,21 +39,21 @@ FAULTS = {
     "gaps": "the background is seen where the naked body would be",
 }
 DEEP = 0.01
-"""Metres inside of a hem: deep."""
+"""Metres inside of a hem from which on skin is deep."""
 
 
 @entry
 def people_faults(run: Run, subjects: int = 200, size: int = 256) -> None:
-    """Faults of synthetic people: counted in images of random poses from random cameras, as shares
-    of the person's pixels.
+    """Counts the faults of synthetic people in images of random poses from random cameras, as
+    shares of the person's pixels.
 
-    Skin seen up a sleeve or under a skirt has the inner side of cloth behind it: no fault; skin
-    that cloth covers well is not in the mesh at all and cannot poke: see hollow. A second a person.
-    Expected: poking below 0.1 %.
+    Skin that is seen up a sleeve or under a skirt has the inner side of cloth behind it, and is no
+    fault. Skin that cloth covers well is not in the mesh, so it cannot poke. Where such cloth is
+    open the fault is "hollow". Takes a second a person. Poking is expected to be below 0.1 %.
 
     Options:
     subjects: people of the training seeds that are built, posed and rendered
-    size: side of the pictures
+    size: side of the pictures in pixels
     """
     body = load_body()
     cases = {str(seed): functools.partial(look_at, body, seed, size) for seed in range(subjects)}
@@ -60,11 +61,8 @@ def people_faults(run: Run, subjects: int = 200, size: int = 256) -> None:
     numbers, table, pixels = {}, [], np.asarray([row["pixels"] for row in rows.values()])
     for name, definition in FAULTS.items():
         each = np.asarray([row[name] for row in rows.values()])
-        mean, most, above = (
-            float((each * pixels).sum() / pixels.sum()),
-            float(each.max()),
-            float((each > 1e-3).mean()),
-        )
+        mean = float((each * pixels).sum() / pixels.sum())
+        most, above = float(each.max()), float((each > 1e-3).mean())
         numbers[name] = {"mean": mean, "worst": most, "above_0.1_percent": above}
         table.append(
             [name.replace("_", ", "), definition, f"{mean:.4%}", f"{most:.2%}", f"{above:.1%}"]
@@ -74,11 +72,11 @@ def people_faults(run: Run, subjects: int = 200, size: int = 256) -> None:
 
 
 def look_at(body: BodyModel, seed: int, size: int) -> dict[str, float]:
+    """Returns the pixels of the person of a seed in an image, and the share of each fault."""
     posed = sample_pose(make_subject(seed, body), 0)
     rng = np.random.default_rng([seed, 77, 0])
-    camera = surroundings.cameras_around(
-        rng, posed.vertices, surroundings.spread_azimuths(rng, 1), size
-    )[0]
+    azimuths = surroundings.spread_azimuths(rng, 1)
+    camera = surroundings.cameras_around(rng, posed.vertices, azimuths, size)[0]
     pixels, *counts = count_faults(body, posed, camera)
     return {"pixels": float(pixels)} | {
         name: float(x / pixels) for name, x in zip(FAULTS, counts, strict=True)
@@ -86,9 +84,11 @@ def look_at(body: BodyModel, seed: int, size: int) -> dict[str, float]:
 
 
 def count_faults(body, posed, camera):
-    """(6,) pixels of the person, then those of FAULTS."""
+    """Returns (6,) numbers of pixels: those of the person, then those of each of FAULTS."""
     subject = posed.subject
     faces, materials = subject.surface.faces, subject.face_materials
+
+    # skin inside of a hem, and cloth whose outer side is close behind it
     everything = rasterize_mesh(*padded(posed.vertices, faces), camera)
     ids = np.asarray(everything.face_ids)
     seen, depth = ids >= 0, np.asarray(everything.depth)
@@ -101,6 +101,8 @@ def count_faults(body, posed, camera):
     eye = np.asarray(camera.center)
     outer = (cloth_ids >= 0) & _faces_the_eye(posed.vertices, faces, eye)[cloth_ids]
     poking = inside & outer & (cloth_depth - depth < DEPTH)
+
+    # where the naked body would be seen
     pose = BodyPose(jnp.asarray(posed.rotations), jnp.asarray(posed.translation))
     naked = pose_body(body, shape_body(body, jnp.asarray(subject.betas)), pose)
     body_alone = rasterize_mesh(naked.vertices, body.faces, camera)
@@ -113,6 +115,7 @@ def count_faults(body, posed, camera):
 
 
 def _faces_the_eye(vertices, faces, eye):
+    """Returns whether the outer side of each face is turned to the eye (3,)."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.sum(np.cross(b - a, c - a) * (eye - a), -1) > 0
 
@@ -131,8 +134,8 @@ TELE = 0.42
 
 @entry
 def people_sheets(run: Run, out: Path = Path("docs/images")) -> None:
-    """Contact sheets of synthetic people: front and back, 8 heads and hands, 8 sequences of 8
-    frames.
+    """Writes contact sheets of synthetic people: 64 from front and back, heads and hands of 8, and
+    8 sequences of 8 frames.
 
     All three take a minute of one CPU core. The same command gives the same images bit for bit on
     the same machine.
@@ -155,7 +158,7 @@ def people_sheets(run: Run, out: Path = Path("docs/images")) -> None:
 
 
 def front_back(body, seeds):
-    """Rows of people from the front, each over a row of the same people from behind."""
+    """Draws rows of people from the front, each over a row of the same people from behind."""
     cells = []
     for seed in seeds:
         posed = sample_pose(make_subject(seed, body), 0)
@@ -166,7 +169,7 @@ def front_back(body, seeds):
 
 
 def close_ups(body, seeds):
-    """A row of heads, a row of the same heads from the side, a row of hands."""
+    """Draws a row of heads, a row of the same heads from the side, and a row of hands."""
     rows = [[], [], []]
     for seed in seeds:
         posed = sample_pose(make_subject(seed, body), 0)
@@ -176,25 +179,29 @@ def close_ups(body, seeds):
         middle = joints[anatomy.Joint.HEAD] + world[anatomy.Joint.HEAD] @ [0, 0.085, 0.02]
         rows[0].append(_near(posed, middle, 0.17, facing + 0.35, 0.05))
         rows[1].append(_near(posed, middle, 0.17, facing + 1.6, 0.05))
-        hand = anatomy.Joint.LEFT_WRIST if seed % 2 else anatomy.Joint.RIGHT_WRIST
-        knuckles = joints[anatomy.Joint.LEFT_HAND + 3 if seed % 2 else anatomy.Joint.RIGHT_HAND + 3]
+        if seed % 2:
+            wrist, hand = anatomy.Joint.LEFT_WRIST, anatomy.Joint.LEFT_HAND
+        else:
+            wrist, hand = anatomy.Joint.RIGHT_WRIST, anatomy.Joint.RIGHT_HAND
+        knuckles = joints[hand + 3]
         outwards = _azimuth(knuckles - joints[anatomy.Joint.SPINE2])
-        rows[2].append(_near(posed, 0.4 * joints[hand] + 0.6 * knuckles, 0.15, outwards, 0.1))
+        rows[2].append(_near(posed, 0.4 * joints[wrist] + 0.6 * knuckles, 0.15, outwards, 0.1))
     return _grid(rows)
 
 
 def motions(body, seeds):
-    """One row a sequence, eight frames over two and a half seconds, the camera beside the walker;
-    two sequences side by side.
+    """Draws eight frames of each sequence over two and a half seconds, from a camera beside the
+    walker.
+
+    A row of the sheet shows two sequences.
     """
     rows = []
     for seed in seeds:
         subject = make_subject(seed, body)
         motion = sample_motion(subject, MOTION_FRAMES)
         rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
-        pelvis = anatomy.joint_positions(subject.build, rotations[0].astype(float))[0][
-            anatomy.Joint.PELVIS
-        ]
+        world, _ = anatomy.joint_positions(subject.build, rotations[0].astype(float))
+        pelvis = world[anatomy.Joint.PELVIS]
         facing = _azimuth(pelvis @ [0, 0, 1])
         posed = [
             pose_subject(subject, rotations[i], translations[i])
@@ -206,10 +213,12 @@ def motions(body, seeds):
 
 
 def _azimuth(direction):
+    """Returns the azimuth of a direction (3,) in radians, 0 along z."""
     return float(np.arctan2(direction[0], direction[2]))
 
 
 def _seen(posed, target, distance, azimuth, elevation, fov, size):
+    """Draws a person from a camera around a target, (h, w, 3)."""
     K, azimuths = intrinsics_from_fov(fov, *size), jnp.asarray([azimuth], jnp.float32)
     camera = orbit(
         jnp.asarray(target, jnp.float32), float(distance), azimuths, float(elevation), K, *size
@@ -218,8 +227,9 @@ def _seen(posed, target, distance, azimuth, elevation, fov, size):
 
 
 def _whole(posed, azimuth, size):
-    """The whole person, feet near the lower edge; all people at one scale, 2.3 metres to the
-    image's height.
+    """Draws the whole person with the feet near the lower edge, (h, w, 3).
+
+    An image is 2.25 metres high, so that all people have one scale, or more for a tall person.
     """
     low, high = posed.vertices.min(0), posed.vertices.max(0)
     reach = max(2.25, 1.1 * (high[1] - low[1]))
@@ -228,12 +238,12 @@ def _whole(posed, azimuth, size):
 
 
 def _near(posed, target, reach, azimuth, elevation):
-    """A close-up of `reach` metres around a point, from a metre away."""
+    """Draws a close-up of `reach` metres around a point, from 1.2 metres away."""
     return _seen(posed, target, 1.2, azimuth, elevation, 2 * np.arctan(reach / 1.2), CLOSE_SIZE)
 
 
 def _grid(rows):
-    """(h, w, 3) image of rows of images of one size; short rows are filled with white."""
+    """Joins rows of images of one size into an image (h, w, 3), and fills short rows with white."""
     columns = max(len(row) for row in rows)
     blank = np.ones_like(rows[0][0])
     return np.concatenate(

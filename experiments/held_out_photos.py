@@ -1,9 +1,9 @@
-"""Photos of real people, each held out of an avatar in turn, for `real_people.py`.
+"""Scores avatars of real people on photos that are held out in turn, for `real_people.py`.
 
-A person who moves between photos has another pose in each, which a photo that is held out has to
-give, too. So there are two numbers: "own pose", the avatar of the other photos in the pose that was
-found with the held-out photo, and "shared pose", in the mean of the poses of the others, which
-knows nothing of it.
+A person who moves between photos has another pose in each photo, and only a photo shows its pose.
+So there are two numbers. "own pose" shows the avatar of the other photos in the pose that was found
+with the held-out photo. "shared pose" shows it in the mean of the poses of the others, which does
+not depend on the held-out photo.
 """
 
 import dataclasses
@@ -33,14 +33,17 @@ def held_out_scores(
     truth: Float[np.ndarray, "v h w 3"] | None = None,
     masks: Float[np.ndarray, "v h w"] | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """PSNRs (dB) and LPIPS of photos by the avatars of the others: means over the views, by pose,
-    "own" and "shared".
+    """Scores the avatars of the other photos on each view in turn.
 
-    A rendering has the exposure of the photo's camera, which is found from all photos.
+    Returns {"own" and "shared" pose: PSNRs in dB and LPIPS}, means over the views. A rendering has
+    the exposure of the photo's camera, which is found from all photos.
 
-    Arguments: capture: what the package makes of the photos. make: an avatar from a part of it.
-    views: that are held out in turn.
-    truth, masks: photos and masks of the person alone on white. Default: those of the capture.
+    Args:
+        capture: what the package makes of the photos
+        make: function that makes an avatar from a part of the capture
+        views: indices of the views that are held out in turn
+        truth: photos of the person alone on white; default: those of the capture
+        masks: masks of the person; default: those of the capture
     """
     rows: dict[str, list[Scores]] = {"own": [], "shared": []}
     gains = 1 / exposure_gains(capture)
@@ -48,17 +51,17 @@ def held_out_scores(
         others = [other for other in range(capture.view_count) if other != view]
         rest, shown = capture.select(others), capture.select([view])
         avatar = make(rest)
-        # of the others alone the gains are the same but for one factor
+        # the gains from the others alone differ from those of all photos by one factor
         factor = np.exp(np.mean(np.log(gains[others] * exposure_gains(rest)), axis=0))
-        told = dataclasses.replace(
-            shown,
-            images=shown.images if truth is None else truth[[view]],
-            masks=shown.masks if masks is None else masks[[view]],
-        )
+        expected = shown
+        if truth is not None:
+            expected = dataclasses.replace(expected, images=truth[[view]])
+        if masks is not None:
+            expected = dataclasses.replace(expected, masks=masks[[view]])
         for pose, drawn in (("own", shown), ("shared", in_shared_pose(rest, shown))):
             found = predict_views(avatar, drawn)
             images = apply_gain(found.images, np.asarray(found.alpha), (factor / gains[view])[None])
-            rows[pose].append(photo_scores(images, told))
+            rows[pose].append(photo_scores(images, expected))
     return {
         pose: mean_scores(scores) | {"each": [row["psnr_fg"] for row in scores]}
         for pose, scores in rows.items()
@@ -66,7 +69,7 @@ def held_out_scores(
 
 
 def in_shared_pose(rest: Capture, shown: Capture) -> Capture:
-    """A view in the mean of the poses of other views."""
+    """Returns the shown view in the mean of the poses of the other views."""
     frames = np.asarray(rest.frames)
     rotations = rest.poses.rotations[frames].mean(axis=0)
     translation = rest.poses.translation[frames].mean(axis=0)
@@ -80,8 +83,8 @@ def in_shared_pose(rest: Capture, shown: Capture) -> Capture:
 
 
 def photo_scores(images: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
-    """psnr, psnr_fg and psnr_corrected (dB), and LPIPS, of drawn views against the photos of a
-    capture, means over them.
+    """Returns psnr, psnr_fg and psnr_corrected (dB) and LPIPS of drawn views against the photos of
+    a capture, as means over the views.
     """
     still = dataclasses.replace(truth, frames=np.zeros(truth.view_count, np.int32))
     scores = score_tasks(images, still, _alex())["novel"]
@@ -101,17 +104,19 @@ def psnr_corrected(
     photo: Float[np.ndarray, "h w 3"],
     mask: Float[np.ndarray, "h w"],
 ) -> float:
-    """PSNR (dB) of the person after the gain of each channel that brings it nearest to the photo.
+    """Returns the PSNR (dB) of the person after each channel has the gain that brings it nearest to
+    the photo.
 
-    Three numbers of the held-out photo are known then: its exposure and white balance, or the side
-    of the room that it shows. A simpler `color_correct` than that of camp_zipnerf, whose
-    polynomials of the colors hide more.
+    The gains use three numbers of the held-out photo, which stand for its exposure and white
+    balance, or for the side of the room that it shows. `color_correct` of camp_zipnerf fits
+    polynomials of the colors instead, which hide more errors.
     """
-    drawn, told = image[mask > 0.5], photo[mask > 0.5]
-    gains = (drawn * told).sum(axis=0) / np.maximum((drawn**2).sum(axis=0), 1e-9)
-    return -10 * float(np.log10(np.mean((gains * drawn - told) ** 2)))
+    drawn, true = image[mask > 0.5], photo[mask > 0.5]
+    gains = (drawn * true).sum(axis=0) / np.maximum((drawn**2).sum(axis=0), 1e-9)
+    return -10 * float(np.log10(np.mean((gains * drawn - true) ** 2)))
 
 
 @functools.cache
 def _alex() -> Lpips | None:
+    """Returns LPIPS with AlexNet, or None where its weights are not installed."""
     return load_lpips("alex") if "alex" in installed_lpips() else None

@@ -1,4 +1,4 @@
-"""docs/knobs.md: every setting that trades accuracy or memory for speed, from the code itself."""
+"""Writes docs/knobs.md: every setting that trades accuracy or memory for speed, from the code."""
 
 import ast
 import dataclasses
@@ -57,6 +57,7 @@ PRESETS_HEAD = """
 
 
 def page() -> str:
+    """Returns the text of docs/knobs.md."""
     classes = (
         Runtime,
         Conventions,
@@ -73,7 +74,7 @@ def page() -> str:
 
 
 def preset_rows() -> list[str]:
-    """A row for each preset: what differs from the defaults."""
+    """Returns a row for each preset, with the fields that differ from the defaults."""
 
     def changes(value: Any, usual: Any) -> list[str]:
         names = [field.name for field in dataclasses.fields(value) if field.name != "runtime"]
@@ -83,19 +84,16 @@ def preset_rows() -> list[str]:
             if getattr(value, name) != getattr(usual, name)
         ]
 
-    plain = Settings(), Runtime()
     rows = []
     for name, preset in PRESETS.items():
-        own, network = (
-            ", ".join(changes(preset, plain[0])),
-            ", ".join(changes(preset.runtime, plain[1])),
-        )
+        own = ", ".join(changes(preset, Settings()))
+        network = ", ".join(changes(preset.runtime, Runtime()))
         rows.append(f"| `{name}` | {own} | {network or 'as trained'} |")
     return rows
 
 
 def field_rows() -> list[str]:
-    """A row for each field of a training run that holds no others."""
+    """Returns a row for each field of a training run that has no fields inside."""
     run = RUNS["tiny"]()
     rows = []
     for path, value in field_paths(run).items():
@@ -105,17 +103,18 @@ def field_rows() -> list[str]:
         cls = type(functools.reduce(getattr, places, run))
         hint = typing.get_type_hints(cls, include_extras=True)[name]
         ranges = "; ".join(dict.fromkeys(map(str, marks_in(hint, Range))))
-        allowed = in_words(typing.get_type_hints(cls)[name]) + (f", {ranges}" if ranges else "")
+        allowed = in_words(typing.get_type_hints(cls)[name])
+        if ranges:
+            allowed = f"{allowed}, {ranges}"
         cells = (f"`{path}`", allowed, f"`{value}`", docstrings(cls).get(name, ""))
-        rows.append(
-            f"| {' | '.join(' '.join(cell.split()).replace('|', 'or') for cell in cells)} |"
-        )
+        cells = [" ".join(cell.split()).replace("|", "or") for cell in cells]
+        rows.append(f"| {' | '.join(cells)} |")
     return rows
 
 
 @functools.cache
 def docstrings(cls: type) -> dict[str, str]:
-    """The strings below the fields of a class, by field."""
+    """Returns {field: the string below it} of a dataclass and its bases."""
     found = {}
     for each in cls.__mro__[-2::-1]:
         if not dataclasses.is_dataclass(each) or not each.__module__.startswith("humangs_jax"):
@@ -123,23 +122,21 @@ def docstrings(cls: type) -> dict[str, str]:
         (written,) = ast.parse(textwrap.dedent(inspect.getsource(each))).body
         assert isinstance(written, ast.ClassDef)
         for field, text in itertools.pairwise(written.body):
-            if (
-                isinstance(field, ast.AnnAssign)
-                and isinstance(text, ast.Expr)
-                and isinstance(text.value, ast.Constant)
-            ):
+            if not isinstance(field, ast.AnnAssign) or not isinstance(text, ast.Expr):
+                continue
+            if isinstance(text.value, ast.Constant):
                 found[ast.unparse(field.target)] = str(text.value.value)
     return found
 
 
 def knob_rows(cls: Any) -> list[str]:
-    """A row for each knob of a configuration."""
+    """Returns a row for each knob of a configuration, a field whose metadata has a gain."""
     source = "../" + cls.__module__.replace(".", "/") + ".py"
     rows = []
     for field in dataclasses.fields(cls):
         if "gain" in field.metadata:
             cost, gain, measured = (field.metadata[name] for name in ("cost", "gain", "measured"))
-            default = field.default if not dataclasses.is_dataclass(field.default) else "on"
+            default = "on" if dataclasses.is_dataclass(field.default) else field.default
             rows.append(
                 f"| [`{cls.__name__}`]({source})`.{field.name}` | {default} | {cost} | {gain} |"
                 f" [{measured}]({measured}) |"
@@ -149,7 +146,5 @@ def knob_rows(cls: Any) -> list[str]:
 
 @entry
 def knobs(run: Run) -> None:
-    """Writes docs/knobs.md: every setting that trades accuracy or memory for speed, from the code
-    itself.
-    """
+    """Writes docs/knobs.md, every setting that trades accuracy or memory for speed."""
     PAGE.write_text(page())

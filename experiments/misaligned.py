@@ -1,6 +1,7 @@
-"""People who move between their photos: what refinement gains where one pose stands for all."""
+"""Measures what refinement gains for people who move between photos that share one pose."""
 
 import dataclasses
+import functools
 from typing import Any
 from unittest import mock
 
@@ -32,13 +33,15 @@ from humangs_jax.synthetic.writer import Stream, View, capture_views, sample_pos
 MOVED_STREAM = 77
 """Random stream of a seed, for the movements between photos."""
 MOVED_JOINTS = 22
-"""Joints of trunk, limbs and head, which come first in the body."""
+"""Number of joints of trunk, limbs and head, which come first in the body."""
 SMALL = 0.02
 """Radians of the first movement whose size in centimetres is measured."""
 NEVER = float("inf")
-"""For `search.STILL`: no photo is moved."""
+"""Value of `search.STILL` with which no photo is moved."""
 SHOWN = {"psnr": ("PSNR", 2), "psnr_fg": ("foreground PSNR", 2), "lpips": ("LPIPS", 3)}
-"""Scores of the table: heading and digits. LPIPS is missing where its weights are not installed."""
+"""{score: its heading and digits in the table}. LPIPS is missing where its weights are not
+installed.
+"""
 
 
 @entry
@@ -48,10 +51,10 @@ def misaligned(
     centimetres: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0),
     views: int = 4,
 ) -> None:
-    """What iterations gain where the person has moved between the photos, which share one pose.
+    """Measures what iterations gain where the person has moved between photos that share one pose.
 
-    The pose is the mean of those that the photos show; held-out views show the pose itself.
-    "iterations": on the photos as they are; "and moved photos": as `refine` makes them.
+    The shared pose is the mean of those that the photos show. Held-out views show the shared pose.
+    "iterations" uses the photos unchanged. "and moved photos" moves them as `refine` does.
 
     Options:
     centimetres: mean distance of the vertices from where the pose has them
@@ -60,14 +63,14 @@ def misaligned(
     start, rows = people.start(), {}
     for seed in start.seeds:
         for far in centimetres:
-            rows[f"{seed} {far:g}"] = lambda seed=seed, far=far: _measured(start, seed, far, views)
+            rows[f"{seed} {far:g}"] = functools.partial(_measured, start, seed, far, views)
     settings = start.settings | {"views": views, "centimetres": centimetres}
     found = run.rows(rows, settings)
     run.show(misaligned_section(found, centimetres), found)
 
 
 def _measured(start: Start, seed: int, far: float, views: int) -> dict[str, Any]:
-    """Scores of held-out views before the iterations, and after them in both ways."""
+    """Returns the scores of held-out views before the iterations, and after them in both ways."""
     photos = moved_photos(start, seed, far, views)
     held = HeldOut(start.held_out.views, 0, 1)
     truth = make_evaluation_subject(seed, start.body, [1], start.size, held).held_out
@@ -91,7 +94,9 @@ def _measured(start: Start, seed: int, far: float, views: int) -> dict[str, Any]
 
 
 def moved_photos(start: Start, seed: int, far: float, views: int) -> Capture:
-    """Photos of a person in poses around one, and the one as the pose of all."""
+    """Returns a capture whose photos show a person in poses around one pose, and which has that
+    pose for all of them.
+    """
     subject = make_subject(seed, start.body)
     still = sample_pose(subject, 0)
     rng = np.random.default_rng([seed, Stream.CAMERAS])
@@ -107,10 +112,11 @@ def moved_photos(start: Start, seed: int, far: float, views: int) -> Capture:
 
 
 def moved_poses(still: PosedSubject, centimetres: float, count: int) -> list[PosedSubject]:
-    """The person in as many poses around a pose; vertices are off it by this much in the mean.
+    """Returns the person in `count` poses around a pose, from which vertices are this far away in
+    the mean.
 
-    Joints turn by about the same angle each. The mean of the turns is zero, so that the pose is
-    what a fit to all of them finds.
+    All joints turn by about the same angle. The mean of the turns is zero, so that a fit to all
+    poses finds the pose in the middle.
     """
     if not centimetres:
         return [still] * count
@@ -129,7 +135,7 @@ def moved_poses(still: PosedSubject, centimetres: float, count: int) -> list[Pos
 
 
 def misaligned_section(rows: dict[str, Any], centimetres: tuple[float, ...]) -> str:
-    """The table of the page: means over the people, and the least gain of any of them."""
+    """Formats the table of the page: means over the people, and the least gain of a person."""
     lines = []
     for far in centimetres:
         people = [row for name, row in rows.items() if name.split()[1] == f"{far:g}"]
