@@ -121,10 +121,17 @@ def write_bvh(
 ):
     """The text of a BVH file of a body with the joints `rest` (55, 3) in T-pose, in centimetres.
 
-    poses: (m, 55, 3). names: ours -> the file's; other joints are left out. frames_of: see above.
-    moves: (m, 3), where the pelvis is. up: a rotation of the whole world. pelvis: (m) rotations by
-    which the pelvis's joint is turned as well; joints at its place turn back: its children there,
-    and for the others Carrier0 and so on.
+    Args:
+        rest: joints (55, 3), metres.
+        poses: axis-angle rotations (m, 55, 3).
+        names: the file's name for each of our joints; joints without a name are left out.
+        frames_of: the rotation of each joint's axes at rest, by default of `rest_frames`.
+        moves: places (m, 3) of the pelvis, metres.
+        order: the axes of the Euler angles.
+        unit: lengths of the file in a metre.
+        up: a rotation of the whole world.
+        pelvis: m further turns of the pelvis's joint. They are undone by its children that lie at
+            its place, and for the other children by a joint in between, `Carrier` and a number.
     """
     frames_of = frames_of or rest_frames()
     moves = np.tile([0.1, 0.9, -0.2], (len(poses), 1)) if moves is None else moves
@@ -149,6 +156,7 @@ def write_bvh(
         yield f"{tab}\tOFFSET {' '.join(f'{unit * x:.8f}' for x in offset)}"
         yield f"{tab}\tCHANNELS {move} {' '.join(f'{axis}rotation' for axis in order)}"
         for child in children[name]:
+            # a child elsewhere than the pelvis hangs on a joint that undoes the turn
             if (
                 name not in above
                 and pelvis is not None
@@ -173,6 +181,7 @@ def write_bvh(
         f"Frames: {len(poses)}",
         "Frame Time: 0.0083333",
     ]
+    # numbers of a frame in the order of the joints above
     for frame, (pose, move) in enumerate(zip(poses, moves, strict=True)):
         world, numbers = {}, list(unit * up.apply(move))
         for name in written:
@@ -181,6 +190,7 @@ def write_bvh(
                 continue
             own = Rotation.from_rotvec(pose[INDEX[name]])
             world[name] = own if name not in above else world[above[name]] * own
+            # the joint's turn from the file's rest frame, then from its parent's
             theirs = up * world[name] * (up * frames_of[name]).inv()
             if name in above:
                 holder = up * world[above[name]] * (up * frames_of[above[name]]).inv()

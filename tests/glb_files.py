@@ -22,8 +22,20 @@ def write_glb(
     titles=(),
     **more_of_file,
 ):
-    """A skinned skeleton in motion; `above`: the node that it hangs on, as programs of centimetres
-    and z up write it.
+    """Writes a skinned skeleton in motion.
+
+    Args:
+        path: the file.
+        rest: joints (55, 3) of the rest pose.
+        poses: axis-angle rotations (m, 55, 3).
+        moves: places (m, 3) of the pelvis.
+        names: the file's name for each of our joints; joints without a name are left out.
+        fps: frames in a second.
+        above: a node that the skeleton hangs on; its matrix may have other units and another up.
+        interpolation: of the keys, as glTF names it.
+        more: poses of further animations.
+        titles: names of the animations.
+        **more_of_file: further entries of the document.
     """
     writer, joints = GlbWriter(), [name for name in JOINT_NAMES if name in names]
     place = {name: i for i, name in enumerate(joints)}
@@ -31,6 +43,7 @@ def write_glb(
     times = writer.array("SCALAR", np.arange(len(poses)) / fps, bounds=True)
 
     def animate(node, path_, values):
+        # tangents before and after each value, 0: the values themselves are hit
         if interpolation == "CUBICSPLINE":
             values = np.stack(
                 [np.zeros_like(values), values, np.zeros_like(values)], axis=1
@@ -42,6 +55,7 @@ def write_glb(
         channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path_}})
 
     inverse = []
+    # nodes lie at the joints of the rest pose; the skin undoes it and the node above
     outer = np.eye(4) if above is None else np.reshape(above["matrix"], (4, 4)).T
     for name in joints:
         j, p = INDEX[name], PARENTS[INDEX[name]]
@@ -64,6 +78,7 @@ def write_glb(
     }
     document = {"scene": 0, "scenes": [{"nodes": roots}], "nodes": nodes, "skins": [skin]}
     animations = []
+    # one animation for each series of poses
     for i, each in enumerate((poses, *more)):
         channels, samplers = [], []
         for name in joints:

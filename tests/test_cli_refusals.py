@@ -32,6 +32,7 @@ def things(tmp_path_factory, capture_folder):
     shutil.copytree(capture_folder, path / "someone")
     save_capture(path / "bare", dataclasses.replace(load_capture(capture_folder), masks=None))
     save_tiny_avatar(path / "me.npz")
+    # damaged avatars
     data = (path / "me.npz").read_bytes()
     (path / "truncated.npz").write_bytes(data[: len(data) // 2])
     middle = data.index(b"quats.npy") + 100
@@ -45,6 +46,7 @@ def things(tmp_path_factory, capture_folder):
     del header["checksum"]
     write("nan.npz", header=json.dumps(header), means=np.full((3, 3), np.nan, np.float32))
     np.savez(path / "no_keys.npz", header=arrays["header"])
+    # files of other kinds, and motions of other skeletons and places
     write_png(path / "photo.png", np.ones((8, 8, 3)))
     (path / "cloud.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
     np.savez(path / "ten.npz", poses=np.zeros((2, 30)), trans=np.zeros((2, 3)), mocap_framerate=30)
@@ -52,6 +54,7 @@ def things(tmp_path_factory, capture_folder):
         path / "far.npz", poses=np.zeros((2, 165)), trans=np.full((2, 3), 1e6), mocap_framerate=30
     )
     np.savez(path / "pickled.npz", poses=np.array([{"a": 1}], dtype=object), trans=np.zeros((1, 3)))
+    # folders and captures that lack something
     (path / "folder.npz").mkdir()
     (path / "some").mkdir()
     (path / "some" / "thesis.tex").write_text("mine")
@@ -60,6 +63,7 @@ def things(tmp_path_factory, capture_folder):
         rotations=lambda x: np.nan * x,
     )
     next((shutil.copytree(capture_folder, path / "lacking") / "images").iterdir()).unlink()
+    # what is sound, and may not be overwritten
     small_avatar().save(path / "three.npz")
     for name, joints in (("jump", 55), ("few", 10), ("steps", 3)):
         save_motion(path / f"{name}.npz", Motion(jnp.zeros((4, joints, 3)), jnp.zeros((4, 3)), 4.0))

@@ -140,8 +140,9 @@ def test_without_masks_no_preset_that_refines_is_tried(monkeypatch):
 
 @pytest.mark.slow
 def test_tuning_for_real(tmp_path, monkeypatch, capsys):
-    """The smallest network finds the better of two presets in a large budget, none in a tiny one;
-    `reconstruct`, `animate` and `render` take the file.
+    """A large budget gives the better of two presets, a tiny one none.
+
+    `reconstruct` and `render` read the file that is written.
     """
     monkeypatch.chdir(tmp_path)
     config, demo = presets.tiny().with_conventions(body_vertices=500), load_capture("demo_capture")
@@ -149,6 +150,7 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     save_capture(tmp_path / "someone", capture)
     variables = init_humangs(jax.random.key(0), config)
     save_weights(tmp_path / "tiny.safetensors", variables, config)
+    # only two presets, both quick enough for a test
     small = Runtime(image_size=32)
     fast = Settings(views=1, runtime=small, splat="fast")
     refined = Settings(runtime=small, refine_iterations=1, refine_steps=3)
@@ -158,17 +160,10 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
         monkeypatch.delitem(PRESETS, name)
     found = tune(variables, config, capture, reconstruct_ms=1e8, frame_ms=1e8, size=32)
     assert found.name == "balanced" and set(found.measured) == {"realtime", "balanced"}
-    command = (
-        "tune",
-        "someone",
-        "--weights",
-        "tiny.safetensors",
-        "--size",
-        "32",
-        "--out",
-        "tuned.json",
-    )
+    weights = ("--weights", "tiny.safetensors")
+    command = ("tune", "someone", *weights, "--size", "32", "--out", "tuned.json")
 
+    # a budget that no preset keeps to, then one that both keep to
     code, _, err = run(monkeypatch, capsys, *command, "--reconstruct-ms", "0.001")
     assert code == 1 and "no preset is within the budget" in err.splitlines()[-1]
     assert not (tmp_path / "tuned.json").exists()
@@ -180,19 +175,12 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     assert "balanced: " in out and " ms a reconstruction, " in out
     assert load_settings(tmp_path / "tuned.json") == refined
 
+    # the commands take the written file
     run_with = lambda *words: run(monkeypatch, capsys, *words, "--config", "tuned.json")
-    code, _, err = run_with("reconstruct", "someone", "--weights", "tiny.safetensors", "--no-check")
+    code, _, err = run_with("reconstruct", "someone", *weights, "--no-check")
     assert code == 0 and len(Avatar.load("avatar.npz").gaussians.means), err
     save_capture(tmp_path / "unmasked", dataclasses.replace(capture, masks=None))
-    words = (
-        "reconstruct",
-        "unmasked",
-        "--weights",
-        "tiny.safetensors",
-        "--no-check",
-        "--out",
-        "plain.npz",
-    )
+    words = ("reconstruct", "unmasked", *weights, "--no-check", "--out", "plain.npz")
     code, out, err = run(monkeypatch, capsys, *words, "--preset", "balanced")
     assert code == 0 and "no masks: the avatar is not refined" in out + err, err
     code, _, err = run_with("render", "avatar.npz", "--size", "32", "--views", "2")

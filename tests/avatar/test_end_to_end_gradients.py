@@ -93,6 +93,7 @@ class Case:
             offset_scale=None if published else 0.25,
             skinning_joints=JOINTS if self.bare else None,
         )
+        # parts, then conventions, as the fields of the case say
         model = model.with_parts(
             encoder=dataclasses.replace(
                 encoder, transformer=transformer, upsampler=None if self.bare else encoder.upsampler

@@ -161,8 +161,9 @@ def test_the_texture_is_what_was_on_the_body(tmp_path):
 
 
 def skinned(path, frame):
-    """The vertices of a frame by the letter of glTF's skins: sum of weights, joint matrices and
-    inverse bind matrices.
+    """Returns the vertices of a frame, computed from the file by the formula of glTF's skins.
+
+    A vertex is the sum over joints of weight, joint matrix and inverse bind matrix.
     """
     content, binary = parse_glb(path.read_bytes())
     get = lambda index: read_accessor(content, binary, index)
@@ -172,6 +173,7 @@ def skinned(path, frame):
     for channel in content.get("animations", [{"channels": []}])[0]["channels"]:
         sampler = content["animations"][0]["samplers"][channel["sampler"]]
         values[channel["target"]["node"], channel["target"]["path"]] = get(sampler["output"])[frame]
+    # the local transform of each node, with the values of the animation where it has some
     for i, node in enumerate(nodes):
         matrix = np.eye(4)
         matrix[:3, :3] = Rotation.from_quat(
@@ -179,6 +181,7 @@ def skinned(path, frame):
         ).as_matrix()
         matrix[:3, 3] = values.get((i, "translation"), node.get("translation", [0, 0, 0]))
         local.append(matrix)
+    # transforms along the hierarchy, then the blend of the joints for each vertex
     above = {child: i for i, node in enumerate(nodes) for child in node.get("children", [])}
     world = lambda i: local[i] if i not in above else world(above[i]) @ local[i]
     skin, part = content["skins"][0], content["meshes"][0]["primitives"][0]["attributes"]
@@ -290,6 +293,7 @@ def test_trimesh_reads_our_obj(tmp_path, monkeypatch, capsys):
     assert "1,280 triangles, feet on 0; x.mtl and x.png belong to it" in capsys.readouterr().out
     assert {path.name for path in tmp_path.glob("x*")} == {"x.obj", "x.mtl", "x.png"}
     read = trimesh.load(tmp_path / "x.obj", process=False)
+    # the file stands on its feet; colors are compared at the places of the avatar
     low = float(np.asarray(one.rest_vertices)[:, 1].min())
     assert len(read.faces) == 1280 and read.bounds[0, 1] == pytest.approx(0, abs=1e-5)
     seen = read.visual.to_color().vertex_colors[:, :3] / 255
@@ -307,6 +311,7 @@ def test_trimesh_reads_our_obj(tmp_path, monkeypatch, capsys):
     names = {path.name for path in tmp_path.glob("x*")}
     assert names == {"x.obj", "x_0000.obj", "x_0002.obj", "x.mtl", "x.png"}
     assert "mtllib x.mtl" in (tmp_path / "x_0002.obj").read_text()[:200]
+    # a frame of the motion, with z up
     placed = grounded(dance(), RestBody(one.rest_vertices, one.rest_joints), PARENTS)
     expected = textured().posed(one, placed.pose(2)).vertices
     frame = trimesh.load(tmp_path / "x_0002.obj", process=False)

@@ -141,13 +141,14 @@ def smallest_three(quats):
 
 
 def compressed_ply(gaussians, colors_bounded=True):
-    """Of PlayCanvas: bounds of each 256, and words between them."""
+    """A file in PlayCanvas's layout: bounds of each 256 Gaussians, and integers between them."""
     g = gaussians
     largest, three = smallest_three(g.quats)
     rotation = largest << np.uint32(30) | packed(three / np.sqrt(2) + 0.5, (10, 10, 10))
     kinds = {"": np.asarray(g.means), "scale_": np.log(g.scales), "c": np.asarray(g.colors)}
     words, bounds, count = {}, {}, len(g.means)
     chunks = [slice(at, at + 256) for at in range(0, count, 256)]
+    # each chunk has bounds; words hold the place between them, from 0 to 1
     for key, values in kinds.items():
         names = "rgb" if key == "c" else [f"{key}{axis}" for axis in "xyz"]
         low, high = (
@@ -175,6 +176,7 @@ def compressed_ply(gaussians, colors_bounded=True):
         np.stack(list(bounds.values()), axis=1).astype("<f4").tobytes()
         + np.stack(vertex, axis=1).astype("<u4").tobytes()
     )
+    # harmonics are bytes of their own element, from -4 to 4
     if g.harmonics is not None:
         rest = np.asarray(g.harmonics).swapaxes(1, 2).reshape(count, -1)
         header += [
@@ -186,10 +188,11 @@ def compressed_ply(gaussians, colors_bounded=True):
 
 
 def spz(gaussians, version):
-    """Of Niantic, by its specification; 4 is `spz_four` of these arrays."""
+    """A file by Niantic's specification, versions 1 to 4; `spz_four` packs version 4."""
     g, bits = gaussians, 12
     k = 0 if g.harmonics is None else g.harmonics.shape[1]
     quats = np.asarray(g.quats) / np.linalg.norm(g.quats, axis=1, keepdims=True)
+    # three components of the quaternion as bytes, from version 3 on the three smallest
     if version < 3:
         rotations = (
             np.rint(127.5 * np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] + 127.5)
@@ -204,6 +207,7 @@ def spz(gaussians, version):
             words = words | np.rint(511 * np.sqrt(2) * np.abs(part)).astype(np.uint32)
         rotations = words.astype("<u4").tobytes()
     byte = lambda x: np.clip(np.rint(x), 0, 255).astype("u1").tobytes()
+    # places: 24 bits of fixed point, in version 1 half floats
     fixed = np.rint(np.asarray(g.means) * 2**bits).astype(int).reshape(-1).tolist()
     places = b"".join((n % 2**24).to_bytes(3, "little") for n in fixed)
     places = np.asarray(g.means).astype("<f2").tobytes() if version == 1 else places
@@ -254,6 +258,7 @@ def glb(gaussians, node=None, change=lambda content: None, short=False):
     ]
     if g.harmonics is not None:
         columns |= {name: g.harmonics[:, i] for i, name in enumerate(names[: g.harmonics.shape[1]])}
+    # an attribute is an accessor and a view into the binary chunk
     binary, views, accessors = b"", [], []
     for name, values in columns.items():
         small = short and name.endswith("ROTATION")
@@ -287,6 +292,7 @@ def glb(gaussians, node=None, change=lambda content: None, short=False):
     }
     content |= {"meshes": [{"primitives": [part]}], "accessors": accessors, "bufferViews": views}
     content |= {"buffers": [{"byteLength": len(binary)}]}
+    # `change` may damage the document before it is written
     change(content)
     text = json.dumps(content).encode()
     text += b" " * (-len(text) % 4)

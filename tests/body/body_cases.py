@@ -66,6 +66,7 @@ def oracle(body, betas, rotations, translation):
             [(Rotation.from_rotvec(r).as_matrix() - np.eye(3)).ravel() for r in rotations[1:]]
         )
         rest = rest + np.stack([d @ feature for d in get("pose_directions")])
+    # from the rest pose to the world: the rest joint is moved to 0 first
     transforms = []
     for frame, joint in zip(world_frames(joints, body.parents, rotations), joints, strict=True):
         to_joint = np.eye(4)

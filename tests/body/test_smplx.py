@@ -72,6 +72,7 @@ def compare_body(model: Path, arrays: Path) -> list[tuple[str, int, float, float
     number = lambda key, i: jnp.asarray(expected[key][i])
     for convention, (suffix, use_pca, flat_hand_mean) in CONVENTIONS.items():
         for i in range(len(expected["betas"])):
+            # hands are coefficients of PCA or angles, from flat hands or from the mean
             hand = [number(f"{side}_hand_{suffix}", i) for side in ("left", "right")]
             if use_pca:
                 hand = [own @ hands.components[side, : len(own)] for side, own in enumerate(hand)]
@@ -158,8 +159,9 @@ def test_current_files_hold_expressions_after_300_columns(tmp_path):
 
 
 def chumpy_pickle(path, content, wrap):
-    """Write a pickle that names chumpy's classes, with the attributes that chumpy's own pickles
-    carry.
+    """Writes a pickle of chumpy's classes with the attributes that chumpy saves.
+
+    `wrap` names two arrays of `content`: the first becomes a `Ch`, the second a selection of one.
     """
     modules = {
         name: types.ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering")
@@ -177,6 +179,7 @@ def chumpy_pickle(path, content, wrap):
     chumpy = Ch()
     chumpy.x = content[wrap[0]]
     chumpy._dirty_vars = {}
+    # an array that is a selection from another one: its first number is left out
     source, select = Ch(), Select()
     source.x = np.concatenate([[7.0], content[wrap[1]].ravel()])
     select.a, select.idxs, select.preferred_shape = (

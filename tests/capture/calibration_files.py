@@ -69,18 +69,27 @@ def quaternion(rotation):
 
 
 def write_colmap(folder, K, poses, names, model="PINHOLE", extra=(), seen=None, world_points=None):
-    """seen: of each view (n, 2) pixels of world_points, or None for empty second lines."""
+    """Writes cameras.txt, images.txt and points3D.txt, as COLMAP does.
+
+    Args:
+        folder: where to; made if needed.
+        K: intrinsics of the views (v, 3, 3).
+        poses: from the world to the cameras (v, 4, 4).
+        names: of the images.
+        model: COLMAP's name of the camera model.
+        extra: the parameters of the model that follow the principal point.
+        seen: for each view the pixels (n, 2) of `world_points`, or None for empty second lines.
+        world_points: points (n, 3), or None for no file of them.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     lines = ["# Camera list with one line of data per camera:"]
     for i, k in enumerate(K, 1):
-        focal = (
-            [k[0, 0]]
-            if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-            else [k[0, 0], k[1, 1]]
-        )
+        one_focal = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+        focal = [k[0, 0]] if one_focal else [k[0, 0], k[1, 1]]
         values = " ".join(repr(float(x)) for x in [*focal, k[0, 2], k[1, 2], *extra])
         lines.append(f"{i} {model} {WIDTH} {HEIGHT} {values}")
     (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
+    # identifiers do not start at 0 and differ between files
     lines = [
         "# Image list with two lines of data per image:",
         "#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME",
@@ -88,11 +97,10 @@ def write_colmap(folder, K, poses, names, model="PINHOLE", extra=(), seen=None, 
     for i, (pose, name) in enumerate(zip(poses, names, strict=True)):
         values = " ".join(repr(float(x)) for x in [*quaternion(pose[:3, :3]), *pose[:3, 3]])
         lines.append(f"{i + 10} {values} {i + 1} {name}")
-        seen_here = (
-            []
-            if seen is None
-            else [f"{x!r} {y!r} {j + 5}" for j, (x, y) in enumerate(seen[i].tolist())]
-        )
+        seen_here = []
+        if seen is not None:
+            seen_here = [f"{x!r} {y!r} {j + 5}" for j, (x, y) in enumerate(seen[i].tolist())]
+        # the last one is a pixel without a point
         lines.append(" ".join([*seen_here, "3.5 4.5 -1"]) if seen_here else "")
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     if world_points is not None:

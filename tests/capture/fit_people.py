@@ -161,29 +161,40 @@ def _landmarks(names):
 def person(
     seed, frames, views, *, still=False, even=False, moving=False, outliers=0.0, kind=COCO_17
 ):
-    """A capture and noisy keypoints of it, views of a frame one after the other, named m0v0, m0v1,
-    ...
+    """Returns a capture without photos and noisy keypoints of it.
 
-    still: cameras are the same for all frames. even: evenly spaced around the person. moving: from
-    one pose to another in 8 frames, and not at random.
+    Views of a frame follow each other and are named m0v0, m0v1 and so on.
+
+    Args:
+        seed: of poses, cameras and noise.
+        frames: number of moments.
+        views: number of views of a moment.
+        still: whether the cameras are the same in all frames.
+        even: whether the cameras are evenly spaced around the person.
+        moving: whether the person moves from one random pose to the next in 8 frames; else each
+            frame has a random pose.
+        outliers: share of the keypoints that are far from where they belong.
+        kind: the set of keypoints.
     """
     rng = np.random.default_rng(seed)
     prior = pose_prior(default_body().joint_names)
     rotations = prior.mean + prior.std * rng.normal(0, 0.7, (frames, *prior.mean.shape))
     rotations = np.clip(rotations, prior.lower, prior.upper)
+    # the whole body turns about the vertical only
     rotations[:, 0] = [[0, angle, 0] for angle in rng.uniform(-np.pi, np.pi, frames)]
     if moving:
         rotations[:, 0] = rotations[0, 0]
+        # a smooth step between two of the random poses
         whole, share = np.divmod(np.arange(frames) / 8, 1)
         share = (1 - np.cos(np.pi * share[:, None, None])) / 2
-        rotations = (
-            rotations[whole.astype(int)] * (1 - share) + rotations[whole.astype(int) + 1] * share
-        )
+        first = whole.astype(int)
+        rotations = rotations[first] * (1 - share) + rotations[first + 1] * share
     poses = jax.vmap(BodyPose)(jnp.asarray(rotations, jnp.float32), jnp.zeros((frames, 3)))
     cameras = _cameras(rng, frames, views, still, even)
     landmarks = np.asarray(_landmarks(kind.names)(poses))
     frame_of = np.repeat(np.arange(frames), views)
     matrices = np.asarray(cameras.cam_from_world)
+    # landmarks in pixels, with noise and some far away
     local = (
         np.einsum("vab,vkb->vka", matrices[:, :3, :3], landmarks[frame_of])
         + matrices[:, None, :3, 3]

@@ -204,6 +204,7 @@ def test_pixel_centers_can_be_overridden(tmp_path):
 
 
 def test_file_storage():
+    # what OpenCV writes: nested maps, lists in lines and in brackets, and matrices
     text = """%YAML:1.0
 ---
 count: 3   # a comment

@@ -124,6 +124,7 @@ def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_p
         cameras=replace(fitted.capture.cameras, cam_from_world=moved),
         displacement=kept,
     )
+    # the new folder is complete, and the old one unchanged
     target = check_place(folder[0], tmp_path / "out", overwrite=False)
     write_fitted(folder[0], target, capture, fitted.report)
     again = load_capture(target)
@@ -138,6 +139,7 @@ def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_p
         ),
     ):
         check_place(folder[0], target, overwrite=False)
+    # folders that are not ours, or that hold what is read, are refused
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "diary.txt").write_text("mine")
     with pytest.raises(ValueError, match=r"holds no capture\.json"):

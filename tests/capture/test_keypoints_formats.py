@@ -445,85 +445,39 @@ def test_names_are_different_and_mirrors_are_mutual(keypoint_set):
             assert other == name
 
 
-def test_points_are_where_the_tools_have_them():
-    """Numbers from COCO's, COCO-WholeBody's and OpenPose's pages."""
-    for keypoint_set, numbers in (
-        (
-            COCO_17,
-            {
-                0: "nose",
-                1: "left_eye",
-                4: "right_ear",
-                9: "left_wrist",
-                12: "right_hip",
-                16: "right_ankle",
-            },
-        ),
-        (
-            COCO_WHOLEBODY_133,
-            {
-                17: "left_big_toe",
-                19: "left_heel",
-                20: "right_big_toe",
-                22: "right_heel",
-                23: "face_0",
-                90: "face_67",
-            }
-            | {
-                91: "left_hand_root",
-                95: "left_thumb_tip",
-                96: "left_index_1",
-                112: "right_hand_root",
-            }
-            | {132: "right_pinky_tip"},
-        ),
-        (
-            OPENPOSE_67,
-            {
-                1: "neck",
-                2: "right_shoulder",
-                4: "right_wrist",
-                5: "left_shoulder",
-                8: "mid_hip",
-                9: "right_hip",
-            }
-            | {
-                14: "left_ankle",
-                15: "right_eye",
-                18: "left_ear",
-                19: "left_big_toe",
-                24: "right_heel",
-            }
-            | {
-                25: "left_hand_root",
-                46: "right_hand_root",
-                47: "right_thumb_1",
-                50: "right_thumb_tip",
-                66: "right_pinky_tip",
-            },
-        ),
-        (
-            MEDIAPIPE_33,
-            {
-                0: "nose",
-                2: "left_eye",
-                5: "right_eye",
-                8: "right_ear",
-                11: "left_shoulder",
-                16: "right_wrist",
-            }
-            | {
-                17: "left_pinky_1",
-                20: "right_index_1",
-                22: "right_thumb_2",
-                24: "right_hip",
-                28: "right_ankle",
-            }
-            | {1: "face_42", 6: "face_36", 9: "face_54", 30: "right_heel", 32: "right_foot_index"},
-        ),
-    ):
-        for i, name in numbers.items():
-            assert keypoint_set.names[i] == name
+PAGES = [
+    (
+        COCO_17,
+        "0 nose, 1 left_eye, 4 right_ear, 9 left_wrist, 12 right_hip, 16 right_ankle",
+    ),
+    (
+        COCO_WHOLEBODY_133,
+        "17 left_big_toe, 19 left_heel, 20 right_big_toe, 22 right_heel, 23 face_0, 90 face_67, "
+        "91 left_hand_root, 95 left_thumb_tip, 96 left_index_1, 112 right_hand_root, "
+        "132 right_pinky_tip",
+    ),
+    (
+        OPENPOSE_67,
+        "1 neck, 2 right_shoulder, 4 right_wrist, 5 left_shoulder, 8 mid_hip, 9 right_hip, "
+        "14 left_ankle, 15 right_eye, 18 left_ear, 19 left_big_toe, 24 right_heel, "
+        "25 left_hand_root, 46 right_hand_root, 47 right_thumb_1, 50 right_thumb_tip, "
+        "66 right_pinky_tip",
+    ),
+    (
+        MEDIAPIPE_33,
+        "0 nose, 1 face_42, 2 left_eye, 5 right_eye, 6 face_36, 8 right_ear, 9 face_54, "
+        "11 left_shoulder, 16 right_wrist, 17 left_pinky_1, 20 right_index_1, 22 right_thumb_2, "
+        "24 right_hip, 28 right_ankle, 30 right_heel, 32 right_foot_index",
+    ),
+]
+"""Numbers of points on the tools' pages."""
+
+
+@pytest.mark.parametrize(("keypoint_set", "points"), PAGES)
+def test_points_are_where_the_tools_have_them(keypoint_set, points):
+    for point in points.split(", "):
+        number, name = point.split()
+        assert keypoint_set.names[int(number)] == name
 
 
 def test_landmarks_of_the_face_mirror_as_in_300w():

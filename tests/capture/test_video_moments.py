@@ -129,28 +129,10 @@ def encode(path, frames, rate, *options, filters="null", pixels="yuv420p", codec
 
     height, width = frames[0].shape[:2]
     data = b"".join(np.rint(65535 * np.clip(each, 0, 1)).astype("<u2").tobytes() for each in frames)
-    command = [
-        imageio_ffmpeg.get_ffmpeg_exe(),
-        "-y",
-        "-v",
-        "error",
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb48le",
-    ]
-    command += [
-        "-s",
-        f"{width}x{height}",
-        "-r",
-        str(rate),
-        "-i",
-        "-",
-        "-vf",
-        filters,
-        "-fps_mode",
-        "passthrough",
-    ]
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb48le", "-s", f"{width}x{height}", "-r", str(rate)]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", *raw, "-i", "-"]
+    # no frame is repeated or dropped to keep a rate
+    command += ["-vf", filters, "-fps_mode", "passthrough"]
     quality = ["-crf", "6", "-preset", "ultrafast"] if codec == "libx264" else []
     command += ["-c:v", codec, *quality, "-pix_fmt", pixels, *options, str(path)]
     subprocess.run(command, input=data, check=True, capture_output=True)
@@ -171,6 +153,7 @@ def test_videos_of_other_rates_and_with_gaps_become_frames_of_one_moment(tmp_pat
     (tmp_path / "videos").mkdir()
     encode(tmp_path / "videos" / "a.mp4", [moment(i / 10) for i in range(20)], 10)
     encode(tmp_path / "videos" / "b.mp4", [moment(i / 30) for i in range(60)], 30)
+    # c lacks frames in the middle, the late one those at its start
     dropped = "select=not(between(n\\,5\\,9))"
     late = "select=not(lt(n\\,4))"
     encode(tmp_path / "videos" / "c.mp4", [moment(i / 10) for i in range(20)], 10, filters=dropped)
@@ -187,6 +170,7 @@ def test_videos_of_other_rates_and_with_gaps_become_frames_of_one_moment(tmp_pat
         " s apart" in str(report)
     )
     assert "warning: c: no frame at 5 moments (0.50 to 0.90 s): left out there" in str(report)
+    # of every fourth moment the first three, one of them in the gap
     report = import_cameras(
         tmp_path / "rig.json", tmp_path / "videos", tmp_path / "few", up="+y", every=4, frames=3
     )
@@ -198,26 +182,20 @@ def test_videos_of_other_rates_and_with_gaps_become_frames_of_one_moment(tmp_pat
 
 
 def test_masks_are_those_of_the_frames_they_go_with(tmp_path):
-    """The gap of a camera is none of its masks' video, which another program wrote."""
+    """A camera's video has a gap in its times, and the video of its masks has none."""
     K, poses = written.scene(2)
     written.write_calibration_full(tmp_path / "rig.json", K, poses, ("a", "b"))
     for kind in ("videos", "masks"):
         (tmp_path / kind).mkdir()
         for name in ("a", "b"):
             times = [i for i in range(12) if name == "a" or not 4 <= i < 8]
-            frames = [
-                (
-                    moment(i / 10)
-                    if kind == "videos"
-                    else np.eye(48, 64)[..., None] * [1, 1, 1] + (i > 7)
-                )
-                for i in times
-            ]
-            gap = (
-                "select=1,setpts=if(gte(N\\,4)\\,PTS+4/TB/10\\,PTS)"
-                if name == "b" and kind == "videos"
-                else "null"
-            )
+            gap = "null"
+            if kind == "videos":
+                frames = [moment(i / 10) for i in times]
+                if name == "b":  # its times show the gap, those of its masks do not
+                    gap = "select=1,setpts=if(gte(N\\,4)\\,PTS+4/TB/10\\,PTS)"
+            else:
+                frames = [np.eye(48, 64)[..., None] * [1, 1, 1] + (i > 7) for i in times]
             encode(tmp_path / kind / f"{name}.mp4", frames, 10, filters=gap)
     import_cameras(
         tmp_path / "rig.json",
@@ -227,28 +205,8 @@ def test_masks_are_those_of_the_frames_they_go_with(tmp_path):
         up="+y",
     )
     photos = load_photos(tmp_path / "out")
-    assert photos.frames.tolist() == [
-        0,
-        0,
-        1,
-        1,
-        2,
-        2,
-        3,
-        3,
-        4,
-        5,
-        6,
-        7,
-        8,
-        8,
-        9,
-        9,
-        10,
-        10,
-        11,
-        11,
-    ]
+    both = lambda frames: np.repeat(frames, 2).tolist()
+    assert photos.frames.tolist() == [*both(range(4)), 4, 5, 6, 7, *both(range(8, 12))]
     covered = photos.masks.mean(axis=(1, 2)) > 0.5
     assert covered.tolist() == (photos.frames > 7).tolist()
 

@@ -65,6 +65,7 @@ def test_a_format_of_cameras_is_one_row(tmp_path, made_up, capsys):
     written.write_photos(tmp_path, [f"c{i}.png" for i in range(len(cameras))])
     (tmp_path / "studio.rig").write_text("RIG")
     assert inspect_folder(tmp_path).cameras == tmp_path
+    # read from the folder and from the file, shown in the help, in the docs and in the error
     for i, source in enumerate((tmp_path, tmp_path / "studio.rig")):
         report = import_cameras(source, tmp_path, tmp_path.with_name(f"out{i}"))
         assert (

@@ -86,8 +86,13 @@ def cone(body, hem):
 
 
 def in_clothes(body, rotations=None, worn=None, grown=0.0):
-    """A capture of the body, its skin `grown` along the normals, and of something worn in the
-    T-pose.
+    """Returns a capture of a body, in views all around, with masks.
+
+    Args:
+        body: the body model.
+        rotations: its pose; without one the T-pose.
+        worn: (vertices, faces) of something that is seen as well and does not move.
+        grown: distance by which the skin lies outwards, metres.
     """
     pose = BodyPose(
         jnp.zeros((len(body.parents), 3)) if rotations is None else rotations, jnp.zeros(3)
@@ -95,19 +100,13 @@ def in_clothes(body, rotations=None, worn=None, grown=0.0):
     rest = shape_body(body, jnp.zeros(len(body.shape_names)))
     skin = replace(rest, vertices=rest.vertices + grown * vertex_normals(rest.vertices, body.faces))
     posed = pose_body(body, skin, pose).vertices
-    parts = [(posed, body.faces)] + (
-        [] if worn is None else [(jnp.asarray(worn[0], jnp.float32), jnp.asarray(worn[1]))]
-    )
+    parts = [(posed, body.faces)]
+    if worn is not None:
+        parts.append((jnp.asarray(worn[0], jnp.float32), jnp.asarray(worn[1])))
     K = intrinsics_from_fov(np.pi / 3, SIZE, SIZE)
-    cameras = orbit(
-        jnp.asarray([0.0, -0.5, 0.0]),
-        2.4,
-        jnp.linspace(0, 2 * np.pi, VIEWS + 1)[:-1],
-        0.1,
-        K,
-        SIZE,
-        SIZE,
-    )
+    angles = jnp.linspace(0, 2 * np.pi, VIEWS + 1)[:-1]
+    cameras = orbit(jnp.asarray([0.0, -0.5, 0.0]), 2.4, angles, 0.1, K, SIZE, SIZE)
+    # a pixel belongs to the person where any part is seen
     shown = lambda i: np.any(
         [np.asarray(rasterizer()(*part, cameras[i]).face_ids) >= 0 for part in parts], axis=0
     )

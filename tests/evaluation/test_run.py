@@ -60,6 +60,7 @@ def psnr(x, y):
 
 def test_every_image_is_a_row_and_means_are_in_their_order(people, tmp_path):
     found = evaluate(cases(people), method=predicting(people), protocol="lhm")
+    # scores and their mean, computed here
     expected = {
         name: [psnr(*pair) for pair in zip(p, c.images, strict=True)]
         for name, (c, p) in people.items()
@@ -80,6 +81,7 @@ def test_every_image_is_a_row_and_means_are_in_their_order(people, tmp_path):
         and "no weights of LPIPS squeeze were given" in text
         and "IoU" in text
     )
+    # the same numbers in every kind of report
     files = {kind: tmp_path / f"a.{kind}" for kind in ("json", "html", "csv", "markdown", "latex")}
     found.write(**files)
     report = json.loads(files["json"].read_text())
@@ -288,6 +290,7 @@ def test_what_is_wrong_is_one_line(people, folders, tmp_path):
         ValueError, match=r"no prediction was found; 8 were expected: .*ann/front\.png"
     ):
         evaluate(folders, predictions=theirs)
+    # predictions of another size, and only some with transparency
     write_predictions(theirs, {"ann": people["ann"]})
     write_png(theirs / "ann" / "back.png", np.zeros((20, 30, 3)))
     with pytest.raises(
@@ -299,6 +302,7 @@ def test_what_is_wrong_is_one_line(people, folders, tmp_path):
         ValueError, match="1 of 4 images have an alpha channel: expected all or none"
     ):
         evaluate(folders, predictions=theirs)
+    # methods and protocols that do not fit the people
     with pytest.raises(ValueError, match="avatar and weights: expected one of them"):
         evaluate(folders, avatar=tmp_path, weights="w.safetensors")
     with pytest.raises(
@@ -448,6 +452,7 @@ def test_avatars_and_weights_are_drawn_on_the_protocols_background(tmp_path):
         assert by_weights.means["psnr"].mean > 24 and by_weights.means["iou"].mean > 0.9
         corner = by_avatar.gallery.shots
         assert len(corner) == 6 and by_weights.gallery.shots == {}
+        # an invisible avatar leaves the background of the protocol
         dimmed = replace(avatar.gaussians, opacities=jnp.zeros_like(avatar.gaussians.opacities))
         nobody = hg.evaluate(
             "demo_capture", avatar=replace(avatar, gaussians=dimmed), protocol=protocol

@@ -237,17 +237,15 @@ def test_people_are_plain_and_a_system_without_poses_sees_one_of_them(tmp_path):
     folder = people.write_plain(tmp_path / "p", "demo", 1, 6, size=64)
     near = people.write_plain(tmp_path / "near", "demo", 1, 6, 4, near=True)
     capture, close = (load_capture(next(x.glob("3*"))) for x in (folder, near))
-    assert capture.images.shape == (12, 64, 64, 3) and close.images.shape == (
-        6,
-        people.SIZE,
-        people.SIZE,
-        3,
-    )
+    assert capture.images.shape == (12, 64, 64, 3)
+    assert close.images.shape == (6, people.SIZE, people.SIZE, 3)
     assert close.masks.mean() > 1.3 * capture.masks.mean()
     assert load_capture(next(near.glob("3*")) / "held_out").frame_count == 2
+    # all people stand in the same light
     body = load_body()
     lights = [people.plain(seed, body).lights for seed in (3_000_000, 3_000_001)]
     jax.tree.map(np.testing.assert_array_equal, *lights)
+    # with one pose, the targets show the pose of the photos
     config = bench.configuration(bench.variants()["lvsm"], 0, 4)
     make = lambda **how: people.on_disk(folder, **how)(config)
     both, one = make(), make(one_pose=True)
@@ -257,6 +255,7 @@ def test_people_are_plain_and_a_system_without_poses_sees_one_of_them(tmp_path):
         for x in [source.example(0, i, 4)]
     }
     assert targets(one) == {False} and targets(both) == {False, True}
+    # recolored people have their color channels in another order, by example
     colored = make(recolored=True)
     plain, changed = both.example(0, 3, 4), colored.example(0, 3, 4)
     orders = itertools.permutations(range(3))

@@ -509,21 +509,18 @@ def test_parts_that_do_not_fit_are_refused():
             ValueError, match=r"(SurfaceMap.size|driver.widths|CorrectionMLP.layers).*expected 1 to"
         ):
             wrong()
+    # drivers that do not fit the pose or the decoder are refused where the network is traced
     config, target = small("lca"), Target(pose(), tube().template)
-    outputs, ctx = (
-        jax.eval_shape(
-            lambda v: apply_humangs(v, inputs_of("lca"), config)[0], random_variables(config)
-        ),
-        config.forward_context(),
-    )
-    for driver, said in (
+    run = lambda variables: apply_humangs(variables, inputs_of("lca"), config)[0]
+    outputs, ctx = jax.eval_shape(run, random_variables(config)), config.forward_context()
+    for driver, problem in (
         (CorrectionMLP(8, 1, joints=5), r"driver\.joints 5: the pose has 2 joints"),
         (
             CorrectionMLP(8, 1, joints=2, gaussians_per_vertex=2),
             r"driver\.gaussians_per_vertex 2: the decoder gives",
         ),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=problem):
             jax.eval_shape(
                 functools.partial(driver.init, ctx=ctx), jax.random.key(0), outputs, target
             )

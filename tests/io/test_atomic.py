@@ -88,6 +88,7 @@ def test_writes_replace_and_leave_nothing_temporary(tmp_path):
             == (tmp_path / "deep" / "folder" / "a.txt").read_text()
             == text
         )
+    # files are added beside others, and some are left out
     (tmp_path / "deep" / "folder" / "mine.txt").write_text("kept")
     atomic.add_files(
         tmp_path / "deep" / "folder",
@@ -102,6 +103,7 @@ def test_writes_replace_and_leave_nothing_temporary(tmp_path):
         "folder"
     ]
     assert (tmp_path / "deep" / "folder" / "b" / "c" / "a.txt").read_text() == "four"
+    # folders that do not exist are made
     atomic.add_files(tmp_path / "deep" / "new", writes_into("five"))
     assert (tmp_path / "deep" / "new" / "a.txt").read_text() == "five"
     atomic.write_text(tmp_path / "none" / "yet" / "file.txt", "text")

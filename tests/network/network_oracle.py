@@ -82,6 +82,7 @@ def random_state(options, seed=0):
         weight(f"{key}.weight", *shape, fan_in=fan_in)
         state[f"{key}.bias"] = rng.normal(size=outputs or shape[0]) * 0.3
 
+    # the encoder
     R, C = o.texture
     state["neural_texture"] = rng.normal(size=(3, R, R, C))
     if o.class_token:
@@ -101,6 +102,7 @@ def random_state(options, seed=0):
         if o.qk_norm:
             norm(f"{block}.attn.q_norm", o.head, bias=False)
             norm(f"{block}.attn.k_norm", o.head, bias=False)
+    # the upsampler: convolutions, and transposed ones, whose first axis is the input
     if o.upsampler:
         for i in range(4):
             affine(f"upsampler.proj.{i}", hidden, o.width, 1, 1)
@@ -116,6 +118,7 @@ def random_state(options, seed=0):
             ("up2.1", hidden // 2),
         ):
             norm(f"upsampler.{key}", width, batch=True)
+    # the decoder reads a token, the class token and an encoded place
     entering = o.width * (1 + o.class_token) + 39
     affine("vertex_decoder.trunk.0", 8, entering)
     affine("vertex_decoder.trunk.2", 8, 8)

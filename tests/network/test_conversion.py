@@ -63,6 +63,7 @@ def test_the_configuration_is_read_off_the_shapes(options, tmp_path):
     assert decoder.skinning_joints == (options.joints if options.skinning_head else None)
     if options.upsampler:
         assert (encoder.upsampler.hidden, reader.output_width) == (8, options.width)
+    # conventions are those of the paper, in a size that patches divide
     size = config.conventions.image_size
     assert (
         config.conventions == published().with_conventions(image_size=size).conventions
@@ -258,6 +259,7 @@ def test_the_command_refuses_code(tmp_path, monkeypatch, capsys):
 
 def test_the_command_converts(tmp_path, monkeypatch, capsys):
     state = oracle.random_state(Options(qk_norm=False))
+    # tensors of the training losses are no part of the network
     losses = {
         "loss_computer.a": FakeTensor(np.ones(2, np.float32)),
         "loss_computer.b": FakeTensor(np.ones(2, np.float32)),
@@ -284,6 +286,7 @@ def test_the_command_converts(tmp_path, monkeypatch, capsys):
     assert config.with_conventions(pool="all") == converted.config.trained
     leaves = zip(*map(jax.tree.leaves, (variables, converted.variables)), strict=True)
     assert all(np.array_equal(*pair) for pair in leaves)
+    # what is converted already, and a file onto itself, are refused
     code, _, error = run(
         monkeypatch, capsys, "convert", weights, "--out", tmp_path / "again.safetensors"
     )

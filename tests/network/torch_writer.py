@@ -45,6 +45,7 @@ def contiguous(shape):
 def pickled(content, extra=lambda tensor: ()):
     """The pickle of `content` and the storages of the tensors in it, named by their number."""
     torch, utils = types.ModuleType("torch"), types.ModuleType("torch._utils")
+    # modules in the place of PyTorch, so that the pickle names its functions and classes
     rebuild = lambda *_: None
     rebuild.__module__, rebuild.__qualname__, rebuild.__name__ = (
         "torch._utils",
@@ -68,6 +69,7 @@ def pickled(content, extra=lambda tensor: ()):
             kind = getattr(torch, value.tensor.kind)
             return ("storage", kind, str(len(storages) - 1), "cpu", size, *extra(value.tensor))
 
+        # the arguments of PyTorch's function that makes a tensor of a storage
         def reducer_override(self, value):
             if not isinstance(value, FakeTensor):
                 return NotImplemented

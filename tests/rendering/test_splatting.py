@@ -171,6 +171,7 @@ def test_gradients_are_derivatives():
         leaves, structure = jax.tree.flatten(arguments)
         slopes = jax.tree.leaves(gradients)
         assert [a.shape for a in leaves] == [a.shape for a in slopes]
+        # one random direction in each array of the arguments
         for i, slope in enumerate(slopes):
             direction = jnp.asarray(rng.normal(size=slope.shape))
             moved = [
@@ -274,6 +275,7 @@ def test_batches_of_subjects_and_views_equal_the_loop():
             return renderings, gradients
 
         renderings, gradients = together(jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects))
+        # renderings are those of single calls, gradients their sum over views
         for i, subject in enumerate(subjects):
             singles = [tiled(subject, cameras[j], background()) for j in range(3)]
             for j, (rendering, _) in enumerate(singles):

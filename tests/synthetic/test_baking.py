@@ -153,15 +153,14 @@ def test_scans_are_read_back_as_they_were(person, tmp_path):
             ..., :3
         ]
         np.testing.assert_array_equal(texture, expected)
+    # the file, drawn in twice the size and averaged, looks like the subject
     camera = surroundings.cameras_around(
         np.random.default_rng(0), posed.vertices, np.asarray([0.5]), 128
     )[0]
     direct, mask = subject.render_view(posed, camera)
     faces, uvs = jnp.asarray(baked.atlas.faces), jnp.asarray(baked.atlas.uvs)
-    vertices, texture = (
-        jnp.asarray(posed.vertices[baked.atlas.vertices]),
-        jnp.asarray(expected / 255, jnp.float32),
-    )
+    vertices = jnp.asarray(posed.vertices[baked.atlas.vertices])
+    texture = jnp.asarray(expected / 255, jnp.float32)
     seen = rasterizer.rasterize_mesh(
         vertices, faces, camera.resized(2 * camera.width, 2 * camera.height)
     )

@@ -41,6 +41,7 @@ def a_linear_model():
         specs = sharding.partition(params, mesh)
         named = on_mesh(specs, mesh)
         placed = sharding.place(params, named)
+        # large arrays are divided, small ones are whole on each device
         assert placed["kernel"].addressable_data(0).size == params["kernel"].size // parts
         assert placed["bias"].addressable_data(0).size == 48
         jax.tree.map(np.testing.assert_array_equal, sharding.whole(placed, mesh), params)
@@ -51,6 +52,7 @@ def a_linear_model():
                 jax.grad(loss)(sharding.gather(params, specs), x, y), specs, mesh
             )
 
+        # each device sees some rows of the batch
         rows = PartitionSpec(sharding.AXES)
         mapped = jax.shard_map(
             gradient, mesh=mesh, in_specs=(specs, rows, rows), out_specs=specs, check_vma=False

@@ -239,10 +239,12 @@ def test_gradients_are_known_where_a_stage_takes_and_gives():
             )
         return terms["a"] + terms["b"], recorder.given
 
+    # a run without probes shows the stages and their shapes
     dry = Recorder()
     loss(recorder=dry)
     assert list(dry.given) == ["reader.first", "reader.second", "reader", "loss: a", "loss: b"]
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), dry.shapes)
+    # probes of 0 change nothing; their gradients are those of the stages
     sent = jax.grad(lambda probes: loss(probes)[0])(zeros)
     assert float(loss(zeros)[0]) == float(loss()[0])
     fine = {

@@ -69,7 +69,7 @@ def agreement(values, point, names, directions=3, steps=STEP_SIZES):
 
 
 def own_case(names, side=SIDE):
-    """(values, point) of the terms alone, on made-up renderings."""
+    """Returns (function of a point that gives the loss terms, a point): made-up renderings."""
     rng = np.random.default_rng(1)
     pixels, vertices = (TARGETS, side, side), 5
     uniform = lambda *shape: rng.uniform(0.1, 0.9, shape)
@@ -93,6 +93,7 @@ def own_case(names, side=SIDE):
         one = lambda rgb, alpha, depth, spread: Rendering(
             rgb, alpha, depth, jnp.zeros((), jnp.int32), distortion=spread
         )
+        # distortion is at most the square of alpha times the range of depths
         spread = 2 * alpha**2 * point["spread"]
         rendering = jax.vmap(one)(point["rgb"], alpha, point["depth"], spread)
         drawn = Drawn(rendering, point["opacities"], point["tight_offsets"])

@@ -71,6 +71,7 @@ def draw_points(points, colors, camera):
 
 
 def write_subject(path, body, seed):
+    """Writes a capture of a body with random shape, poses and colors, drawn as points."""
     generator = np.random.default_rng(seed)
     betas = generator.normal(size=1).astype(np.float32)
     rest = shape_body(body, jnp.asarray(betas))
@@ -79,6 +80,7 @@ def write_subject(path, body, seed):
     cameras = orbit(
         jnp.zeros(3), 2.6, jnp.arange(VIEWS) * 2 * jnp.pi / VIEWS + 0.1 * seed, 0.1, K, SIZE, SIZE
     )
+    # forty points on every face, colored between its corners
     weights = generator.dirichlet([1, 1, 1], 40)
     corner_colors = generator.random((len(body.template), 3))
     faces = np.asarray(body.faces)

@@ -35,6 +35,7 @@ def configuration(checkpoint_every=1, batch_size=4, at_once=1, learning_rate=1e-
 
 
 def main():
+    """Trains in this process; prints "ready" before the first step and "done" at the end."""
     parser = argparse.ArgumentParser()
     parser.add_argument("out", type=Path)
     parser.add_argument("captures", type=Path)
@@ -50,6 +51,7 @@ def main():
     parser.add_argument("--process", type=int)
     parser.add_argument("--no-validation", action="store_true")
     arguments = parser.parse_args()
+    # before the first import of what uses devices
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_num_cpu_devices", arguments.devices)
     if arguments.cache:

@@ -310,6 +310,7 @@ def test_a_dropped_glb_moves_and_its_other_animations_are_offered(browser, avata
         "walk",
         "run",
     ]
+    # the second animation is chosen
     browser.run(
         """document.getElementById("message").textContent = "";
         const select = document.getElementById("clip");
@@ -321,6 +322,7 @@ def test_a_dropped_glb_moves_and_its_other_animations_are_offered(browser, avata
     np.testing.assert_allclose(
         matrices(shown_pose(browser, 2)[0]), matrices(clips[1][2]), atol=ANGLE
     )
+    # a file of one motion takes the choice away
     drop(
         browser,
         "one.npz",

@@ -91,6 +91,7 @@ def test_the_script_moves_what_python_moves(person, shapes, tmp_path):
     names = avatar.expression_names
     expression = [shapes.get(name, 0.0) for name in names]
     means = np.concatenate([avatar.gaussians.means, avatar.face.hidden.means])
+    # what the page has after loading
     scene = {
         "header": {"face": packed.header["face"]},
         "arrays": arrays,
@@ -123,6 +124,7 @@ console.log(JSON.stringify([changed, means, applyFace(scene, {json.dumps(express
     opacities = np.asarray(wanted.opacities) / np.concatenate(
         [avatar.gaussians.opacities, avatar.face.hidden.opacities]
     )
+    # hidden Gaussians are moved away by the page and made transparent by Python
     shown = found[:, 1] > -AWAY
     assert not opacities[~shown].size or opacities[~shown].max() < 0.6
     assert opacities[shown].min() > 0.3

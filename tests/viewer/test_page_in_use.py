@@ -325,10 +325,12 @@ def test_a_motion_without_a_rate_is_a_question_not_an_end(browser, size):
         and "how many frames are a second?" in form.text
     )
     assert form.location["x"] >= 0 and form.location["x"] + form.size["width"] <= size[0]
+    # without an answer the former motion stays
     browser.driver.find_element(By.ID, "leave-rate").click()
     assert not form.is_displayed() and browser.run(f"return {NAME}") == before
     drop(browser, "still.npz", **still)
     wait_for(browser, "!document.getElementById('ask-rate').hidden")
+    # an answer is used; one frame needs none
     answer = browser.driver.find_element(By.ID, "rate-answer")
     answer.clear()
     answer.send_keys("12.5", Keys.ENTER)

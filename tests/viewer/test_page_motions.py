@@ -118,6 +118,7 @@ def skeletons():
         "z up": write_bvh(source, poses(CMU), CMU, moves=moves, up=UP["z"]),
         "no standing": write_bvh(source, poses(LAFAN), LAFAN, frames_along_bones(source), moves),
     }
+    # joints that turn and are turned back, and names in other spellings
     for seed in range(3):
         turns = Rotation.random(4, random_state=seed)
         files[f"turned pelvis {seed}"] = write_bvh(
@@ -163,6 +164,7 @@ def skeletons():
         .replace("JOINT Head", "JOINT constructor")
         .replace("JOINT Neck", "JOINT __proto__")
     )
+    # people on the floor, in worlds with another up
     for kind in ("walking", "crawling", "lying on the back", "handstand"):
         rotations, translations = motions()[kind]
         body = rotations * np.isin(JOINT_NAMES, list(CMU))[:, None]
@@ -179,6 +181,7 @@ def array_files():
     """Every format that the page knows, and people on the floor in worlds with y, z and -y up."""
     rng = np.random.default_rng(0)
     poses, trans = rng.normal(0, 0.3, (4, 165)), rng.normal(0, 0.2, (4, 3))
+    # random poses by the names of every data set
     hands = {
         "left_hand_pose": poses[:, 75:120],
         "right_hand_pose": poses[:, 120:],
@@ -236,6 +239,7 @@ def array_files():
             "trans": trans,
         },
     }
+    # people on the floor: which axis is up is found by the poses
     for kind, (rotations, translations) in motions().items():
         for up, turn in UP.items():
             for heading in (90,):
@@ -262,6 +266,7 @@ def glb_files(folder):
     quarter = Rotation.from_euler("x", 90, degrees=True)
     matrix = np.eye(4)
     matrix[:3, :3] = 0.01 * quarter.inv().as_matrix()
+    # z is up below this node, and a unit is a centimetre
     above = {"name": "Armature", "matrix": matrix.T.reshape(-1).tolist()}
     turned = [quarter.apply(pose) for pose in dance(5)]
     bones = {f"{side} {i}": {"node": i} for i, side in enumerate(CMU)}
@@ -343,6 +348,7 @@ def test_a_glb_that_is_no_motion_gets_one_line(tmp_path):
         "extensions": {"EXT_meshopt_compression": {"buffer": 1, "count": 2, "byteStride": 4}}
     }
     whole = animation_file(tmp_path)
+    # damaged files first, then documents that no reader can follow
     cases = {
         "nothing": (b"", "not a GLB file, or cut short"),
         "text": (b"hello, this is no file of numbers", "not a GLB file"),

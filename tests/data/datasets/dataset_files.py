@@ -291,6 +291,7 @@ def h5py():
 
 
 def write_dna(folder, frames=FRAMES):
+    """Writes a recording as DNA-Rendering does: photos in one HDF5 file, the rest in another."""
     import h5py
 
     made = recording(frames)
@@ -310,29 +311,21 @@ def write_dna(folder, frames=FRAMES):
         for c, (R, T) in enumerate(zip(made.R, made.T, strict=True)):
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = R, T
+            # cameras to the world, no distortion
             at = f"Camera_Parameter/{c:02d}"
-            notes[f"{at}/K"], notes[f"{at}/D"], notes[f"{at}/RT"] = (
-                made.K,
-                np.zeros(5),
-                np.linalg.inv(pose),
-            )
+            notes[f"{at}/K"] = made.K
+            notes[f"{at}/D"] = np.zeros(5)
+            notes[f"{at}/RT"] = np.linalg.inv(pose)
             for frame in range(frames):
-                photo, person = map(encode, made.shot(c, frame))
-                main[f"Camera_5mp/{c}/color/{frame}"], notes[f"Mask/{c}/mask/{frame}"] = (
-                    photo,
-                    person,
-                )
-        full = [
-            values["global_orient"],
-            values["body_pose"],
-            values["jaw_pose"],
-            np.zeros((frames, 6)),
-        ]
+                photo, mask = made.shot(c, frame)
+                main[f"Camera_5mp/{c}/color/{frame}"] = encode(photo)
+                notes[f"Mask/{c}/mask/{frame}"] = encode(mask)
+        # poses of all joints in SMPL-X's order; the eyes are at rest
+        names = ("global_orient", "body_pose", "jaw_pose")
+        full = [*(values[name] for name in names), np.zeros((frames, 6))]
         full = np.concatenate([*full, values["left_hand_pose"], values["right_hand_pose"]], 1)
-        notes["SMPLx/fullpose"], notes["SMPLx/transl"] = (
-            full.reshape(frames, 55, 3),
-            values["transl"],
-        )
+        notes["SMPLx/fullpose"] = full.reshape(frames, 55, 3)
+        notes["SMPLx/transl"] = values["transl"]
         for key in ("betas", "expression"):
             notes[f"SMPLx/{key}"] = values[key]
     return folder

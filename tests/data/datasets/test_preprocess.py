@@ -141,12 +141,14 @@ def test_a_finished_scene_is_kept_only_of_the_same_files(videos, tmp_path, body)
 
 def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path, body):
     out = tmp_path / "out"
+    # two processes make a scene each; a further run makes none
     assert run(videos, out, body, settings(), shard=(0, 2)).scenes == 1
     kept = (out / "avatarrex_a" / "scene.json").stat().st_mtime_ns
     report = run(videos, out, body, settings(), shard=(1, 2))
     assert (report.made, report.scenes) == (1, 2) and len(read_scene_list(out)) == 2
     assert run(videos, out, body, settings()).made == 0
     assert (out / "avatarrex_a" / "scene.json").stat().st_mtime_ns == kept
+    # other settings, another body model and other videos are refused; a copy of the model is not
     with pytest.raises(
         ValueError, match=r"manifest.json: settings: .*size 16 -> 32.*another folder"
     ):
@@ -167,6 +169,7 @@ def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path,
         ValueError, match=r"avatarrex_a/scene.json: known.views: expected an integer, got True"
     ):
         run(videos, out, body, settings())
+    # places that cannot hold the set, and a folder without videos
     with pytest.raises(ValueError, match="lies in the data set"):
         run(videos, videos / "out", body, settings())
     (tmp_path / "mine").mkdir()
