@@ -1,14 +1,14 @@
-"""A look at a capture before its use, and at a fit: the posed body over each photo, and numbers
-that show what is wrong.
+"""Checks a capture before its use, or a fit. Draws the posed body over each photo, and computes
+numbers that show what is wrong.
 
-Blue is the person's left side, red the right, the green line the boundary of the body; photo and
-body should coincide. A yellow line is the boundary of the body after the displacement of the
-capture, or after that to the masks where `reconstruct` makes one, with its skirt.
-`apps.quick_check` names what is wrong with a view.
+Blue is the person's left side, red is the right side, and the green line is the boundary of the
+body. Photo and body should coincide. A yellow line is the boundary of the displaced body: by the
+displacement of the capture, or else by the displacement to the masks that `reconstruct` finds, with
+a skirt where there is one. `apps.quick_check` names what is wrong with a view.
 
-On the sheet of a fit a disc is a keypoint: the person's left blue, right red, middle white. An
-outlier is a ring. A line leads to the cross of the body's landmark; where the body fits, disc and
-cross coincide.
+On the sheet of a fit a disc is a keypoint: blue for the person's left, red for the right, white for
+the middle. A ring is an outlier. A line leads from the keypoint to a cross, which is the landmark
+of the body. Where the body fits, disc and cross coincide.
 """
 
 import dataclasses
@@ -50,19 +50,21 @@ from humangs_jax.rendering.mesh.rasterizer import (
 )
 
 _LONGEST_SIDE = 512
-"""Larger photos are shrunk to this for the check, pixels."""
+"""Photos whose longer side exceeds this are reduced to it before they are drawn, pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Tints:
-    """How the body is shown on the sheet; colors are red, green and blue in [0, 1]."""
+    """Colors and opacity of the body on the sheet. Colors are red, green and blue in [0, 1], but
+    for `cross`.
+    """
 
     left: tuple[float, float, float] = (0.15, 0.45, 1.0)
     """Color of the person's left side."""
     right: tuple[float, float, float] = (1.0, 0.35, 0.15)
-    """Color of the right side."""
+    """Color of the person's right side."""
     middle: tuple[float, float, float] = (0.85, 0.85, 0.85)
-    """Color of the middle."""
+    """Color of the person's middle."""
     boundary: tuple[float, float, float] = (0.1, 0.85, 0.2)
     """Color of the body's outline."""
     displaced: tuple[float, float, float] = (1.0, 0.85, 0.0)
@@ -70,14 +72,15 @@ class _Tints:
     opacity: float = 0.55
     """Opacity of the body over the photo."""
     cross: tuple[int, int, int] = (255, 0, 230)
-    """Color of crosses where the body has a keypoint, of 255."""
+    """Color of the lines and crosses that show the body's landmarks, red, green and blue, 0 to 255.
+    """
 
 
 TINTS = _Tints()
 
 
 _AMBIENT = 0.35
-"""Share of the light that comes from everywhere."""
+"""Share of ambient light, 0 to 1. The rest is light from the camera."""
 
 
 @pytree_dataclass
@@ -85,14 +88,14 @@ class BodyImage:
     """The posed body as one camera sees it."""
 
     shaded: Float[Array, "h w 3"]
-    """Colors, (h, w, 3), lit from the camera, black outside of the body."""
+    """Colors of the body, (h, w, 3), 0 to 1, lit from the camera. Black where the body is not."""
     covered: Bool[Array, "h w"]
-    """Pixels that show the body, (h, w)."""
+    """Whether a pixel shows the body, (h, w)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewCheck:
-    """One view."""
+    """How well body and mask of one view agree."""
 
     name: str
     """Name of the view, as in the capture."""
@@ -101,37 +104,39 @@ class ViewCheck:
     outside: float | None
     """Share of the body's pixels that are more than one pixel off the mask; None without masks."""
     inside: float
-    """Share of the body in the image."""
+    """Share of the body that is inside the image, 0 to 1."""
     warning: str | None = None
-    """What looks wrong with the view, in a line; None if nothing does."""
+    """One line that says what looks wrong with the view; None if nothing does."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CheckReport:
-    """How well body, photos and masks agree; `str(report)` is the table that the command line
+    """How well body, photos and masks agree. `str(report)` is the table that the command line
     prints.
     """
 
     views: tuple[ViewCheck, ...]
     """One entry per view, in the order of the capture."""
     warnings: tuple[str, ...] = ()
-    """What looks wrong with the capture as a whole, a line each."""
+    """What looks wrong with the capture as a whole, one line for each problem."""
     displaced: float = 0.0
-    """Metres that `reconstruct` moves the body at most, so that it fits the masks; 0: it fits
-    already.
+    """Largest distance by which `reconstruct` moves a vertex of the body, so that the body fits the
+    masks, metres. 0: nothing is moved.
     """
     registered: bool = False
-    """Whether the capture itself says by how much."""
+    """Whether the displacement is that of the capture itself. Else `reconstruct` finds it from the
+    masks.
+    """
     skirt: bool = False
     """Whether `reconstruct` puts a skirt around the legs."""
 
     @property
     def ok(self) -> bool:
-        """Whether there is no warning."""
+        """Whether there is no warning, neither for the capture nor for a view."""
         return not (self.warnings or any(view.warning for view in self.views))
 
     def __str__(self) -> str:
-        """A table, then the warnings."""
+        """Returns a table with a row for each view, then the warnings."""
         # views with a warning end in an exclamation mark
         rows = [["view", "silhouette IoU", "body outside mask", "body in frame"]]
         for view in self.views:
@@ -170,12 +175,12 @@ class CheckReport:
 def check_capture(
     capture: Capture | PreparedCapture, out: str | Path, keypoints: Keypoints | None = None
 ) -> CheckReport:
-    """Draw the posed body over every photo, write the sheet as a PNG, and report how well they
+    """Draws the posed body over every photo, writes the sheet as a PNG, and reports how well they
     agree.
 
-    Arguments: capture: also one that is prepared for a network; else it is prepared for the one
-    that comes with the package. keypoints: of the views, if they are known: whether the cameras may
-    be at fault.
+    Arguments: capture: a plain capture is prepared for the network that comes with the package. One
+    that is already prepared for a network stays as it is. keypoints: keypoints of the views, if
+    they are known. They show whether cameras are wrong, which changes the advice in warnings.
     Raises: OSError if the sheet cannot be written.
     """
     if isinstance(capture, PreparedCapture):
@@ -230,7 +235,9 @@ def _compared(
     found: Faults,
     cameras_are_right: bool,
 ) -> ViewCheck:
-    """How well the pixels that the body covers agree with the mask of a view."""
+    """Compares the pixels that the body covers with the mask of a view. cameras_are_right: whether
+    keypoints have shown no camera errors; then the advice is to keep cameras fixed.
+    """
     name, warning, inside = capture.names[view], found.views[view], found.inside[view]
     if capture.masks is None:
         return ViewCheck(name, None, None, inside, warning)
@@ -249,7 +256,9 @@ def _compared(
 
 
 def calls_of_check(capture: Capture, config: HumanGSConfig) -> Iterator[Call]:
-    """The programs that draw the body over photos, and that of the network over it."""
+    """Yields the programs that draw the body over photos, for background compilation: one for the
+    body of the capture, and one for the body that the network of `config` uses.
+    """
     small = capture.select([0]).resized(min(_LONGEST_SIDE, max(capture.images.shape[1:3])))
     for body in (capture.body, gaussian_body(capture.body, config)):
         vertices = np.zeros(body.template.shape, np.float32)
@@ -257,8 +266,8 @@ def calls_of_check(capture: Capture, config: HumanGSConfig) -> Iterator[Call]:
 
 
 def _prepared(capture: Capture) -> PreparedCapture | None:
-    """The capture as `reconstruct` will use it with the network of the package; None if no view
-    shows the person.
+    """Prepares the capture for the network of the package, as `reconstruct` does. Returns None if
+    no view shows the person.
     """
     try:
         return prepare_capture(capture, shipped_network())
@@ -267,8 +276,9 @@ def _prepared(capture: Capture) -> PreparedCapture | None:
 
 
 def _shown(whole: Capture, small: Capture, vertices: dict[int, Float[Array, "n 3"]]) -> Capture:
-    """What a sheet shows of a capture: its photos cut to the person, or `small`, all of them, where
-    that is nearly the same.
+    """Returns the capture that the sheet shows: photos cut to the person, at most 512 pixels a
+    side, or `small` where the cut photos would be nearly the whole ones. vertices: of the posed
+    body, by frame.
     """
     close, _ = around_person(whole, vertices)
     if close is whole:
@@ -285,7 +295,9 @@ def draw_body(
     camera: Camera,
     photo: Float[np.ndarray, "h w 3"],
 ) -> tuple[Float[np.ndarray, "h w 3"], BodyImage]:
-    """The posed body over a photo of one camera, and the body alone."""
+    """Draws the posed body over the photo of one camera. Returns that picture, (h, w, 3), 0 to 1,
+    and the image of the body alone.
+    """
     drawn = body_image(
         jax.jit(person_vertices)(body, betas, pose), body.faces, side_tints(body), camera
     )
@@ -293,15 +305,18 @@ def draw_body(
 
 
 def overlay(photo: Float[np.ndarray, "h w 3"], drawn: BodyImage) -> Float[np.ndarray, "h w 3"]:
-    """Half-transparent body over a photo, with its silhouette."""
+    """Blends the body over a photo, half-transparent and with its outline. Returns (h, w, 3), in
+    [0, 1].
+    """
     covered = np.asarray(drawn.covered)
     blended = photo + TINTS.opacity * covered[..., None] * (np.asarray(drawn.shaded) - photo)
     return np.where(_boundary(covered)[..., None], np.asarray(TINTS.boundary), blended)
 
 
 def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
-    """Colors of the vertices: left, right, or between, by the names of the joints that move them,
-    else by x in T-pose.
+    """Returns colors of the body's vertices, (n, 3), by their side: left, right, or between. Names
+    of the joints that move a vertex decide the side; without such names the sign of x in T-pose
+    does.
     """
     weights = np.asarray(body.skinning_weights)
     left, right = (
@@ -336,7 +351,9 @@ def body_image(
 def _posed_frames(
     capture: Capture, moves: Float[np.ndarray, "n 3"] | None = None
 ) -> dict[int, Float[Array, "n 3"]]:
-    """Vertices of the frames that views show, by frame. moves: of the shaped body."""
+    """Returns the posed vertices of the frames that views show, by frame, (n, 3), metres. moves:
+    displacements of the shaped body before it is posed, metres; None: none.
+    """
     rest = shape_body(capture.body, jnp.asarray(capture.betas))
     if moves is not None:
         rest = replace(rest, vertices=rest.vertices + moves)
@@ -347,8 +364,8 @@ def _posed_frames(
 def _agreement(
     covered: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
 ) -> tuple[float, float]:
-    """Intersection over union of body and mask, and the share of the body more than one pixel off
-    the mask.
+    """Returns the intersection over union of body and mask, and the share of the body's pixels that
+    are more than one pixel off the mask, both 0 to 1.
     """
     union = max((covered | mask).sum(), 1)
     return float((covered & mask).sum() / union), float(
@@ -357,7 +374,7 @@ def _agreement(
 
 
 def _boundary(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the body beside pixels outside it."""
+    """Returns the pixels of the body that have a neighbour outside of the body, (h, w)."""
     return covered & ~binary_erosion(covered, border_value=1)
 
 
@@ -372,18 +389,19 @@ def _label(view: ViewCheck) -> str:
 # --------------------------------------------------------------------------------------------------
 
 VIEWS = 24
-"""Most views on a sheet."""
+"""Most views on the sheet of a fit."""
 _FINE = 2
-"""Factor by which sheets are drawn larger and then shrunk, for smooth lines."""
+"""Factor by which a sheet is drawn too large and then shrunk, so that lines are smooth."""
 
 
 def fit_sheet(
     capture: Capture, keypoints: Keypoints, examination: Examination, out: str | Path
 ) -> None:
-    """Write a sheet of up to 24 views, evenly chosen, as a PNG.
+    """Writes a sheet of up to 24 views, evenly chosen, as a PNG. Each shows the fitted body and the
+    keypoints.
 
-    Arguments: examination: of this capture by these keypoints. Raises: OSError if the image cannot
-    be written.
+    Arguments: examination: how far this capture's landmarks are from these keypoints. Raises:
+    OSError if the image cannot be written.
     """
     count = capture.view_count
     chosen = np.unique(np.linspace(0, count - 1, min(count, VIEWS)).round().astype(int)).tolist()
@@ -413,8 +431,11 @@ def _with_keypoints(
     examination: Examination,
     view: int,
 ) -> Float[np.ndarray, "h w 3"]:
-    """The image of a view with its keypoints. corner: of the photo of `capture` in the one that
-    keypoints are of, pixels.
+    """Draws the keypoints of a view, and the landmarks of the body, over its image. Returns
+    (h, w, 3), 0 to 1.
+
+    Arguments: capture: the capture whose photos are cut to the person. corner: upper left corner
+    (x, y) of the cut photo in the photo that keypoints refer to, pixels.
     """
     from PIL import Image, ImageDraw
 

@@ -1,4 +1,6 @@
-"""Photos cut to the person, for sheets: in a dome a person has 200 of 1,920 pixels."""
+"""Cuts photos to the person, for sheets. In the photos of a camera dome a person covers only about
+200 of 1,920 pixels.
+"""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -12,7 +14,9 @@ from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import Capture
 
 LARGEST_SHARE = 0.7
-"""Share of the photo's area above which a window is not cut: the photo is shown whole."""
+"""Largest window that is cut out, as a share of the photo's area. With a larger one the photo is
+shown whole.
+"""
 
 
 def around_person(
@@ -20,13 +24,15 @@ def around_person(
     vertices: Mapping[int, Float[Array, "n 3"]],
     marks: Sequence[Float[np.ndarray, "k 2"]] | None = None,
 ) -> tuple[Capture, Int[np.ndarray, "v 2"]]:
-    """The capture with photos, masks and cameras cut to windows of one size around the person, and
-    their upper left corners.
+    """Cuts photos, masks and cameras of a capture to windows around the person. All windows have
+    the same size. Returns the capture, and the upper left corner (x, y) of each window, (v, 2),
+    pixels.
 
-    The capture as it is, and corners of 0, where the largest window is nearly the photo.
+    Where the largest window is nearly the whole photo, the capture stays as it is and corners are
+    0.
 
-    Arguments: vertices: of the posed body, by frame. marks: further pixels of each view that are to
-    be seen.
+    Arguments: vertices: of the posed body, by frame, (n, 3), metres. marks: further pixels (x, y)
+    of each view that the window has to show.
     """
     height, width = capture.images.shape[1:3]
     photo, count = np.asarray([width, height]), len(capture.images)
@@ -63,7 +69,7 @@ def around_person(
 def _cut(
     images: np.ndarray, corners: Int[np.ndarray, "v 2"], size: Int[np.ndarray, "2"]
 ) -> np.ndarray:
-    """Windows of one size (width, height) at the corners (x, y)."""
+    """Cuts each image to a window of `size` (width, height) whose upper left corner is (x, y)."""
     return np.stack(
         [
             image[y : y + size[1], x : x + size[0]]
@@ -78,8 +84,8 @@ def _box(
     vertices: Float[Array, "n 3"],
     marks: Sequence[Float[np.ndarray, "k 2"]] | None,
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
-    """The least and largest x and y of the body, the mask and the marks in a photo; None if nothing
-    is in it.
+    """Returns the least and the largest (x, y), each (2,), of the pixels of body, mask and marks
+    that lie in a photo. None if there are none. vertices: in the world, (n, 3), metres.
     """
     K, pose = (
         np.asarray(x[view], float) for x in (capture.cameras.K, capture.cameras.cam_from_world)

@@ -1,12 +1,14 @@
-"""People in photos: found, the same one in all of them chosen, and written as keypoints, masks and
-a numbered sheet.
+"""Finds the people in photos, chooses one person, the same in all photos, and writes this person's
+keypoints and masks, and a numbered sheet of all people.
 
-    keypoints.json   the chosen person, for `humangs fit`
-    unknown/NAME.png where somebody else may hide the person, of the photos of a capture
-    people.png       the sheet: everybody, with numbers
-    masks/NAME.png   of the chosen person
+Files that are written:
 
-Who of one photo is who of another: `apps.same_people`.
+    keypoints.json   keypoints of the chosen person, for `humangs fit`
+    masks/NAME.png   masks of the chosen person
+    people.png       the sheet: everybody in every photo, with numbers
+    unknown/NAME.png for photos of a capture: where somebody else may hide the person
+
+`apps.same_people` decides who of one photo is who of another.
 """
 
 import contextlib
@@ -76,11 +78,11 @@ from humangs_jax.io.images import (
 from humangs_jax.io.reading import write_json
 
 KEYPOINTS_FILE = "keypoints.json"
-"""File of the keypoints."""
+"""File name of the keypoints."""
 SHEET_FILE = "people.png"
-"""Picture of all photos with their people."""
+"""File name of the sheet, a picture of all photos with their people."""
 MASKS = "masks"
-"""Folder of the masks."""
+"""Name of the folder of masks."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +90,7 @@ class _Sheet:
     """How the sheet of people looks."""
 
     thumbnail: int = 480
-    """Pixels of the longest side of a photo on the sheet."""
+    """Longest side of a photo on the sheet, pixels."""
     colors: tuple[tuple[int, int, int], ...] = (
         (46, 160, 67),
         (31, 111, 235),
@@ -98,24 +100,30 @@ class _Sheet:
     )
     """Colors of the people on the sheet, by number."""
     faint: float = 0.45
-    """Share of the color over a person's pixels."""
+    """Opacity of the color over a person's pixels, 0 to 1. Where somebody is chosen, the others
+    have half of it.
+    """
 
 
 _SHEET = _Sheet()
 
 
 _PLAINLY = 0.5
-"""Masks or keypoints on somebody else have to leave the person less than this share of what they
-give the other one.
+"""Share that decides three comparisons of masks or keypoints. A matched person with less than this
+share of the best score gives way to the best. A person found in a cut photo needs this share of the
+given mask's area. Somebody who has more than this share of the mask on another person's mask is
+taken for that person.
 """
 
 
 def found_in_photos(folder: Path) -> list[PhotoPeople]:
-    """The people in the photos of a folder, or of a capture folder, whose cameras are used; see
-    `same_people`.
+    """Finds the people in the photos of a folder and matches them between photos. In a capture
+    folder the calibrated cameras help to match, see `same_people`.
 
-    Raises: CaptureError without photos; FileError, naming the file, for what is no photo;
-    ValueError without LiteRT.
+    Raises:
+        CaptureError: if there are no photos.
+        FileError: for a file that is no photo; the message names the file.
+        ValueError: if LiteRT is not installed.
     """
     if (folder / "capture.json").is_file():
         return found_in_capture(folder)
@@ -125,9 +133,10 @@ def found_in_photos(folder: Path) -> list[PhotoPeople]:
 
 
 def left_out(folder: Path) -> str | None:
-    """What `found_in_photos` does not use of a folder, in one line; None where it uses all.
+    """Returns one line that names what `found_in_photos` does not use of a folder. None where it
+    uses all, and for a capture folder.
 
-    Raises: as it.
+    Raises: CaptureError if the folder has no photos.
     """
     if (folder / "capture.json").is_file():
         return None
@@ -135,7 +144,8 @@ def left_out(folder: Path) -> str | None:
 
 
 def found_in_capture(folder: Path) -> list[PhotoPeople]:
-    """The people in the photos of a capture folder; the photos are named as the views.
+    """Finds the people in the photos of a capture folder and matches them between photos. Each
+    photo has the name of its view, with the suffix .png.
 
     Raises: see `found_in_photos`.
     """
@@ -154,19 +164,21 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
 
 
 Hidden = Sequence[Bool[np.ndarray, "h w"] | None] | Bool[np.ndarray, "v h w"] | None
-"""Where each photo does not show the person; None: everything is shown."""
+"""Pixels of each photo that do not show the person, one array (h, w) or None per photo. None: no
+photo has such pixels.
+"""
 
 
 def without_hidden_landmarks(photos: list[PhotoPeople], hidden: Hidden) -> list[PhotoPeople]:
-    """The photos with no landmark seen where the photo does not show the person: the detector
-    guesses it.
+    """Sets the confidence of landmarks to 0 where a photo does not show the person, since there the
+    detector only guesses them. Returns the photos with these landmarks.
     """
     if hidden is None:
         return photos
 
     # points of one person under the cover of one photo
     def uncovered(points: Float[np.ndarray, "k c"], cover: Bool[np.ndarray, "h w"]) -> np.ndarray:
-        """Points (x, y, confidence, ...) with no confidence under the cover."""
+        """Returns the points (x, y, confidence, ...) with confidence 0 under the cover."""
         column, row = np.floor(points[:, :2]).astype(int).T
         inside = np.flatnonzero(inside_photo(column, row, *cover.shape[::-1]))
         points = points.copy()
@@ -174,7 +186,7 @@ def without_hidden_landmarks(photos: list[PhotoPeople], hidden: Hidden) -> list[
         return points
 
     def seen(found: PersonInPhoto | None, cover: Bool[np.ndarray, "h w"]) -> PersonInPhoto | None:
-        """Somebody with no landmark seen under the cover."""
+        """Returns the person with confidence 0 for all landmarks under the cover."""
         if found is None:
             return None
         person = found.person
@@ -195,11 +207,11 @@ def without_hidden_landmarks(photos: list[PhotoPeople], hidden: Hidden) -> list[
 def without_others(
     pictures: Iterable[Float[np.ndarray, "h w 3"]], others: Hidden
 ) -> Iterator[Float[np.ndarray, "h w 3"]]:
-    """The photos with the colors around in place of other people and of things in front, so that
-    the detector finds the person alone.
+    """Paints over other people and things in front of the person with the colors around them, so
+    that the detector finds the person alone. Yields the photos.
 
-    Arguments: others: where these are in each photo, or None. White that an import has added
-    around a photo, which is unknown too, stays as it is.
+    Arguments: others: for each photo, the pixels to paint over, or None. Pixels that are pure white
+    stay as they are, since an import marks the white that it adds around a photo as unknown, too.
     """
     for i, picture in enumerate(pictures):
         covered = None if others is None else others[i]
@@ -216,10 +228,12 @@ def with_masked(
     masks: Sequence[Float[np.ndarray, "h w"]],
     on_white: Sequence[Float[np.ndarray, "h w 3"]],
 ) -> list[PhotoPeople]:
-    """The photos with the person of the masks: where nobody found has such a mask, what the
-    detector sees is cut to it.
+    """Makes sure that the person of each given mask is among the people of its photo. Where the
+    mask of nobody found matches, the detector looks again at the photo cut to the mask, and the
+    person found there is added.
 
-    Arguments: on_white: the photos with nothing but the masks' pixels.
+    Arguments: masks: one per photo, (h, w), 0 to 1. on_white: the photos cut to their masks, white
+    elsewhere.
     """
     # where a given mask and the person found there overlap less, somebody else may have been found
     lost = [
@@ -244,7 +258,9 @@ def with_masked(
 
 
 def _overlap(found: PersonInPhoto | None, mask: Float[np.ndarray, "h w"]) -> float:
-    """Intersection over union of somebody's mask and a mask of the photo."""
+    """Returns the intersection over union, 0 to 1, of a person's mask and a mask of the whole
+    photo.
+    """
     if found is None:
         return 0.0
     (top, left), (height, width) = found.corner, found.mask.shape
@@ -255,7 +271,9 @@ def _overlap(found: PersonInPhoto | None, mask: Float[np.ndarray, "h w"]) -> flo
 
 
 def _mostly(found: PersonInPhoto | None, other: PersonInPhoto, size: tuple[int, int]) -> bool:
-    """Tells whether most of somebody's mask is on that of another person."""
+    """Returns whether more than half of a person's mask lies on the mask of another person. True
+    for None. size: width and height of the photo, pixels.
+    """
     if found is None:
         return True
     whole = np.zeros(size[::-1], bool)
@@ -273,11 +291,12 @@ def person_in_capture(
     keypoints: Keypoints | None = None,
     person: int | None = None,
 ) -> tuple[list[PhotoPeople], int]:
-    """The people in the photos of a capture folder, and the number of the one who is meant: by
-    keypoints, if there are any, else by the number asked for, else by masks, else by size.
+    """Finds the people in the photos of a capture folder, and returns them with the number of the
+    intended person. Keypoints decide who is intended, if there are any; else the number that was
+    asked for, else masks, else size.
 
-    Raises: see `found_in_photos`, `choose`, `person_of`; ValueError for a photo whose keypoints are
-    of nobody found there.
+    Raises: see `found_in_photos`, `choose` and `person_of`. Also ValueError for a photo whose
+    keypoints belong to nobody found in it.
     """
     people, sheet = found_in_capture(folder), folder / SHEET_FILE
     if keypoints is None:
@@ -300,18 +319,19 @@ def person_in_capture(
 
 
 Masks = Sequence[Float[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]]
-"""Masks of the photos, each of the size of its photo."""
+"""One mask per photo, (h, w), as large as its photo."""
 
 
 def person_of(
     photos: Sequence[PhotoPeople], given: Keypoints | Masks, sheet: Path
 ) -> tuple[list[PhotoPeople], int]:
-    """The photos, and the number of the one whose keypoints or masks these are, which decide in
-    each photo.
+    """Finds the person to whom the given keypoints or masks belong. Returns the photos, in which
+    this person has the same number everywhere, and the number. Where a photo's keypoints or masks
+    contradict the match between photos, they decide.
 
-    Arguments: sheet: see `choose`.
-    Raises: ValueError for keypoints or masks of nobody, and where it is unclear who of a photo
-    without any is meant.
+    Arguments: sheet: where to write the sheet of people if this is refused.
+    Raises: ValueError if the keypoints or masks belong to nobody found, or if a photo has none and
+    it is unclear who in it is intended.
     """
     kind = "keypoints" if isinstance(given, Keypoints) else "masks"
     scores = [
@@ -349,8 +369,8 @@ def _has_any(given: Keypoints | Masks, view: int) -> bool:
 
 
 def _agreement(found: PersonInPhoto | None, given: Keypoints | Masks, view: int) -> float:
-    """How much of the keypoints or the mask of a view is on the mask of somebody who was found
-    there.
+    """Returns how well a found person agrees with the keypoints or the mask of a view: the sum of
+    the person's mask at the seen keypoints, or over the pixels of the given mask. 0 for None.
     """
     if found is None:
         return 0.0
@@ -364,7 +384,9 @@ def _agreement(found: PersonInPhoto | None, given: Keypoints | Masks, view: int)
 
 
 def keypoints_of(photos: Sequence[PhotoPeople], person: int) -> Keypoints:
-    """The keypoints of a person; of photos without the person, none."""
+    """Returns the keypoints of the person with this number in all photos. Confidences are 0 in
+    photos without the person.
+    """
     found = [photo.people[person] for photo in photos]
     seen = [None if each is None else each.person for each in found]
     hands = any(each is not None and each.hands is not None for each in seen)
@@ -374,16 +396,18 @@ def keypoints_of(photos: Sequence[PhotoPeople], person: int) -> Keypoints:
 
 
 def upright(file: Path) -> Float[np.ndarray, "h w 3"]:
-    """A photo as its EXIF orientation wants it shown."""
+    """Reads a photo and turns it upright by its EXIF orientation. Returns (h, w, 3), 0 to 1."""
     return oriented(read_image(file)[0], orientation(file))
 
 
 def detect_photos(
     names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 3"]]
 ) -> list[PhotoPeople]:
-    """The people of each photo with values in [0, 1], those with the most pixels first.
+    """Finds the people in each photo. In each, people come in the order of their number of pixels,
+    largest first.
 
-    Raises: ValueError without LiteRT.
+    Arguments: photos: values in [0, 1].
+    Raises: ValueError if LiteRT is not installed.
     """
     try:
         networks, parts = Networks(), FaceAndHands()
@@ -408,10 +432,11 @@ def detect_photos(
 def _found(
     person: Landmarks, photo: Float[np.ndarray, "h w 3"], parts: FaceAndHands | None = None
 ) -> PersonInPhoto:
-    """The person with a mask whose edges are the photo's, and with hands if `parts` looks for them.
+    """Returns a detected person with a mask that follows the edges in the photo. `parts`, if given,
+    finds the hands.
 
-    Nothing of the size of the photo is made. Landmarks beyond the photo are guesses of the
-    detector, and are not seen.
+    The mask covers only a part of the photo. Landmarks outside of the photo are guesses of the
+    detector, so they are marked as not seen.
     """
     pixel = person.crop.side / LANDMARK_SIZE
     window = mask_window(person, photo.shape[1], photo.shape[0], filter_margin(pixel))
@@ -449,12 +474,13 @@ def _found(
 
 
 def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> int:
-    """The number of the person that is meant: the one asked for, or the only one who is large.
+    """Returns the number of the intended person: the one that was asked for, or the only one who is
+    large.
 
-    Arguments: sheet: where the numbers can be looked up; it is written where this cannot be
-    decided.
-    Raises: ValueError if no photo has a person or none has this number, if several may be meant, or
-    if it is unclear who is who.
+    Arguments: person: the number that was asked for; None: none was. sheet: where the numbers can
+    be looked up. It is written if the choice fails.
+    Raises: ValueError if no photo has a person, if none has this number, if several may be meant,
+    or if it is unclear who is who.
     """
     try:
         return _chosen(photos, person, sheet)
@@ -464,9 +490,9 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
 
 
 def _write_refused(sheet: Path, photos: Sequence[PhotoPeople]) -> None:
-    """Writes the sheet of people that an error refers to.
+    """Writes the sheet of people to which an error message refers.
 
-    Raises: ValueError where a picture of others has its name.
+    Raises: ValueError if there is a file of this name that we did not write.
     """
     sheet.parent.mkdir(parents=True, exist_ok=True)
     check_ours(
@@ -478,7 +504,7 @@ def _write_refused(sheet: Path, photos: Sequence[PhotoPeople]) -> None:
 
 
 def _refused(message: str, photos: Sequence[PhotoPeople], sheet: Path) -> ValueError:
-    """An error about who is who; its sheet is written."""
+    """Writes the sheet of people, and returns an error with this message."""
     _write_refused(sheet, photos)
     return ValueError(message)
 
@@ -512,7 +538,9 @@ def _chosen(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> i
 
 
 def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
-    """What should be known about the photos of a person, a line each."""
+    """Returns remarks about the photos of a person, a line each: photos without the person, persons
+    who are cut off, doubtful calibration, and exchanges of left and right.
+    """
     told = [
         f"{photo.name}: the person was not found in it"
         for photo in photos
@@ -541,8 +569,8 @@ def remarks(photos: Sequence[PhotoPeople], person: int) -> list[str]:
 def check_found_place(
     folder: Path, names: Sequence[str], advice: str = MOVE_AWAY, *, masks: bool = True
 ) -> None:
-    """Whether what is found in photos of these names can be written without replacing files of
-    others.
+    """Checks that results for photos of these names can be written into a folder without replacing
+    files that we did not write.
 
     Raises: ValueError, see `io.atomic.check_ours`.
     """
@@ -551,7 +579,9 @@ def check_found_place(
 
 
 def names_in(folder: Path) -> list[str]:
-    """The names of the photos that `found_in_photos` looks at. Raises: as it."""
+    """Returns the names of the photos that `found_in_photos` looks at. Raises: see
+    `found_in_photos`.
+    """
     if (folder / "capture.json").is_file():
         return [f"{name}.png" for name in load_photos(folder).names]
     images, files = photo_files(folder)
@@ -559,13 +589,13 @@ def names_in(folder: Path) -> list[str]:
 
 
 def _mask_name(photo: str) -> str:
-    """The path of the mask of a photo in the folder that is written."""
+    """Returns the path of a photo's mask, relative to the folder that is written."""
     return f"{MASKS}/{Path(photo).with_suffix('.png').as_posix()}"
 
 
 def _is_ours(file: Path) -> bool:
-    """Whether a file that is there was written by `write_found`. capture.json is that of the
-    photos, which gets their masks.
+    """Returns whether an existing file was written by `write_found`. capture.json always counts as
+    ours, since it belongs to the capture whose photos get the masks.
     """
     if file.name == KEYPOINTS_FILE:
         with contextlib.suppress(OSError, ValueError):
@@ -584,12 +614,16 @@ def write_found(
     to_capture: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Keypoints and masks of a person, and the sheet, into a folder; all or nothing.
+    """Writes keypoints and masks of a person, and the sheet, into a folder. Either all files are
+    written or none.
 
-    Arguments: to_capture: the folder is the capture whose photos these are, which then names the
-    masks. overwrite: replace files that were not written by this function, too.
-    Raises: ValueError if two photos have the same name but for the suffix, or for a file of others,
-    see `check_found_place`.
+    Arguments:
+        masks: whether to write masks.
+        to_capture: the folder is the capture that has the photos. Then capture.json is changed to
+        name the masks.
+        overwrite: also replace files that were not written by this function.
+    Raises: ValueError if the names of two photos differ in the suffix only, or if a file of others
+    is in the way, see `check_found_place`.
     """
     # photos that differ in their suffix only would share a mask
     files = [_mask_name(photo.name) for photo in photos]
@@ -645,7 +679,9 @@ def write_found(
 
 
 def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:
-    """The mask of a person at the size of the photo; black if the person is not in it."""
+    """Returns the mask of a person at the size of the photo, (h, w), 0 to 1. It is 0 everywhere if
+    the person is not in the photo.
+    """
     mask = np.zeros(photo.size[::-1], np.float32)
     found = photo.people[person]
     if found is not None:
@@ -657,9 +693,10 @@ def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:
 def hidden_by_others(
     photo: PhotoPeople, person: int, mask: Float[np.ndarray, "h w"] | None = None
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Where other people in a photo may stand in front of the person; None where nobody does.
+    """Returns the pixels where other people in a photo may stand in front of the person, (h, w).
+    None where nobody does.
 
-    Arguments: mask: of the person, in place of the one that was found.
+    Arguments: mask: mask of the person that replaces the detected one, (h, w), 0 to 1.
     """
     own = photo.people[person]
     hidden = np.zeros(photo.size[::-1], bool)
@@ -677,8 +714,8 @@ def hidden_by_others(
 
 
 def _write_sheet(path: Path, photos: Sequence[PhotoPeople], person: int | None = None) -> None:
-    """The photos side by side, everybody in a color and with a number. person: the one who was
-    chosen.
+    """Draws the photos side by side, with everybody in a color and with a number. person: number of
+    the chosen person, who is drawn stronger; None: nobody is chosen.
     """
     from humangs_jax.avatar.video import contact_sheet
 

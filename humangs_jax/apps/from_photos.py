@@ -1,5 +1,5 @@
-"""From a folder of photos or a video to an avatar: cameras, masks and keypoints are used where they
-are there, and found where they are not. What `humangs start` does, as a function.
+"""Makes an avatar from a folder of photos or from a video. Cameras, masks and keypoints are used if
+the folder has them, and found if it has none. This is what `humangs start` does, as a function.
 """
 
 import dataclasses
@@ -60,32 +60,36 @@ from humangs_jax.refinement.refine import refine_with_report
 from humangs_jax.viewer.page import write_page
 
 _IGNORE = "ignore"
-"""As `cameras`: the calibration in the folder of photos is not used."""
+"""Value of the argument `cameras` that ignores the calibration in the folder of photos."""
 BEGIN_ANEW = "--overwrite (in Python overwrite=True) begins anew"
-"""What to do about a body of an earlier run."""
+"""Advice where the body of an earlier run is in the way."""
 
 
 class MissingError(ValueError):
-    """Something has to be made before there can be an avatar; the steps before say how."""
+    """Something that an avatar needs is missing. The steps yielded before say how to make it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Step:
-    """What `avatar_from_photos` has found or made; `str(step)` is how `humangs start` shows it."""
+    """Something that `avatar_from_photos` has found or made. `humangs start` shows it as
+    `str(step)`.
+    """
 
     text: str
-    """What there is to say, in one line or several."""
+    """The message, in one line or several."""
     file: Path | None = None
-    """The file that was written; None: none was."""
+    """The file that was written; None if none was."""
     warning: bool = False
     """Whether something looks wrong."""
     photos: PreparedCapture | None = None
-    """The capture, with its fitted body, as it is used; None until photos are prepared."""
+    """The prepared capture with its fitted body; None until the photos are prepared."""
     avatar: Avatar | None = None
     """The finished avatar, in the last step; None before."""
 
     def __str__(self) -> str:
-        """The text, after the name of the file or the word "warning"."""
+        """Returns the message, after the name of the file or the word "warning" where there is
+        one.
+        """
         if self.warning:
             return f"warning: {self.text}"
         if self.file is None:
@@ -95,20 +99,22 @@ class Step:
 
 @dataclasses.dataclass(frozen=True)
 class Known:
-    """What is known about the photos of a capture when its body is fitted."""
+    """What is known about the photos of a capture when the body is fitted to them."""
 
     folder: Path
-    """Folder that the photos were imported from."""
+    """Folder from which the photos were imported."""
     cameras: Path | None
     """The calibration; None: the cameras were found from the person."""
     keypoints: Path
     """File or folder of the keypoints."""
     keypoints_by_detector: bool
-    """Whether they were found here: then they are of the person who was chosen, and of nobody
-    else.
+    """Whether the detector of this package found the keypoints. Then they are only those of the
+    chosen person.
     """
     masks_by_detector: bool
-    """Whether masks were found here: then they are at the photos' edges already."""
+    """Whether the detector of this package found the masks. Then they follow the edges in the
+    photos already.
+    """
 
 
 def avatar_from_photos(
@@ -128,29 +134,31 @@ def avatar_from_photos(
     refinement: RefineConfig | None = ITERATIONS_ALONE,
     overwrite: bool = False,
 ) -> Iterator[Step]:
-    """From photos or a video of a person to an avatar, step by step, as `humangs start` does.
+    """Makes an avatar from photos or a video of a person, step by step, as `humangs start` does.
 
     Files are written into `out`: the capture with its body, check.png, avatar.npz and avatar.html.
-    A call that was interrupted goes on from a body that it finds there.
+    A call that was interrupted can be repeated. It goes on from the fitted body if there is one in
+    `out`.
 
     Args:
-        photos: folder of photos, perhaps with cameras, masks and keypoints in it; or a video.
+        photos: folder of photos, which may also have cameras, masks and keypoints; or a video.
         out: the capture folder to write.
-        cameras: the calibration, if it is elsewhere; "ignore": find the cameras from the person.
-        masks: folder of the masks, if it is elsewhere.
-        others: folder of masks of what is in front of the person, if it is elsewhere.
-        keypoints: their file or folder, if it is elsewhere.
-        person: number of the person, if several are seen.
-        height: of the person, metres: the scale where there is no calibration.
+        cameras: file or folder of the calibration, if it is not in `photos`. "ignore": ignore the
+        calibration in `photos`, and find the cameras from the person.
+        masks: folder of the masks, if it is not in `photos`.
+        others: folder of masks of what is in front of the person, if it is not in `photos`.
+        keypoints: file or folder of keypoints, if it is not in `photos`.
+        person: number of the person, if several people are in the photos.
+        height: height of the person, metres. It gives the scale if there is no calibration.
         scale: metres per unit of the calibration.
-        up: the axis of the calibration's world that points up, as "+z".
-        without_masks: use none; behind the person is nothing but white.
-        fit_masks: move masks to the edges in the photos.
+        up: the axis of the calibration's world that points up, such as "+z".
+        without_masks: use no masks, because there is only white behind the person.
+        fit_masks: move the boundaries of masks to the edges in the photos.
         refinement: how the avatar is refined; None: not at all.
-        overwrite: begin anew where `out` has a body or an avatar.
+        overwrite: begin anew even if `out` has a body or an avatar.
 
     Yields:
-        What was found and made, one after the other; the last step has the avatar.
+        What was found and made, one step after the other. The last step has the avatar.
 
     Raises:
         ValueError: one line that names the file or argument and what is missing or wrong.
@@ -161,7 +169,7 @@ def avatar_from_photos(
     """
 
     def as_path(value):
-        """A path, or None for None."""
+        """Returns the value as a path; None for None."""
         return None if value is None else Path(value)
 
     # the parts of the work are methods, which share these arguments
@@ -186,39 +194,47 @@ def avatar_from_photos(
 
 @dataclasses.dataclass(frozen=True)
 class FromPhotos:
-    """The arguments of `avatar_from_photos`, and its parts. Each yields what it has found."""
+    """The arguments of `avatar_from_photos`. Its methods are the parts of the work, and most of
+    them yield what they have found.
+    """
 
     photos: Path
     """Folder of photos, or a video."""
     out: Path
     """The capture folder to write."""
     cameras: Path | None = None
-    """The calibration, or `_IGNORE`; None: what the folder has."""
+    """File or folder of the calibration; None: that of the folder of photos, if there is one.
+    `_IGNORE`: none.
+    """
     masks: Path | None = None
-    """Folder of masks; None: what the folder has."""
+    """Folder of masks; None: that of the folder of photos, if there is one."""
     others: Path | None = None
-    """Folder of masks of what is in front of the person; None: what the folder has."""
+    """Folder of masks of what is in front of the person; None: that of the folder of photos, if
+    there is one.
+    """
     keypoints: Path | None = None
-    """Keypoints; None: what the folder has."""
+    """File or folder of keypoints; None: those of the folder of photos, if there are any."""
     person: int | None = None
-    """Number of the person; None: there is one."""
+    """Number of the person, if there are several; None: the only one."""
     height: float | None = None
-    """Height of the person, metres; None: an average person's."""
+    """Height of the person, metres; None: that of an average person."""
     scale: float | None = None
     """Metres per unit of the calibration; None: 1."""
     up: str | None = None
-    """The axis of the calibration's world that points up; None: the format's."""
+    """The axis of the calibration's world that points up; None: that of the calibration's
+    format.
+    """
     without_masks: bool = False
-    """Whether no masks are used."""
+    """Whether masks are ignored, because there is only white behind the person."""
     fit_masks: bool = True
-    """Whether masks are moved to the edges in the photos."""
+    """Whether the boundaries of masks are moved to the edges in the photos."""
     refinement: RefineConfig | None = ITERATIONS_ALONE
     """How the avatar is refined; None: not at all."""
     overwrite: bool = False
-    """Whether to begin anew where `out` has a body or an avatar."""
+    """Whether to begin anew even if `out` has a body or an avatar."""
 
     def steps(self) -> Iterator[Step]:
-        """From the photos to the page."""
+        """Does all of the work, from the photos to the page, and yields the steps."""
         if self.masks is not None and self.without_masks:
             raise ArgumentError("masks", f"{self.masks}: does not go with without_masks")
         self.resumes()  # what is wrong with the folder is reported before the work
@@ -241,7 +257,11 @@ class FromPhotos:
             yield from self._go_on(material, ahead)
 
     def _check_lengths(self, material: PhotoFolder) -> None:
-        """Raises: ArgumentError for a scale or a direction that something else sets."""
+        """Checks that scale and direction are not given twice.
+
+        Raises: ArgumentError for a height with a calibration, or for a scale or an axis without
+        one.
+        """
         if material.cameras is not None and self.height is not None:
             raise ArgumentError(
                 "height", ": is for photos without cameras: the calibration has a scale"
@@ -253,15 +273,15 @@ class FromPhotos:
                     raise ArgumentError(argument, problem)
 
     def mark(self, **more: Any) -> dict[str, dict[str, Any]]:
-        """The file that says which run made the folder: its photos, and the options that a later
-        run has to repeat.
+        """Returns the content of the file that marks a folder as made by a run: the photos, and the
+        options that a later run has to repeat. more: further entries.
         """
         return {
             START_MARK: {"photos": str(self.photos.resolve()), "options": self._decisive(), **more}
         }
 
     def _decisive(self) -> dict[str, Any]:
-        """Options that decide what the body is, as plain values."""
+        """Returns the options on which the body depends, as plain values."""
         names = (
             "cameras",
             "masks",
@@ -281,7 +301,11 @@ class FromPhotos:
         }
 
     def _check_same_options(self, mark: Any) -> None:
-        """Raises: ArgumentError if the body of the earlier run was made with other options."""
+        """Checks that an earlier run made its body with the same options. mark: content of its file
+        `START_MARK`.
+
+        Raises: ArgumentError for the first option that differs.
+        """
         earlier = None
         if isinstance(mark, dict):
             earlier = mark.get("options")
@@ -294,7 +318,7 @@ class FromPhotos:
                 raise ArgumentError(name, problem)
 
     def _go_on(self, material: PhotoFolder, ahead: Ahead) -> Iterator[Step]:
-        """From where an earlier run came to an end, if there was one."""
+        """Fits the body and makes the avatar. Uses the body of an earlier run if there is one."""
         # a body that is there is used again
         if self.resumes():
             self._check_same_options(read_json(self.out / START_MARK))
@@ -318,10 +342,10 @@ class FromPhotos:
         yield from self._finish(capture, estimate)
 
     def _with_cameras(self, material: PhotoFolder) -> Generator[Step, None, Known]:
-        """Import photos and cameras, find keypoints and masks that are missing, and name what else
-        is to be made.
+        """Imports photos and cameras, and finds missing keypoints and masks. If something else is
+        missing, it yields how to make it.
 
-        Raises: MissingError.
+        Raises: MissingError if something is missing that cannot be found in the photos.
         """
         photos, masked = None, self.without_masks
         if material.cameras is not None:
@@ -351,7 +375,7 @@ class FromPhotos:
         return self._known(material, masks_by_detector="masks" in detected)
 
     def _photos_alone(self, material: PhotoFolder) -> Generator[Step, None, Known]:
-        """Find the person and the cameras in the photos."""
+        """Finds the person in the photos, and the cameras from the person."""
         with stage("finding the person and the cameras"):
             given = (material.keypoints, material.masks, material.alpha, material.others)
             own_masks = not (self.without_masks or material.alpha or material.masks)
@@ -374,7 +398,7 @@ class FromPhotos:
         return self._known(material, masks_by_detector=own_masks)
 
     def _detect(self, material: PhotoFolder, wanted: list[str]) -> Iterator[Step]:
-        """Find keypoints or masks in the photos of the capture."""
+        """Finds keypoints, masks or both in the photos of the capture, and writes them."""
         with stage("finding the person"):
             photos = load_photos(self.out)
             given = None
@@ -389,7 +413,7 @@ class FromPhotos:
         yield Step(f"{' and '.join(wanted)} found in the photos: {sheet} shows them")
 
     def _known(self, material: PhotoFolder, *, masks_by_detector: bool) -> Known:
-        """What the fit may count on: keypoints are those of the detector where the folder has
+        """Returns what the fit needs to know. Keypoints are those of the detector if the folder has
         none.
         """
         return Known(
@@ -401,7 +425,9 @@ class FromPhotos:
         )
 
     def _folder(self) -> Generator[Step, None, Path]:
-        """The folder of photos; that of a video is beside `out`."""
+        """Returns the folder of photos. For a video, its best frames are written into a folder
+        beside `out`.
+        """
         video = video_of(self.photos)
         if video is None:
             return self.photos
@@ -416,9 +442,9 @@ class FromPhotos:
         return folder
 
     def resumes(self) -> bool:
-        """Whether an earlier run left a body to go on from.
+        """Returns whether an earlier run left a body from which this one can go on.
 
-        Raises: ArgumentError if the folder may not be replaced.
+        Raises: ArgumentError if `out` is a file, or a folder that may not be replaced.
         """
         ours = (self.out / START_MARK).is_file()
         begun = ours and not (self.out / "body.npz").exists()
@@ -438,7 +464,7 @@ class FromPhotos:
         return fitted
 
     def _import(self, material: PhotoFolder) -> Generator[Step, None, ImportReport]:
-        """Import photos and cameras into the capture."""
+        """Imports photos and cameras into the capture."""
         with stage("importing photos and cameras"):
             assert material.cameras is not None
             report = import_cameras(
@@ -469,7 +495,9 @@ class FromPhotos:
     def _fit(
         self, known: Known, ahead: Ahead
     ) -> Generator[Step, None, tuple[Capture, HeldOut | None]]:
-        """Fit the body to keypoints and masks, and write it into the capture."""
+        """Fits the body to keypoints and masks, and writes it into the capture. Returns the
+        capture, and how well its avatar reproduces a held-out photo; None if this was not measured.
+        """
         with stage("fitting the body"):
             fit_masks = self.fit_masks and not known.masks_by_detector
             photos = load_photos(self.out, fit_masks=fit_masks)
@@ -511,8 +539,12 @@ class FromPhotos:
     def _with_own_poses(
         self, photos: Path, bodies: list[RefinedCapture], record: FitRecord
     ) -> Generator[Step, None, tuple[list[RefinedCapture], FitRecord]]:
-        """Bodies with a pose for each photo, and the record of the fit to match, if photos that
-        share a pose show that the person moved between them; else what was given.
+        """Fits a pose for each photo if several photos share a pose and show that the person moved
+        between them. Returns the new bodies and a record of the fit that matches them; else returns
+        the given ones.
+
+        Arguments: photos: folder from which the photos were imported, for their times. bodies: for
+        loose and tight clothes.
         """
         first = bodies[0].capture
         if first.frame_count > 1 or first.view_count < 2:
@@ -527,7 +559,9 @@ class FromPhotos:
         return moved, record_of_photos(record, first.frames)
 
     def _finish(self, capture: Capture, estimate: HeldOut | None) -> Iterator[Step]:
-        """Check the capture, then make, refine and write the avatar."""
+        """Checks the capture, then makes, refines and writes the avatar. estimate: how well an
+        avatar of this body reproduces a held-out photo; None: to be measured here.
+        """
         forget_decoded()  # the capture has the photos
         with stage("preparing the photos"):
             weights = shipped_weights()
@@ -575,7 +609,7 @@ class FromPhotos:
         yield Step("the avatar in a browser", file=page, photos=photos, avatar=avatar)
 
     def _check(self, capture: Capture | PreparedCapture) -> Iterator[Step]:
-        """Draw the body over the photos."""
+        """Draws the body over the photos, and yields how well they agree."""
         with stage("checking"):
             report = check_capture(capture, self.out / "check.png")
         yield Step(f"\n{report}")
@@ -583,7 +617,9 @@ class FromPhotos:
 
 
 def _bodies_to_masks(fitted: FittedCapture) -> list[RefinedCapture]:
-    """The fitted body, refined by the masks: as of someone in loose clothes, and in tight ones."""
+    """Refines the fitted body by the masks in two ways: first for loose clothes, then for tight
+    ones.
+    """
     capture = fitted.capture
     # calibrated cameras move where the keypoints have shown that they are off
     if capture.calibrated:
@@ -600,6 +636,6 @@ def _bodies_to_masks(fitted: FittedCapture) -> list[RefinedCapture]:
 
 
 def _keypoints(photos: Photos, file: Path, person: int | None) -> Keypoints:
-    """The keypoints of some photos, of the person with that number where several are in them."""
+    """Reads the keypoints of photos. person: number of the person, if the file has several."""
     height, width = photos.images.shape[1:3]
     return read_keypoints(file, photos.names, width, height, person=person)

@@ -1,9 +1,8 @@
-"""Photos without a calibration -> a capture without a body: the people in them are found, and from
-the person the cameras.
+"""Makes a capture without a body from photos without a calibration: finds the people in the photos,
+and from the chosen person the cameras.
 
-See `capture.fitting.person_cameras`; who is who in several photos: `apps.detect`. Large photos are
-reduced
-first: nothing that comes after looks at more than some hundred pixels of a person.
+`capture.fitting.person_cameras` finds the cameras, and `apps.detect` decides who is who. Large
+photos are reduced first, because later steps look at no more than some hundred pixels of a person.
 """
 
 import dataclasses
@@ -39,7 +38,7 @@ from humangs_jax.io.images import (
 )
 
 LONGEST = 2048
-"""Pixels: longest side to which photos are reduced."""
+"""Longest side to which photos are reduced, pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,15 +46,17 @@ class PhotosImported:
     """What `import_photos` did."""
 
     lines: tuple[str, ...]
-    """What was written and found, a line each."""
+    """What was written and found, one line each."""
     warnings: tuple[str, ...]
-    """What a user should know, a line each."""
+    """What a user should know, one line each."""
     people: list[PhotoPeople]
-    """The people in each photo, at the size of the photos that were looked at."""
+    """The people in each photo, in pixels of the photos that were looked at, which may be
+    reduced.
+    """
     person: int
-    """Number of the one who is meant among the people."""
+    """Number of the chosen person among the people."""
     one_moment: bool
-    """Whether several photos share one pose, so that cameras can be refined."""
+    """Whether there are several photos and all share one pose, so that cameras can be refined."""
 
 
 def import_photos(
@@ -71,20 +72,22 @@ def import_photos(
     reduce: bool = False,
     also: Mapping[str, object] | None = None,
 ) -> PhotosImported:
-    """Write the capture folder `out`, with keypoints.json and people.png, from photos alone; what
-    is there is replaced.
+    """Writes the capture folder `out`, with keypoints.json and people.png, from photos alone.
+    Existing files are replaced.
 
     Arguments:
-        person: number on people.png, where several may be meant; with `keypoints`, in their file.
-        height: of the person, metres.
-        keypoints: of another program. They choose who is meant in each photo.
-        masks: folder of masks of another program. They choose, too, where neither keypoints nor a
-            number is given.
-        others: folder of masks of other people and of things in front, of photos that have some.
-        own_masks: whether the detector's masks are written.
+        person: number of the person on people.png, if several may be meant. With `keypoints`, it is
+        the number in their file.
+        height: height of the person, metres; None: that of an average person.
+        keypoints: keypoints of another program. They choose the person in each photo.
+        masks: folder of masks of another program. They choose the person if neither keypoints nor a
+        number is given.
+        others: folder of masks of other people and of things in front of the person. Only some
+        photos need to have one.
+        own_masks: whether to write the masks of our detector.
         reduce: whether large photos may be reduced.
-        also: name and content of JSON files that appear with the capture.
-    Raises: ValueError (one line) if no camera is found or several people may be meant; as
+        also: names and contents of JSON files that are written with the capture.
+    Raises: ValueError (one line) if no camera is found or several people may be meant. Also as
     `import_cameras`.
     """
     images, files = photo_files(folder)
@@ -105,8 +108,8 @@ def import_photos(
 
 
 def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
-    """The photos, upright and not larger than `LONGEST`, in a folder; none if they are small as
-    they are.
+    """Writes the photos into a folder, upright and not larger than `LONGEST`, and returns their
+    files. Returns an empty list if no photo is larger, or if two photos differ in the suffix only.
     """
     names = {file.relative_to(images).with_suffix(".png") for file in files}
     if max(max(image_size(file)) for file in files) <= LONGEST or len(names) < len(files):
@@ -124,22 +127,22 @@ def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
 
 
 class _Looked(NamedTuple):
-    """The people in the photos, and what is seen of the one who is meant."""
+    """The people in the photos, and what is seen of the chosen person."""
 
     photos: list[PhotoPeople]
     """All photos, with their people."""
     number: int
-    """Number of the person who is meant."""
+    """Number of the chosen person."""
     shown: list[int]
     """Indices of the photos that show the person."""
     seen: PersonViews
-    """Landmarks of the person in these photos."""
+    """Landmarks of the person in the photos of `shown`."""
     cropped: tuple[str, ...]
-    """A line for photos that were cut; empty if none was."""
+    """One line about photos that were cropped; empty if none was."""
 
 
 class _Choice(NamedTuple):
-    """What says who is meant, see `import_photos`, and where the capture goes."""
+    """The arguments that choose the person, see `import_photos`, and the place of the capture."""
 
     person: int | None
     """Number on people.png, or in the keypoint file if there is one."""
@@ -190,7 +193,9 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choic
 
 
 def _cropped(files: list[Path]) -> tuple[str, ...]:
-    """A warning that names the photos whose EXIF describes a larger frame."""
+    """Returns one line that names photos whose EXIF describes a frame of another shape, so that
+    they were cropped. Empty if there are none.
+    """
     frames = [(file, cropped_from(file)) for file in files]
     found = [(file, frame) for file, frame in frames if frame is not None]
     if not found:
@@ -211,7 +216,8 @@ def _by(size: tuple[int, int]) -> str:
 def _chosen(
     photos: list[PhotoPeople], images: Path, files: list[Path], choice: _Choice
 ) -> tuple[list[PhotoPeople], int]:
-    """The photos, and the number of the person.
+    """Chooses the person. Returns the photos, in which the person has the same number, and the
+    number.
 
     Raises: see `detect.choose`, `detect.person_of`, `read_keypoints`.
     """
@@ -239,7 +245,10 @@ def _written(
     own_masks: bool,
     also: Mapping[str, object] | None,
 ) -> PhotosImported:
-    """Write the capture. Arguments: choice: whose masks are imported; None: no masks are."""
+    """Finds the cameras from the person, and writes the capture.
+
+    Arguments: images: folder of the photos. choice: names the masks to be imported; None: none are.
+    """
     photos, number, shown, seen, cropped = looked
     found = cameras_from_person(seen, height=height)
     if choice is None:

@@ -1,10 +1,10 @@
-"""What is wrong with a capture: whether its photos, masks, cameras and poses belong together, in a
-fraction of a second.
+"""Finds in a fraction of a second what is wrong with a capture: whether photos, masks, cameras and
+poses belong together.
 
-The posed body is drawn as points into coarse silhouettes by numpy: nothing is compiled. Where a
-silhouette is not on its mask, mistakes that people make are undone on trial, and the one that
-explains it is named. `humangs reconstruct` and `refine` look first; `humangs check` and `start`
-draw a sheet as well (`apps.check`).
+The posed body is drawn as points into coarse silhouettes with numpy, so nothing is compiled. Where
+a silhouette does not lie on its mask, common mistakes are undone on trial, and the one that
+explains the view is named. `humangs reconstruct` and `refine` call this before they begin. `humangs
+check` and `start` draw a sheet as well (`apps.check`).
 """
 
 import dataclasses
@@ -28,35 +28,41 @@ from humangs_jax.data.capture_checks import few
 
 @dataclasses.dataclass(frozen=True)
 class _Limits:
-    """When body and photo do not agree."""
+    """Thresholds for the agreement of body and photo."""
 
     iou: float = 0.5
-    """Clothes and hair cover about a fifth of a silhouette that the body does not; half means
-    another pose or camera."""
+    """Intersection over union below which body and mask do not agree. Clothes and hair cover about
+    a fifth of a silhouette that the body does not. At half, the pose or the camera is wrong.
+    """
     sure_iou: float = 0.6
-    """Intersection over union above which a mistake that was undone explains a view."""
+    """Intersection over union that a view needs once a mistake is undone, so that the mistake
+    explains it.
+    """
     inside: float = 0.5
-    """Share of the points in the frame below which there is a warning."""
+    """Share of the body's points in the frame below which there is a warning."""
     sure_inside: float = 0.9
-    """Share of the points in the frame that is asked of an explanation."""
+    """Share of the body's points that have to be in the frame once a mistake is undone."""
     height: float = 0.05
-    """Share of the image's height: a body smaller than this has its lengths in another unit."""
+    """Height of the body as a share of the image's height. A smaller body has its lengths in
+    another unit.
+    """
     turn: float = 2 * math.pi + 0.5
-    """Radians: rotation vectors are at most half a turn, and a whole one where someone counted on;
-    degrees are far beyond."""
+    """Length of the longest rotation vector that is accepted, radians. It is at most half a turn,
+    or a whole turn where a program kept counting. Values in degrees are far beyond.
+    """
     better: float = 0.1
-    """IoU by which an exchange has to explain each view better than the capture does."""
+    """IoU that each view has to gain so that an exchange of cameras explains it."""
     dark: float = 0.12
-    """A photo is too dark if 98 % of the person's values are below this."""
+    """A photo is too dark if 98 % of the person's values are below this, 0 to 1."""
     burnt: float = 0.98
-    """A photo is burnt out if 60 % of the person's values are above this."""
+    """A photo is burnt out if 60 % of the person's values are above this, 0 to 1."""
 
 
 _LIMITS = _Limits()
 
 
 VIEWS = 24
-"""Most views that are looked at before a reconstruction, evenly chosen."""
+"""Most views that are looked at before a reconstruction. They are evenly chosen."""
 
 Matrix = Float[np.ndarray, "4 4"]
 Cells = Bool[np.ndarray, "rows columns"]
@@ -78,32 +84,34 @@ MISTAKES: dict[str, Callable[[Matrix, Float[np.ndarray, "3"]], Matrix]] = {
     "the cameras stand in a world with z up: multiply cam_from_world by (x, y, z) -> (x, -z, y)"
     " from the right": (lambda m, t: m @ _TO_Y_UP.T),
 }
-"""What people do wrong, and the correct cam_from_world from the given one and the body's
-translation.
+"""Common mistakes, each with a function that undoes it. The function takes the given
+cam_from_world, (4, 4), and the body's translation, (3,), and returns the correct cam_from_world.
 """
 MISTAKES_OF_IMAGES: dict[str, Callable[[Cells, Cells], tuple[Cells, Cells]]] = {
     "the mask is inverted": lambda body, mask: (body, ~mask),
     "the photo is mirrored": lambda body, mask: (body[:, ::-1], mask),
 }
-"""What people do wrong with photos, and the silhouettes of body and mask without it."""
+"""Common mistakes with photos, each with a function that undoes it. The function takes and returns
+the silhouettes of body and mask.
+"""
 
 
 class Faults(NamedTuple):
-    """What is wrong with a capture."""
+    """What is wrong with a capture and its views."""
 
     whole: tuple[str, ...]
-    """What is wrong with the capture as a whole, a line each."""
+    """What is wrong with the capture as a whole, one line for each problem."""
     views: tuple[str | None, ...]
-    """What is wrong with each view, a line or None."""
+    """What is wrong with each view, one line; None if nothing is."""
     inside: tuple[float, ...]
-    """Share of the body in the frame, of each view, 0 to 1."""
+    """Share of the body in the frame of each view, 0 to 1."""
     explained: set[int]
     """Indices of the views that `whole` explains."""
 
 
 def likely_mistakes(capture: Capture) -> tuple[str, ...]:
-    """Warns in one line each about what looks wrong in a capture; what concerns all views comes
-    first.
+    """Returns warnings about what looks wrong in a capture, one line each. Problems of the whole
+    capture come first.
     """
     some = np.unique(
         np.linspace(0, capture.view_count - 1, min(capture.view_count, VIEWS)).round().astype(int)
@@ -119,7 +127,7 @@ def likely_mistakes(capture: Capture) -> tuple[str, ...]:
 
 
 def faults(capture: Capture) -> Faults:
-    """What is wrong with a capture as a whole, and with every view."""
+    """Returns what is wrong with a capture as a whole, and with every view."""
     views = _coarse_views(capture)
     problems, inside = zip(*map(_fault, views), strict=True)
     largest = float(np.linalg.norm(np.asarray(capture.poses.rotations, float), axis=-1).max())
@@ -141,7 +149,9 @@ def faults(capture: Capture) -> Faults:
 
 
 class _View(NamedTuple):
-    """What is compared, in numpy: JAX would compile each of the small operations."""
+    """What is compared of one view, as numpy arrays. JAX would compile each of the small
+    operations.
+    """
 
     name: str
     """Name of the view."""
@@ -188,7 +198,9 @@ def _coarse_views(capture: Capture) -> list[_View]:
 
 
 def _fault(view: _View) -> tuple[str | None, float]:
-    """What is wrong with a view, and the share of the body in the frame."""
+    """Returns what is wrong with a view, in a line or None, and the share of the body in the frame,
+    0 to 1.
+    """
     body, inside, height = _silhouette(view)
     if view.cells is not None and not view.cells.any():
         return "the mask is empty", inside
@@ -205,7 +217,9 @@ def _fault(view: _View) -> tuple[str | None, float]:
 
 
 def _wrong_exposure(view: _View) -> str | None:
-    """A person who is nearly black or burnt out shows nothing."""
+    """Returns what is wrong with the exposure of the person, who may be nearly black or burnt out;
+    None if nothing is.
+    """
     person = (
         view.image if view.mask is None else view.image[view.mask > 0.99]
     )  # without its blended edge
@@ -220,8 +234,9 @@ def _wrong_exposure(view: _View) -> str | None:
 
 
 def _cause(view: _View, body: Cells) -> str | None:
-    """The mistake that, undone, puts the body where the mask is; without a mask the only one that
-    puts it in the frame.
+    """Returns the mistake that explains a view: undoing it puts the body where the mask is. Without
+    a mask, it is the only mistake whose undoing puts the body into the frame. None if no mistake
+    explains the view.
     """
     tried = {}
     if view.cells is not None:
@@ -245,9 +260,9 @@ def _cause(view: _View, body: Cells) -> str | None:
 
 
 def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
-    """For views that fit the camera of another one: that one.
-
-    An exchange has to explain all of its views.
+    """Returns the views whose cameras seem to be exchanged. Keys are indices of views, values are
+    indices of the views whose cameras would fit them. Empty if an exchange does not explain all of
+    its views.
     """
 
     def drawn(i, j):
@@ -283,8 +298,8 @@ def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
 
 
 def _silhouette(view: _View) -> tuple[Cells, float, float]:
-    """The cells that the body covers; the share of its points in the image; and its height there,
-    of the image's.
+    """Returns the cells that the body covers, the share of its points that are in the image, and
+    its height as a share of the image's height.
     """
     height, width = view.image.shape[:2]
     pixels = points_in_image(view.points, view.K, view.matrix, width, height)

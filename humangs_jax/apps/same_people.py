@@ -1,10 +1,11 @@
-"""Who of the people in one photo is who of those in the others.
+"""Matches the people in photos: decides who of one photo is who of another.
 
-The person is the only large one of each photo. Where several are large, people of one moment are
-matched by how well they triangulate, over time by where they are, in space or in the photo of one
-camera. Without calibrated cameras nothing tells who of them is who: colors are no proof, since
-photos are exposed as they like. Whoever is matched to nobody may still be the person: only who is
-in a photo together with the person is surely somebody else.
+In the simplest case each photo shows one large person, who is the same everywhere. Where several
+are large and cameras are calibrated, people of one moment are matched by how well their landmarks
+triangulate. Over time they are matched by where they are, in space, or in the photo of one camera.
+Without calibrated cameras nothing decides who of several large people is who. Colors are no proof,
+since photos may be exposed differently. Somebody who was matched to nobody may still be the person.
+Only somebody who is in a photo together with the person is surely somebody else.
 """
 
 import dataclasses
@@ -25,30 +26,34 @@ from humangs_jax.core.array_types import Bool, Float, Int, UInt
 from humangs_jax.geometry.camera import Camera
 
 _RIVAL = 0.35
-"""Somebody with this share of the pixels of the largest person could be the intended person too."""
+"""Least area of a rival, as a share of the area of the largest person. A rival could be the
+intended person, too.
+"""
 
 
 class PersonInPhoto(NamedTuple):
     """A person who was found in a photo."""
 
     person: SeenPerson
-    """Landmarks in pixels of the photo and in metres, and whether they are seen."""
+    """Landmarks in pixels of the photo and in metres, with their visibility."""
     mask: UInt[np.ndarray, "h w"]
     """The person's mask, (h, w), 0 to 255, in the part of the photo that begins at `corner`."""
     corner: tuple[int, int]
     """Row and column of the first pixel of the mask in the photo."""
     area: float
-    """Pixels of the person; of one who is covered by others, as many as there would be without
-    them.
+    """Number of pixels of the person. For somebody who may be covered by others it is at least an
+    estimate for the person without cover.
     """
     mirrored: bool = False
-    """Whether left and right were exchanged, as other views show; it is repaired."""
+    """Whether left and right of the landmarks were exchanged, as other views showed. The landmarks
+    here are right again.
+    """
     apart: bool = False
-    """Whether the landmarks do not meet those of other photos of the moment: the camera is off, or
-    this is somebody else.
+    """Whether the landmarks do not fit those of other photos of the same moment. Then the camera is
+    off, or this is somebody else.
     """
     covered: bool = False
-    """Whether somebody else may stand in front."""
+    """Whether other people may stand in front of this person."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -60,19 +65,21 @@ class PhotoPeople:
     size: tuple[int, int]
     """Width and height of the photo, pixels."""
     thumbnail: Float[np.ndarray, "h w 3"]
-    """The photo reduced for the sheet, (h, w, 3), 0 to 1."""
+    """The reduced photo for the sheet, (h, w, 3), 0 to 1."""
     people: tuple[PersonInPhoto | None, ...]
-    """The people by number, the same in all photos; None for those who are not in it."""
+    """The people by their number, which is the same in all photos. None for people who are not in
+    this photo.
+    """
     known: bool = True
-    """Whether the numbers tell who is who. False if several people are large and nothing tells who
-    of them is who of another photo: they are in the order of size.
+    """Whether equal numbers mean the same person. False if several people of this photo are large
+    and nothing shows who of them is who of another photo; then numbers only follow size.
     """
 
 
 def inside_photo(
     x: Int[np.ndarray, " n"], y: Int[np.ndarray, " n"], width: int, height: int
 ) -> Bool[np.ndarray, " n"]:
-    """Tells which pixels are in a photo of this size."""
+    """Returns which pixels (x, y) lie in a photo of this size, (n,)."""
     return (x >= 0) & (x < width) & (y >= 0) & (y < height)
 
 
@@ -81,12 +88,12 @@ def same_people(
     cameras: Camera | None = None,
     frames: Sequence[int] | None = None,
 ) -> list[PhotoPeople]:
-    """The photos with people in such an order that the i-th of each is the same person.
+    """Orders the people of each photo so that the i-th is the same person in all photos. The first
+    is the person with the most pixels in all photos together.
 
-    Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size, see
-    `PhotoPeople.known`.
-    frames: the moment of each photo. The person with the most pixels in all photos together is the
-    first.
+    Arguments: cameras: a batch with the camera of each photo. None: not known; then people are in
+    the order of size, see `PhotoPeople.known`. frames: the moment of each photo. None: all photos
+    are of one moment.
     """
     if cameras is not None and len(photos) > 1:
         moments = np.asarray([0] * len(photos) if frames is None else frames)
@@ -113,7 +120,9 @@ def same_people(
 
 
 def _large(people: Sequence[PersonInPhoto | None]) -> list[int]:
-    """Gives the people of a photo who could be the intended person as well as its largest."""
+    """Returns the indices of the people of a photo who are large enough to be the intended
+    person.
+    """
     areas = [0.0 if each is None else each.area for each in people]
     return [
         i for i, each in enumerate(people) if each is not None and areas[i] > _RIVAL * max(areas)
@@ -126,13 +135,16 @@ def _areas(photos: Sequence[PhotoPeople]) -> list[float]:
 
 
 Row = list[PersonInPhoto | None]
-"""The people of a photo, each at the number of the person."""
+"""The people of one photo. The index is the number of the person; None for people not in the photo.
+"""
 
 
 def _matched(
     photos: Sequence[PhotoPeople], cameras: Camera, frames: Int[np.ndarray, " v"]
 ) -> list[Row]:
-    """The people of each photo by number, as far as cameras and time tell who is who."""
+    """Returns the people of each photo by number, as far as cameras and time show who is who.
+    frames: the moment of each photo, (v,).
+    """
     K, transforms = (np.asarray(x, np.float64) for x in (cameras.K, cameras.cam_from_world))
     points = [
         tuple(each.person.points for each in photo.people if each is not None) for photo in photos
@@ -154,11 +166,12 @@ def _matched(
 
 
 def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]:
-    """The same where those who are the only large ones of their photos are one person, matched or
-    not.
+    """Joins people who are the only large ones of their photos into one person, even where they
+    were not matched. Returns the rows with the joined person, or the given rows where nothing is
+    joined.
 
-    Two people that one photo shows together stay two. Where somebody else is large in many photos,
-    nobody is joined: whoever is alone in a photo may then be either.
+    Two people whom one photo shows together stay two. Nobody is joined if somebody else remains
+    large, because a person alone in a photo could then be either.
     """
     alone = {large[0] for large in map(_large, rows) if len(large) == 1}
     if not alone:
@@ -183,10 +196,11 @@ def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]
 def _with_those_apart(
     rows: list[Row], person: int, source: Int[np.ndarray, " v"], frames: Int[np.ndarray, " v"]
 ) -> list[Row]:
-    """The same where photos of the person that do not meet the others of their moment are marked,
-    see `PersonInPhoto.apart`.
+    """Marks photos in which the joined person does not fit the other photos of the moment, see
+    `PersonInPhoto.apart`. Changes the rows in place and returns them.
 
-    Arguments: source: the number that each photo had by its match.
+    Arguments: person: number of the joined person. source: the number that this person had in each
+    photo before, (v,). frames: the moment of each photo, (v,).
     """
     for frame in np.unique(frames):
         own = [int(v) for v in np.flatnonzero(frames == frame) if rows[v][person] is not None]
@@ -207,7 +221,9 @@ def _with_those_apart(
 
 
 def exchanged(found: PersonInPhoto) -> PersonInPhoto:
-    """The person with left and right exchanged."""
+    """Exchanges left and right in the landmarks and hands of a person, and marks the person as
+    mirrored.
+    """
     order = np.asarray(MEDIAPIPE_33.mirror)
     person = dataclasses.replace(
         found.person,
@@ -219,15 +235,17 @@ def exchanged(found: PersonInPhoto) -> PersonInPhoto:
 
 
 def rivals(photos: Sequence[PhotoPeople]) -> list[int]:
-    """Gives the numbers of people who could be the intended person as well as the first."""
+    """Returns the numbers of people who could be the intended person as well as number 0, by their
+    pixels in all photos together.
+    """
     areas = _areas(photos)
     return [i for i in range(1, len(areas)) if areas[i] > _RIVAL * areas[0]]
 
 
 def is_unclear(photos: Sequence[PhotoPeople], photo: int, person: int) -> bool:
-    """Tells whether somebody in a photo may be the person who is not known to be in it.
-
-    That is somebody large that no photo shows together with the person.
+    """Returns whether a photo in which the person was not found may still show the person. That is
+    so if it has somebody large whom no photo shows together with the person, and where numbers do
+    not mean who is who.
     """
     people = photos[photo].people
     if not photos[photo].known:

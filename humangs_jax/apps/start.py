@@ -1,8 +1,9 @@
-"""From a folder of photos to an avatar: what is there, what is missing, and which well-known tool
+"""Looks at a folder of photos: what an avatar needs, what is missing, and which well-known tool
 makes it.
 
-Nothing is asked: the folder is looked at. docs/your_photos.md shows the way. Also how like a person
-an avatar is where no photo was. The best frames of a video: `apps.video_photos`.
+The user need not describe the folder; its files are found by their names. docs/your_photos.md shows
+the way. Also measures how well an avatar reproduces a photo that it has not seen, and chooses by
+that between two bodies. `apps.video_photos` takes the best frames of a video.
 """
 
 import dataclasses
@@ -50,17 +51,17 @@ _KEYPOINT_FOLDER = "keypoints"
 _OWN_DETECTOR = (
     "pip install 'humangs_jax[photos]', and the same command finds them; or with another program:"
 )
-"""Advice for masks and keypoints where LiteRT is not installed."""
+"""Advice for masks and keypoints if LiteRT is not installed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PhotoFolder:
-    """What a folder has."""
+    """The photos of a folder, and the files beside them that can be used."""
 
     folder: Path
     """The folder that was looked at."""
     images: Path
-    """The folder of its photos."""
+    """The folder in which its photos are: the folder itself or one in it."""
     photos: int
     """Number of the photos."""
     size: tuple[int, int]
@@ -70,16 +71,17 @@ class PhotoFolder:
     masks: Path | None = None
     """Folder of masks; None if there is none."""
     alpha: bool = False
-    """Whether photos carry their mask as alpha channel."""
+    """Whether photos have their mask in an alpha channel."""
     keypoints: Path | None = None
     """File or folder of keypoints; None if there are none."""
     unused: tuple[Unused, ...] = ()
-    """What the folder has besides."""
+    """Files that are not used."""
     others: Path | None = None
-    """Folder of masks of other people and of things in front; None if there is none."""
+    """Folder of masks of other people and of things in front of the person; None if there is none.
+    """
 
     def __str__(self) -> str:
-        """A line for each kind of thing, and one for what is not used."""
+        """Returns one line for each kind of file, and one for files that are not used."""
         masks = self.masks or ("in the photos' alpha channel" if self.alpha else None)
         rows = {
             "photos": (
@@ -102,17 +104,17 @@ class PhotoFolder:
 
 @dataclasses.dataclass(frozen=True)
 class Missing:
-    """Something that is not there, and how to make it."""
+    """Something that is missing, and how to make it."""
 
     name: str
     """What is missing: cameras, masks or keypoints."""
     why: str
-    """What it is for."""
+    """What it is needed for."""
     how: tuple[str, ...]
-    """Command lines and advice, a line each."""
+    """Command lines and advice, one line each."""
 
     def __str__(self) -> str:
-        """Indented lines under a heading."""
+        """Returns a heading with name and purpose, then indented lines."""
         return "\n".join([f"{self.name}: {self.why}", *(f"    {line}" for line in self.how)])
 
 
@@ -124,10 +126,11 @@ def inspect_folder(
     keypoints: Path | None = None,
     others: Path | None = None,
 ) -> PhotoFolder:
-    """What a folder has; what the arguments name is taken from there.
+    """Returns what a folder has. Files or folders that the arguments name replace those in the
+    folder.
 
-    Raises: CaptureError, one line, if there is no photo, the folder is a capture already, or a
-    named file does not exist.
+    Raises: CaptureError (one line) if there is no photo, if the folder is a capture already, or if
+    a named file does not exist.
     """
     _expect_folder(folder)
     if (folder / "capture.json").is_file():
@@ -167,23 +170,23 @@ def inspect_folder(
 
 
 look = inspect_folder
-"""The name that `inspect_folder` had; it goes in version 0.3."""
+"""The earlier name of `inspect_folder`. It will be removed in version 0.3."""
 
 
 def photo_files(folder: Path) -> tuple[Path, list[Path]]:
-    """The folder that the photos are in, and their files in order.
+    """Returns the folder that has the photos, and their files in order.
 
-    Raises: CaptureError, one line, if there is none.
+    Raises: CaptureError (one line) if there is no photo.
     """
     scan = scan_photos(folder)
     return scan.folder, list(scan.photos)
 
 
 def scan_photos(folder: Path) -> FolderScan:
-    """The photos in a folder, or in the one in it that is called like one of photos, and what both
-    hold besides.
+    """Finds the photos of a folder, which may be in a subfolder such as "images" or "photos". The
+    scan also has the files of both folders that are not used.
 
-    Raises: CaptureError, one line, if there is no photo.
+    Raises: CaptureError (one line) if there is no photo.
     """
     _expect_folder(folder)
     places = (folder / name for name in ("images", "photos", "imgs", "rgb"))
@@ -217,10 +220,10 @@ def _expect_folder(folder: Path) -> None:
 
 
 def missing(material: PhotoFolder, images: Path | None = None) -> tuple[Missing, ...]:
-    """What is still to be made, with the commands that make it.
+    """Returns what is still missing, cameras, masks or keypoints, with the commands that make it.
 
-    Arguments: images: where photos without lens distortion are, if they were imported: keypoints
-    have to be of those.
+    Arguments: images: folder of the photos for which keypoints are to be made, if an import has
+    changed them, for example removed lens distortion. None: the folder's own photos.
     """
     folder, found = material.folder, []
     # two ways to cameras: structure from motion, or a calibrated set
@@ -281,12 +284,14 @@ def missing(material: PhotoFolder, images: Path | None = None) -> tuple[Missing,
 
 
 def has_photos(folder: Path) -> bool:
-    """Whether there is a photo in a folder or in those in it."""
+    """Returns whether a folder or one of its subfolders has a photo."""
     return bool(_scan(folder).photos)
 
 
 def _scan(folder: Path) -> FolderScan:
-    """Scan a folder without masks and without what other programs have made of photos."""
+    """Scans a folder for photos. Skips masks, keypoints and what other programs have made of
+    photos.
+    """
     others = (
         *NO_PHOTOS,
         _KEYPOINT_FOLDER,
@@ -301,16 +306,17 @@ def _scan(folder: Path) -> FolderScan:
 
 
 READ = 8
-"""Photos that the network reads where cameras were found from the person: more are no sharper, and
-take their time. All serve poses and refinement."""
+"""Most photos that the network reads if cameras were found from the person. More photos would take
+longer and give no sharper avatar. All photos serve for poses and refinement.
+"""
 SIZE = 512
-"""Pixels a side of the crop in which bodies are compared."""
+"""Side of the crop in which bodies are compared, pixels."""
 LONGEST = 1024
-"""Pixels: larger photos are reduced, whose crops around the person would be all the same."""
+"""Longest side to which photos are reduced before one is held out, pixels."""
 
 
 class HeldOut(NamedTuple):
-    """How well a photo that an avatar did not see is reproduced."""
+    """How well an avatar reproduces a photo that was held out of it."""
 
     name: str
     """Name of the photo that was held out."""
@@ -318,10 +324,11 @@ class HeldOut(NamedTuple):
     """PSNR over the person, dB."""
     aligned: float
     """PSNR of colors and coverage after small moves of the photo, dB, see `losses.alignment`. It
-    decides which avatar is kept."""
+    decides which body is kept.
+    """
 
     def __str__(self) -> str:
-        """One line."""
+        """Returns one line with the photo's name and its PSNR."""
         return (
             f"a photo that was held out ({self.name}) is reproduced with {self.psnr:.1f} dB in the"
             " foreground"
@@ -336,13 +343,19 @@ def held_out_psnr(
     number: int = 0,
     watch: Callable[[Avatar, PreparedCapture], None] | None = None,
 ) -> HeldOut | None:
-    """How well a photo is reproduced by an avatar of the others, over the person, in a crop of
-    `SIZE` pixels: the one that has the nearest other one, or of higher `number` the next in this
-    order. None for fewer than four photos or without masks.
-    Body and cameras are those of all photos. In its place is a second copy of the nearest photo:
-    the programs for that number of photos are compiled already.
+    """Holds one photo out, makes an avatar of the others, and measures how well it reproduces the
+    photo over the person, in a crop of `SIZE` pixels. Returns None for fewer than four photos or
+    without masks.
 
-    Arguments: watch: gets the avatar of the others, before it is refined, and its photos.
+    Body and cameras are those of all photos. A second copy of the nearest photo takes the place of
+    the photo that is held out, because the programs for that number of photos are compiled already.
+
+    Arguments:
+        variables, config: of the network.
+        refinement: how the avatar is refined; None: not at all.
+        number: which photo is held out. 0 is the photo with the nearest neighbour, 1 the next in
+        this order.
+        watch: called with the avatar of the other photos, before refinement, and these photos.
     """
     photos = _photos_to_hold_out(capture)
     capture = photos.capture
@@ -378,29 +391,35 @@ def _psnr_of_person(
     photo: Float[np.ndarray, "h w 3"],
     mask: Float[np.ndarray, "h w"],
 ) -> float:
-    """`psnr_fg` of `evaluation.scores`, dB, without the programs of the other scores."""
+    """Computes the same as `psnr_fg` of `evaluation.scores`, dB, but without compiling the programs
+    of the other scores. mask: (h, w), 0 to 1.
+    """
     errors = np.mean(np.square(image - photo), axis=-1)
     mean = float(np.sum(errors * mask) / max(np.sum(mask), 1e-6))
     return min(LARGEST_PSNR, -10 * float(np.log10(max(mean, 1e-30))))
 
 
 def _photos_to_hold_out(capture: Capture | PreparedCapture) -> PreparedCapture:
-    """Photos of which one can be held out, prepared once."""
+    """Prepares the photos of which one will be held out: those that the network reads, reduced to
+    `LONGEST` pixels.
+    """
     photos = photos_to_read(prepare_capture(capture))
     large = max(photos.capture.images.shape[1:3]) > LONGEST
     return photos.resized(LONGEST) if large else photos
 
 
 def _with_unknown(capture: Capture) -> Capture:
-    """The capture with unknown areas, so that a crop knows where its photo ends."""
+    """Returns the capture with unknown areas, empty if it has none. A crop needs them to mark what
+    is beyond the photo.
+    """
     if capture.unknown is not None:
         return capture
     return dataclasses.replace(capture, unknown=np.zeros(capture.images.shape[:3], bool))
 
 
 def photos_to_read(photos: PreparedCapture) -> PreparedCapture:
-    """The photos of a capture that the network reads: `READ` of them that show the body best, where
-    cameras were found from the person; else all.
+    """Selects the photos that the network reads. Where cameras were found from the person, these
+    are the `READ` photos that show the body best; else they are all photos.
     """
     if photos.capture.calibrated or photos.capture.view_count <= READ:
         return photos
@@ -415,20 +434,23 @@ def better_body(
     refinement: RefineConfig | None,
     ahead: Ahead | None = None,
 ) -> tuple[Capture, HeldOut | None]:
-    """The capture whose body makes the better avatar, judged by photos that are held out of it, and
-    what the first of them says of the avatar after refinement.
+    """Chooses between two captures that differ in the body: returns the one whose avatar reproduces
+    held-out photos better. Also returns how well that avatar reproduces the first held-out photo
+    after refinement.
 
-    More of the masks is covered by a body that fills clothes; the avatar is not better for it.
-    Several photos are asked, see `photos_agree`, about avatars that are not refined: which body is
-    better shows before, and refinement takes most of the time. Without enough photos the first.
+    A body that fills the clothes covers more of the masks, but the avatar is not better for it, so
+    photos decide. Several photos vote, see `photos_agree`. They judge avatars without refinement:
+    the better body shows already there, and refinement takes most of the time. With too few photos
+    the first capture is returned, and None.
 
-    Arguments: ahead: compiles meanwhile what the refinement will need.
+    Arguments: refinement: as for `held_out_psnr`. ahead: compiles the programs of the refinement in
+    the background.
     """
     photos = _photos_to_hold_out(first)
 
     def compile_refinement(avatar: Avatar, read: PreparedCapture) -> None:
-        """Begins with what the refinement of any of the avatars will need, then with that by all
-        photos.
+        """Queues the programs that refine any of the avatars by the photos that are read, then
+        those for all photos.
         """
         if ahead is not None and refinement is not None:
             ahead.add(calls_of_refine(avatar, read, refinement))
@@ -459,8 +481,9 @@ def better_body(
 
 
 def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:
-    """Distances between the cameras as the person sees them, in the axes of the pelvis. They
-    also serve for somebody who turns before one camera. A photo is not its own neighbour.
+    """Returns distances between the directions in which cameras see the person, (v, v), in the axes
+    of the pelvis. So they also work for somebody who turns in front of one camera. Unit vectors are
+    compared, and 9 is added on the diagonal so that no photo is its own neighbour.
     """
     frames = np.asarray(capture.frames)
     pelvis = np.asarray(capture.poses.rotations, np.float64)[frames, 0]

@@ -1,8 +1,8 @@
-"""The motion of a person in a video of one camera that stands still.
+"""Finds the motion of a person in a video whose camera stands still.
 
-The person is followed through all frames: where one frame has found the person, the landmark
-network alone looks at the next. What was seen is kept in a file beside the result while the work
-goes on, so that an interrupted run goes on where it was. Then one fit over all frames
+The person is followed through all frames. Where one frame has found the person, only the landmark
+network looks at the next. While the work goes on, the landmarks are kept in a file beside the
+result, so that an interrupted run can go on. Then one fit uses all frames
 (`capture.fitting.motion_fit`).
 """
 
@@ -51,7 +51,7 @@ from humangs_jax.motion import made_from_of, save_motion
 
 logger = logging.getLogger(__name__)
 LONGER_SIDE = 1920
-"""Pixels of the longer side of the frames that are looked at, at most."""
+"""Frames whose longer side exceeds this are reduced to it, pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,17 +59,19 @@ class _Following:
     """How one person is followed from frame to frame."""
 
     patience: int = 8
-    """Frames without the person, in a row, that are all searched. A search takes ten times as long
-    as following the person from the frame before."""
+    """Number of frames in a row without the person that are all searched. A search takes ten times
+    as long as following the person from the frame before.
+    """
     rarely: int = 8
-    """After these frames, one of this many is searched."""
+    """After `patience` frames without the person, only one of this many frames is searched."""
     farthest: float = 0.6
-    """Between two frames the hips of a person move by less than this share of the crop's side."""
+    """Largest movement of the hips between two frames, as a share of the crop's side."""
     change: float = 1.6
-    """Between two frames the crop's side changes by less than this factor."""
+    """Largest factor by which the crop's side changes between two frames."""
     alike: float = 0.6
-    """If a second person's crop has at least this share of the largest side, the user has to
-    choose."""
+    """If a second person's crop has at least this share of the largest crop's side, a warning says
+    which of them is followed.
+    """
 
 
 _FOLLOWING = _Following()
@@ -77,10 +79,11 @@ _FOLLOWING = _Following()
 
 _NO_FACE = np.full(len(SHAPE_NAMES), np.nan, np.float32)
 _FACE_SECONDS, _LEAST_FACES = 0.025, 0.1
-"""Standard deviation of the smoothing of faces, seconds: a blink takes a tenth of a second; and the
-share of the frames that have to show a face."""
+"""Two values. Standard deviation of the filter that smooths faces, seconds; a blink takes a tenth
+of a second. Least share of frames that have to show a face.
+"""
 _TALLEST, _SMALLEST = 2.5, 0.4
-"""Metres: heights of people."""
+"""Largest and smallest height of a person that is accepted, metres."""
 
 
 class VideoFit(NamedTuple):
@@ -91,9 +94,11 @@ class VideoFit(NamedTuple):
     body: BodyModel
     """The body that was fitted."""
     K: Float[np.ndarray, "3 3"]
-    """Of the camera, for frames of `size`."""
+    """Intrinsics of the camera, (3, 3), pixels of frames of `size`."""
     size: tuple[int, int]
-    """Width and height of the frames that were looked at, pixels."""
+    """Width and height of the frames that were looked at, pixels. Large frames are reduced
+    before.
+    """
 
 
 @checked_arguments
@@ -105,23 +110,23 @@ def motion_from_video(
     avatar: Avatar | None = None,
     focal_mm: float | int | None = None,
 ) -> Motion:
-    """The motion of a person in a video of one camera that stands still.
+    """Finds the motion of a person in a video whose camera stands still.
 
     Args:
-        video: its file.
-        person: the number of the person, from 0, the largest first where several are seen in the
-            first frame with that many people. None: the largest.
-        height: of the person, metres, which gives the motion its scale. None: as tall as people
-            usually are.
-        avatar: whose body is moved as the person moves, in place of a body with the person's own
-            shape: its size gives the scale.
-        focal_mm: focal length of the camera on 35-mm film. None: that of a telephone.
+        video: the file.
+        person: number of the person, from 0. People are counted from the largest to the smallest,
+        in the first frame that shows so many. None: the largest.
+        height: height of the person, metres. It gives the motion its scale. None: that of an
+        average person.
+        avatar: an avatar to which the motion is fitted. Its body takes the place of a body with the
+        person's shape, and its size gives the scale.
+        focal_mm: focal length of the camera, millimetres on 35-mm film. None: that of a telephone.
 
     Returns:
-        Poses in a world with y up, whose floor is at 0, at the rate of the video.
+        Poses in a world with y up and the floor at 0, at the rate of the video.
 
     Raises:
-        FileError: for a video that cannot be read, naming it.
+        FileError: if the video cannot be read. The message names it.
         ValueError: if nobody is found, or LiteRT is not installed.
 
     Examples:
@@ -145,9 +150,10 @@ def fit_video(
     focal_mm: float | int | None = None,
     kept: Path | None = None,
 ) -> VideoFit:
-    """The motion as `motion_from_video`.
+    """Finds the motion as `motion_from_video` does, and returns what is needed to draw it, too.
 
-    Arguments: rest_joints: of the avatar. kept: a file for what was seen, while the work goes on.
+    Arguments: rest_joints: joints of the avatar at rest, (j, 3), metres. kept: file in which
+    landmarks are kept while the work goes on, so that an interrupted run can go on; None: no file.
     """
     if height is not None and not _SMALLEST <= height <= _TALLEST:
         raise ArgumentError("height", f"{height:g}: expected metres, {_SMALLEST:g} to {_TALLEST:g}")
@@ -191,8 +197,9 @@ def fit_video(
 def smooth_faces(
     faces: Float[np.ndarray, "m e"], rate: float | int
 ) -> Float[np.ndarray, "m e"] | None:
-    """Scores of each frame as they change over time; frames without a face, NaN, lie between the
-    others. None if hardly any frame shows a face.
+    """Smooths the scores of a face over time, (m, e), 0 to 1. Frames without a face, NaN, are
+    interpolated. Returns None if less than a tenth of the frames show a face. rate: frames per
+    second.
     """
     known = np.flatnonzero(np.isfinite(faces).all(1))
     if len(known) < _LEAST_FACES * len(faces):
@@ -204,9 +211,9 @@ def smooth_faces(
 
 
 def rate_and_count(video: Path) -> tuple[float, int]:
-    """Frames per second in the mean, and how many there are.
+    """Returns the mean number of frames per second, and the number of frames.
 
-    Raises: FileError naming the video.
+    Raises: FileError that names the video.
     """
     times = frame_times(video)
     count = len(times)
@@ -231,9 +238,12 @@ def rate_and_count(video: Path) -> tuple[float, int]:
 def look_at_video(
     video: Path, count: int, person: int | None, kept: Path | None
 ) -> tuple[dict[str, np.ndarray], tuple[int, int]]:
-    """What the detector sees of a person in each frame, and the size of the frames: `points`,
-    `confidences` and `world` as `Keypoints` has them, and `again`, where the detector's two points
-    are.
+    """Looks for a person in each frame. Returns arrays with a row per frame, and the width and
+    height of the frames. Arrays are `points`, `confidences` and `world` as in `Keypoints`; `again`,
+    the detector's two points, (m, 2, 2), pixels; and `face`, scores of the face.
+
+    Arguments: count: number of frames, for the progress bar. person: number of the person; None:
+    the largest. kept: file for landmarks, see `fit_video`.
     """
     about = made_from(video, person=person, side=LONGER_SIDE)
     rows, last = _earlier(kept, about), None
@@ -283,7 +293,9 @@ class _Follower:
         self.most, self.missed, self.lines = 0, 0, []
 
     def look(self, photo: Float[np.ndarray, "h w 3"]) -> Landmarks | None:
-        """The person in the next frame; None where nobody is found who may be the same."""
+        """Finds the person in the next frame. Returns None if nobody is found who may be the same
+        person.
+        """
         found = None
         if self.last is not None and not self.missed:
             found = self.networks.landmarks(photo, self.last.crop())
@@ -319,7 +331,9 @@ class _Follower:
         return min(near, key=distance, default=None)
 
     def _same(self, now: Detection, patience: float = 1.0) -> bool:
-        """Whether a detection may be of the person of the last frame."""
+        """Returns whether a detection may be the person of the last frame. patience: factor on the
+        distance that is allowed.
+        """
         assert self.last is not None
         before, after = self.last.crop(), now.crop()
         ratio = max(before.side, after.side) / max(min(before.side, after.side), 1e-6)
@@ -327,7 +341,7 @@ class _Follower:
         return away < patience * _FOLLOWING.farthest * before.side and ratio < _FOLLOWING.change
 
     def told(self) -> str:
-        """Why nobody was followed, in a line."""
+        """Says in one line why nobody was followed."""
         if self.most:
             return f"--person {self.person}: at most {self.most} people are seen in a frame"
         return "nobody is found: expected a person who is seen as a whole"
@@ -336,7 +350,9 @@ class _Follower:
 def _row(
     photo: Float[np.ndarray, "h w 3"], found: Landmarks | None, parts: Any
 ) -> dict[str, np.ndarray]:
-    """What is kept of a frame: zeros where nobody was found; a face that is not seen is NaN."""
+    """Returns the arrays that are kept of a frame. They are 0 if nobody was found, and `face` is
+    NaN if the face is not seen.
+    """
     if found is None:
         shapes = {"points": (2,), "confidences": (), "world": (3,)}
         count = len(MEDIAPIPE_69.names)
@@ -357,7 +373,9 @@ def _row(
 
 
 def made_from(video: Path, **options: Any) -> str:
-    """What a result depends on, as a checksum: the video as it is now, and options."""
+    """Returns a checksum of everything on which a result depends: the video file as it is now, and
+    the options.
+    """
     status = video.stat()
     known = {"name": video.name, "bytes": status.st_size, "modified": status.st_mtime_ns}
     return checksum({}, *(f"{key}={value}" for key, value in (known | options).items()))
@@ -369,9 +387,10 @@ def _keep(kept: Path, about: str, rows: list[dict[str, np.ndarray]]) -> None:
 
 
 def _earlier(kept: Path | None, about: str) -> list[dict[str, np.ndarray]]:
-    """The rows of an interrupted run of the same video and person; none without one.
+    """Reads the rows of an interrupted run with the same video and person. Returns an empty list if
+    there are none.
 
-    Raises: FileError for another file of that name.
+    Raises: FileError if the file is something else.
     """
     if kept is None or not kept.exists():
         return []
@@ -389,7 +408,7 @@ def _earlier(kept: Path | None, about: str) -> list[dict[str, np.ndarray]]:
 
 
 def write_check_video(out: Path, video: Path, found: VideoFit) -> int:
-    """Write the video with the body drawn over it; returns the number of frames."""
+    """Writes the video with the body drawn over it. Returns the number of frames."""
     # pixels of the longer side of a check video
     frames = color_frames(video, 720, None)
     poses = found.fit.motion
@@ -416,10 +435,12 @@ def _drawn(
 
 
 def motion_beside(video: Path, rest_joints: Float[np.ndarray, "j 3"], person: int | None) -> Motion:
-    """The motion of a video on the body of an avatar with these joints, kept beside the video as
-    NAME.motion.npz.
+    """Returns the motion of the person in a video for the body of an avatar. The motion is kept
+    beside the video as NAME.motion.npz, and read from there the next time.
 
-    Raises: ValueError where another file has that name; as `motion_from_video`.
+    Arguments: rest_joints: joints of the avatar at rest, (j, 3), metres. person: number of the
+    person; None: the largest.
+    Raises: ValueError if a file of that name is not ours. Also as `motion_from_video`.
     """
     from humangs_jax.motion import load_motion
 
