@@ -1,5 +1,5 @@
-"""What the motion of a video is worth: faces and fingers of synthetic people, whose truth is known,
-and one camera of a real capture against all four.
+"""Measures how good the motion of a video is: faces and fingers of synthetic people, whose truth is
+known, and one camera of a real capture against all four.
 """
 
 import os
@@ -44,31 +44,34 @@ STRONG = {
     "frown": ("browDownLeft", "browDownRight"),
     "pucker": ("mouthPucker",),
 }
-"""Expressions that are varied, and the shapes that move together in each."""
+"""{expression that is varied: the shapes that move together in it}."""
 BOTH = "brows less frown"
-"""How high the brows are."""
+"""Name of the difference of two expressions, which says how high the brows are."""
 FACE_SIDE, HEAD_PIXELS, HEAD_METRES = 512, 150, 0.24
-"""Pixels of a picture and of the head in it; a usual height of a head."""
+"""Side of a picture in pixels, height of the head in it in pixels, and a usual height of a head."""
 FEET = [BODY_NAMES.index(name) for name in ("left_foot", "right_foot")]
 """The balls of the feet among the joints of the body."""
 LOW_SHARE, LOW = 0.1, 0.02
-"""A foot stands while its ball is at most so many metres above this quantile of its heights."""
+"""A foot stands while its ball is at most `LOW` metres above the quantile `LOW_SHARE` of its
+heights.
+"""
 SMOOTHNESS = 0.002
 """Expected acceleration of the body that all cameras give, metres a frame^2: 7 m/s^2."""
 ARMS_DOWN = 1.25
-"""Radians of the shoulders."""
+"""Radians by which the shoulders lower the arms of the T-pose."""
 
 
 @entry
 def motion_faces(run: Run, people: int = 8, faces: int = 12) -> None:
-    """Scores of expressions against the coefficients that synthetic faces were rendered with:
-    correlation, over all faces of a person, mean over people.
+    """Correlates the scores of expressions with the coefficients that synthetic faces were rendered
+    with. A correlation is that over all faces of a person.
 
-    Faces have 150 pixels of 512. Of the strong shapes two or three are there at a time.
+    Heads are 150 pixels high in pictures of 512. Two or three of the strong expressions are mixed
+    at a time.
 
     Options:
-    people: how many
-    faces: of each person
+    people: number of people
+    faces: number of faces of each person
     """
     body, networks, parts = load_body(), Networks(), FaceAndHands()
     assert body.expressions is not None
@@ -111,7 +114,7 @@ def motion_faces(run: Run, people: int = 8, faces: int = 12) -> None:
 
 
 def face_picture(subject, rng):
-    """A picture of somebody's head and shoulders from the front, turned by up to 20 degrees."""
+    """Draws the head and shoulders of a person from the front, turned by up to 20 degrees."""
     rotations = np.zeros((len(JOINT_NAMES), 3))
     for side, sign in (("left", -1), ("right", 1)):
         rotations[JOINT_NAMES.index(f"{side}_shoulder"), 2] = sign * ARMS_DOWN
@@ -128,22 +131,22 @@ def face_picture(subject, rng):
 
 
 FULL_SIDE, FULL_METRES = 1536, 2.1
-"""Pixels of a picture of a whole person, and metres that it shows."""
+"""Side of a picture of a whole person in pixels, and in metres at the person."""
 HAND_VIEWS = (0.0, 50.0, -60.0, 120.0)
-"""Degrees around a person from which cameras see it."""
+"""Degrees of the cameras around a person, 0: from the front."""
 
 
 @entry
 def motion_fingers(run: Run, people: int = 1, poses: int = 2) -> None:
-    """Joints of the fingers of synthetic people, fitted to photos of four known cameras: without
-    landmarks of hands, where the prior of poses alone says how fingers bend, and with them.
+    """Measures the joints of the fingers of synthetic people, fitted to photos of four known
+    cameras with and without landmarks of hands.
 
-    Errors are distances from the true joints, both measured from their wrist and turned to agree
-    with the true palm.
+    Without these landmarks only the prior of poses says how fingers bend. Errors are distances from
+    the true joints after the palm is moved and turned onto the true palm.
 
     Options:
-    people: how many
-    poses: of each person
+    people: number of people
+    poses: number of poses of each person
     """
     body, networks, parts = load_body(), Networks(), FaceAndHands()
     errors, seen_hands = {"without": [], "with": []}, 0
@@ -151,16 +154,12 @@ def motion_fingers(run: Run, people: int = 1, poses: int = 2) -> None:
         subject = make_subject(seed, body)
         stood = [sample_pose(subject, index) for index in range(poses)]
         rest = shape_body(body, jnp.asarray(subject.betas))
-        truth = [
-            np.asarray(
-                pose_body(
-                    body,
-                    rest,
-                    BodyPose(jnp.asarray(each.rotations), jnp.asarray(each.translation)),
-                ).joints
-            )
-            for each in stood
-        ]
+        truth = []
+        for each in stood:
+            pose = BodyPose(jnp.asarray(each.rotations), jnp.asarray(each.translation))
+            truth.append(np.asarray(pose_body(body, rest, pose).joints))
+
+        # what is seen of the person and the hands, in every pose by every camera
         shown = [posed for posed in stood for _ in HAND_VIEWS]
         cameras = [full_camera(posed, azimuth) for posed in stood for azimuth in HAND_VIEWS]
         rows = []
@@ -168,28 +167,17 @@ def motion_fingers(run: Run, people: int = 1, poses: int = 2) -> None:
             picture = render_view(posed, camera)[0].astype(np.float32)
             person = next(iter(find_people(networks, picture)), None)
             if person is None:
-                rows.append((None, None))
+                rows.append(None)
                 continue
             hands = parts.hands(picture, person.pixels, person.visibility)
             seen_hands += sum(hand is not None for hand in hands)
             points = np.column_stack([person.pixels, person.visibility])
-            own = hand_columns(hands, person.world)
-            rows.append((SeenPerson(points, person.world, 1.0, own), own))
+            columns = hand_columns(hands, person.world)
+            rows.append(SeenPerson(points, person.world, 1.0, columns))
+
+        # fits without and with the landmarks of hands
         for name, kind in (("without", MEDIAPIPE_33), ("with", MEDIAPIPE_69)):
-            columns = [columns_of(seen, kind is MEDIAPIPE_69) for seen, _ in rows]
-            columns = np.asarray(columns).reshape(poses, len(HAND_VIEWS), len(kind.names), 6)
-
-            def stacked(x):
-                return np.asarray(x).reshape(poses, len(HAND_VIEWS), *x[0].shape)
-
-            observations = make_observations(
-                columns[..., :2] + 0.5,
-                columns[..., 2],
-                stacked([np.asarray(camera.K) for camera in cameras]),
-                stacked([np.asarray(camera.cam_from_world) for camera in cameras]),
-            )
-            model = landmark_model(body, kind.names, kind.places)
-            joints = np.asarray(fit_landmarks(model, observations).joints)
+            joints = fitted_joints(body, rows, cameras, kind)
             errors[name] += [finger_errors(*pair) for pair in zip(joints, truth, strict=True)]
     numbers = {name: 1000 * float(np.mean(each)) for name, each in errors.items()}
     rows = [[f"{name} landmarks of hands", f"{value:.1f}"] for name, value in numbers.items()]
@@ -199,8 +187,31 @@ def motion_fingers(run: Run, people: int = 1, poses: int = 2) -> None:
     run.show(text, {"mm": numbers, "hands_found": share, "people": people, "poses": poses})
 
 
+def fitted_joints(body, rows, cameras, kind):
+    """Fits the body to the landmarks of a set, and returns the joints (poses, j, 3) in metres.
+
+    `rows` are what was seen, and `cameras` are the cameras, of all views of a pose after each
+    other.
+    """
+    poses = len(rows) // len(HAND_VIEWS)
+
+    def stacked(arrays):
+        return np.asarray(arrays).reshape(poses, len(HAND_VIEWS), *arrays[0].shape)
+
+    columns = [columns_of(seen, kind is MEDIAPIPE_69) for seen in rows]
+    columns = np.asarray(columns).reshape(poses, len(HAND_VIEWS), len(kind.names), 6)
+    observations = make_observations(
+        columns[..., :2] + 0.5,
+        columns[..., 2],
+        stacked([np.asarray(camera.K) for camera in cameras]),
+        stacked([np.asarray(camera.cam_from_world) for camera in cameras]),
+    )
+    model = landmark_model(body, kind.names, kind.places)
+    return np.asarray(fit_landmarks(model, observations).joints)
+
+
 def full_camera(posed, azimuth):
-    """A camera that sees a whole person. azimuth: degrees from the front."""
+    """Returns a camera that sees a whole person from this many degrees around the front."""
     target = (posed.vertices.min(0) + posed.vertices.max(0)) / 2
     angle, distance = np.radians(azimuth), 3.0
     eye = target + distance * np.asarray([np.sin(angle), 0.1, np.cos(angle)])
@@ -211,8 +222,8 @@ def full_camera(posed, azimuth):
 
 
 def finger_errors(joints, truth):
-    """Mean distance of the finger joints of both hands from the true ones, metres, with the palms
-    on each other.
+    """Returns the mean distance in metres of the finger joints of both hands from the true ones,
+    after each palm is moved and turned onto the true palm.
     """
     found = []
     for side in ("left", "right"):
@@ -231,19 +242,20 @@ def finger_errors(joints, truth):
 
 @entry
 def motion_cameras(run: Run, folder: Path, timed_frames: int = 240) -> None:
-    """The motion that each of four cameras finds alone in the real capture of `real_capture`, a man
-    who balances on a beam, against the body that all four find together.
+    """Compares the motion that each of four cameras finds alone with the body that all four find
+    together, in the real capture of `real_capture`, a man who balances on a beam.
 
-    joints: of the body, mean distance from those of the body of all four, measured from the pelvis
-    in the axes of the camera; the motion was given the man's height, or his body. turned: the same
-    after one turn of all frames of a video, which takes out how a single camera is mistaken about
-    its tilt. third difference: mean length, over joints and frames. feet: how far the ball of a
-    foot that is on the beam moves in a frame, across the beam.
+    "joints" is the mean distance of the body's joints from those of the body of all four, measured
+    from the pelvis. The motion was given the man's height, or, in "with his body", his joints.
+    "turned" is the distance after all frames of a video are turned by one rotation, which takes out
+    the error that a single camera makes about its tilt. "third difference" is a mean length over
+    joints and frames. "feet" is how far the ball of a foot that is on the beam moves across the
+    beam in a frame.
 
     Options:
-    folder: with the unpacked wheel of pose2sim, see real_capture
-    timed_frames: of the first video, forwards and backwards, whose motion is found by the command
-        in a process of its own; 0: none
+    folder: folder with the unpacked wheel of pose2sim, see real_capture
+    timed_frames: number of frames of the first video, played forwards and backwards, whose motion
+        the command finds in a separate process; 0: none
     """
     demo, body = unpacked(folder), without_expression(load_body())
     lenses, seen_by, found = read_cameras(demo / "calibration" / "Calib.qca.txt"), {}, {}
@@ -255,10 +267,14 @@ def motion_cameras(run: Run, folder: Path, timed_frames: int = 240) -> None:
             kept = Path(place) / f"{name}.npz"
             seen, size = look_at_video(video, rate_and_count(video)[1], None, kept)
             seen_by[name] = (lenses[name], max(size) / max(video_size(video)), seen)
+
+        # the truth is the body of all four cameras
         all_four = body_of_all(body, list(seen_by.values()))
         truth = np.asarray(all_four.joints)[:, : len(BODY_NAMES)]
         rest = shape_body(body, all_four.betas)
         height = float(np.ptp(np.asarray(rest.vertices)[:, 1]))
+
+        # the motions of each camera alone, given the height and given the body
         for name, (lens, scale, _) in seen_by.items():
             # from the picture's pixels to millimetres of film
             looked = scale * np.asarray(video_size(demo / "videos" / f"{name}.mp4"))
@@ -275,6 +291,8 @@ def motion_cameras(run: Run, folder: Path, timed_frames: int = 240) -> None:
             numbers["command"] = command_time(
                 demo / "videos" / f"{CAMERAS[0]}.mp4", timed_frames, Path(place)
             )
+
+    # distances from the truth, and how still the motions are
     beam, standing = along_and_on(truth)
     numbers["all four"] = {
         "third_difference_mm": third_difference(truth),
@@ -295,8 +313,13 @@ def motion_cameras(run: Run, folder: Path, timed_frames: int = 240) -> None:
     numbers["mean"] = {
         key: float(np.mean([numbers[name][key] for name in CAMERAS])) for key in keys
     }
+
+    # a line for each camera; the body of all four has no distance from itself
+    def shown(value):
+        return "" if value is None else f"{value:.1f}"
+
     rows = [
-        [name, *(f"{numbers[name][key]:.1f}" if key in numbers[name] else "" for key in keys)]
+        [name, *(shown(numbers[name].get(key)) for key in keys)]
         for name in (*CAMERAS, "mean", "all four")
     ]
     header = ["camera", "joints, mm", "with his body", "turned", "third difference, mm a frame^3"]
@@ -311,13 +334,15 @@ def motion_cameras(run: Run, folder: Path, timed_frames: int = 240) -> None:
 
 
 def in_the_calibration(fit: MotionFit, lens: VideoCamera) -> np.ndarray:
-    """The joints of the body in the axes of the calibration's world, metres from anywhere."""
+    """Returns the joints of the body in the axes of the calibration's world, in metres from an
+    unknown point.
+    """
     turn = lens.cam_from_world[:3, :3].T @ fit.cam_from_world[:3, :3]
     return fit.joints[:, : len(BODY_NAMES)] @ turn.T
 
 
 def video_size(video: Path) -> tuple[int, int]:
-    """Pixels of a video's frames, width and height."""
+    """Returns width and height of a video's frames in pixels."""
     import imageio_ffmpeg
 
     reader = imageio_ffmpeg.read_frames(str(video))
@@ -327,8 +352,8 @@ def video_size(video: Path) -> tuple[int, int]:
 
 
 def command_time(video: Path, frames: int, folder: Path) -> dict[str, float]:
-    """Seconds of `humangs motion` on as many frames of a video, played forwards and backwards, with
-    an empty cache of compiled programs.
+    """Returns the seconds of `humangs motion` on this many frames of a video, played forwards and
+    backwards, with an empty cache of compiled programs.
     """
     import imageio_ffmpeg
 
@@ -354,11 +379,13 @@ def command_time(video: Path, frames: int, folder: Path) -> dict[str, float]:
 def body_of_all(
     body: BodyModel, cameras: list[tuple[VideoCamera, float, dict[str, np.ndarray]]]
 ) -> LandmarkFit:
-    """The body and its motion that the landmarks of all cameras give together, as `humangs fit
-    --smoothness` does: metres in the world of the calibration.
+    """Fits the body and its motion to the landmarks of all cameras together, as `humangs fit
+    --smoothness` does, in metres in the world of the calibration.
 
-    Arguments: cameras: of each its lens, pixels of a looked-at frame for one of the video, and what
-    was seen.
+    Args:
+        body: the body to fit
+        cameras: for each camera its lens, the size of the frames that were looked at as a share of
+            the video's, and the arrays of what was seen
     """
     count = min(len(seen["points"]) for _, _, seen in cameras)
     points, confidences = [], []
@@ -380,18 +407,20 @@ def body_of_all(
 
 
 def distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean distance of corresponding points in metres, in mm."""
+    """Returns the mean distance in mm of corresponding points, which are in metres."""
     return 1000 * float(np.linalg.norm(a - b, axis=-1).mean())
 
 
 def third_difference(joints: np.ndarray) -> float:
-    """Mean length of the third differences over time, mm a frame^3."""
+    """Returns the mean length of the third differences of joints over time, mm a frame^3."""
     return 1000 * float(np.linalg.norm(np.diff(joints, n=3, axis=0), axis=-1).mean())
 
 
 def along_and_on(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The direction of the beam, along which feet that are on it step, and from which frames to the
-    next each foot is on it: those in which the ball of the foot is low. y is up.
+    """Returns the direction (3,) of the beam, along which the feet step, and whether each foot
+    (frames - 1, 2) stands on it from a frame to the next.
+
+    A foot stands while its ball is low. y is up.
     """
     feet = joints[:, FEET]
     heights = feet[..., 1]
@@ -402,7 +431,7 @@ def along_and_on(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def feet_slide(joints: np.ndarray, beam: np.ndarray, standing: np.ndarray) -> float:
-    """Mean length of the moves of the feet that stand, but for those along the beam, mm a frame."""
+    """Returns how far standing feet move across the beam in the mean, mm a frame."""
     moved = np.diff(joints[:, FEET], axis=0)[standing]
     across = moved - (moved @ beam)[:, None] * beam
     return 1000 * float(np.linalg.norm(across, axis=-1).mean())

@@ -1,4 +1,6 @@
-"""What something in front of a person costs an avatar: taken for background, and unknown."""
+"""Measures what something in front of a person costs an avatar, where it is taken for background
+and where it is known to be unknown.
+"""
 
 import dataclasses
 import functools
@@ -28,16 +30,18 @@ from humangs_jax.synthetic.subject import make_subject, pose_subject
 from humangs_jax.synthetic.writer import View, capture_views, sample_pose
 
 PHOTOS = 4
-"""Photos around the person; the first is the most frontal one."""
+"""Number of photos around the person. The first is the most frontal one."""
 CASES = ("table", "posts", "person")
 """What is in front: boxes, or another synthetic person."""
 STATES = ("background", "found", "given", "nothing in front")
-"""How it is treated: as background, as masks cut it; unknown where the body shows it
-(`data/hidden.py`); unknown as a mask of it says; and photos without it."""
+"""How the pixels in front are treated: as background, because masks are cut there; as unknown where
+the body shows that something covers it (`data/hidden.py`); as unknown where a mask of the object is
+given; and photos without the object.
+"""
 NEAR, BESIDE = 0.5, 0.35
 """Metres from the middle of the person to the other person, towards the first camera and beside."""
 OTHERS = 500
-"""How far the seed of the other person is from that of the person."""
+"""Difference between the seeds of the other person and of the person."""
 
 
 @entry
@@ -46,10 +50,12 @@ def occluders(
     people: People = People(5, held_out=4, poses=0, pose_views=1),
     kinds: tuple[str, ...] = CASES,
 ) -> None:
-    """Synthetic people with a table, posts or somebody else in front, four photos.
+    """Measures avatars from four photos of synthetic people with a table, posts or another person
+    in front.
 
-    Foreground PSNR of what is covered in some photo, there and in held-out views, and of held-out
-    views as a whole, of refined avatars. Poses and other masks are true.
+    The table has foreground PSNRs of refined avatars: of what is covered in a photo, in the photos
+    and in held-out views, and of whole held-out views. Poses are true, and so are masks where
+    nothing is in front.
 
     Options:
     kinds: what is in front
@@ -61,6 +67,8 @@ def occluders(
         for seed in start.seeds
     }
     found = run.rows(cases, start.settings | {"photos": PHOTOS})
+
+    # means over the people of which something is covered
     table, numbers = [], {}
     for kind in kinds:
         rows = [found[f"{kind}: {seed}"] for seed in start.seeds]
@@ -83,7 +91,8 @@ def occluders(
 
 
 def measured(start: Start, seed: int, kind: str) -> dict[str, dict[str, float]] | None:
-    """The numbers of a person by state; None if nothing is covered."""
+    """Returns {state: the numbers of a person}, or None if nothing of the person is covered."""
+    # pixels of the photos and of held-out views whose person is covered in a photo
     subject = start.subject(seed, (PHOTOS,))
     whole, others = subject.photos, subject.held_out
     front = in_front(kind, seed, start.body, whole)
@@ -95,7 +104,7 @@ def measured(start: Start, seed: int, kind: str) -> dict[str, dict[str, float]] 
         return None
 
     def state_of(name: str) -> Capture:
-        """The photos as a state has them."""
+        """Returns the photos as they are treated in a state."""
         if name == "nothing in front":
             return whole
         masks = np.where(front, np.float32(0), truth)
@@ -103,10 +112,11 @@ def measured(start: Start, seed: int, kind: str) -> dict[str, dict[str, float]] 
         cut = dataclasses.replace(whole, images=images, masks=masks)
         if name == "background":
             return cut
-        return (
-            with_hidden_parts(cut) if name == "found" else dataclasses.replace(cut, unknown=front)
-        )
+        if name == "found":
+            return with_hidden_parts(cut)
+        return dataclasses.replace(cut, unknown=front)
 
+    # scores of the avatar of each state
     result = {}
     for state in STATES:
         photos = state_of(state)
@@ -126,7 +136,7 @@ def measured(start: Start, seed: int, kind: str) -> dict[str, dict[str, float]] 
 
 
 def psnr(avatar: Avatar, truth: Capture, pixels: Bool[np.ndarray, "v h w"]) -> float:
-    """PSNR of an avatar in the views of a capture, of some pixels, dB."""
+    """Returns the PSNR in dB of an avatar over some pixels of the views of a capture."""
     drawn = predict_views(avatar, truth).images
     return float(-10 * np.log10(np.mean((drawn - truth.images)[pixels] ** 2)))
 
@@ -136,7 +146,11 @@ def psnr(avatar: Avatar, truth: Capture, pixels: Bool[np.ndarray, "v h w"]) -> f
 
 
 def in_front(kind: str, seed: int, body: BodyModel, photos: Capture) -> Bool[np.ndarray, "v h w"]:
-    """Where something is between the person and the cameras of the photos."""
+    """Returns the pixels in which something is between the person and the cameras of the photos.
+
+    `kind` is one of `CASES`.
+    """
+    # axes around the person: up is y, and `towards` points to the first camera
     vertices = body_of(photos)
     middle = vertices.mean(axis=0)
     towards = np.asarray(photos.cameras[0].center) - middle
@@ -154,6 +168,8 @@ def in_front(kind: str, seed: int, body: BodyModel, photos: Capture) -> Bool[np.
         masks = np.asarray(capture_views(other, body, [moved], views).masks) > 0.5
         nearer = [is_nearer(moved.vertices.mean(axis=0), middle, c) for c in cameras(photos)]
         return masks & np.asarray(nearer)[:, None, None]
+
+    # boxes as (center, size) in metres
     rng = np.random.default_rng([seed, CASES.index(kind)])
     if kind == "table":
         low = ground + rng.uniform(0.36, 0.42) * height
@@ -176,17 +192,17 @@ def in_front(kind: str, seed: int, body: BodyModel, photos: Capture) -> Bool[np.
 
 
 def body_of(photos: Capture) -> Float[np.ndarray, "n 3"]:
-    """The vertices of the body in the pose of the photos, metres."""
+    """Returns the vertices of the body in the pose of the photos, metres."""
     return np.asarray(posed_vertices(photos.body, jnp.asarray(photos.betas), photos.poses))[0]
 
 
 def cameras(photos: Capture) -> list[Camera]:
-    """The cameras of photos, one by one."""
+    """Returns the cameras of photos as a list."""
     return [photos.cameras[i] for i in range(photos.view_count)]
 
 
 def is_nearer(point: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"], camera: Camera) -> bool:
-    """Whether a point is clearly nearer to a camera than another one."""
+    """Whether a point is at least 0.2 metres nearer to a camera than another point."""
     axis = np.asarray(camera.cam_from_world)[2, :3]
     return bool(axis @ (point - other) < -0.2)
 
@@ -194,7 +210,7 @@ def is_nearer(point: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"], came
 def drawn(
     camera: Camera, corners: Float[np.ndarray, "8 3"], shape: tuple[int, ...]
 ) -> Bool[np.ndarray, "h w"]:
-    """The pixels of a box."""
+    """Returns the pixels of a box with these corners in an image of this shape."""
     from PIL import Image, ImageDraw
 
     matrix = np.asarray(camera.cam_from_world, float)
@@ -209,8 +225,10 @@ def drawn(
 def covered_vertices(
     body: BodyModel, photos: Capture, others: Capture, covered: Bool[np.ndarray, "v h w"]
 ) -> Bool[np.ndarray, "w h w"]:
-    """The pixels of other views whose nearest visible vertex of the body is covered in a photo
-    that would show it.
+    """Returns the pixels of other views that show a part of the body which is covered in a photo.
+
+    The part is that of the nearest visible vertex. It is covered if a photo would show the vertex,
+    and has a covered pixel there or beside.
     """
     vertices = body_of(photos)
     size = photos.images.shape[1]
@@ -233,7 +251,7 @@ def covered_vertices(
 
 
 def projected(camera: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """Where a camera sees points, pixels."""
+    """Returns the pixels at which a camera sees points."""
     matrix = np.asarray(camera.cam_from_world, float)
     seen = points @ matrix[:3, :3].T + matrix[:3, 3]
     return (seen / seen[:, 2:] @ np.asarray(camera.K, float).T)[:, :2]

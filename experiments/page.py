@@ -1,4 +1,4 @@
-"""The page that shows avatars against `hg.render`, in Chromium with software WebGL."""
+"""Compares the page that shows avatars with `hg.render`, in Chromium with software WebGL."""
 
 import math
 import tempfile
@@ -32,10 +32,11 @@ ELEVATIONS = (0.1, 0.5, -0.2)
 WALK_FRAME = 17
 VERTICAL_FOV = math.pi / 6
 FINE_EDGE = 0.017
-"""Metres; the longest edge of a body that carries some 60,000 Gaussians."""
+"""Longest edge in metres of a body that carries some 60,000 Gaussians."""
 MOTION_WINDOW = (480, 600)
+"""Width and height of the page in which the motion is compared, CSS pixels."""
 PICTURE_WINDOW, WAIT = (1280, 800), 4.0
-"""Of the picture: CSS pixels, and seconds of the walk before it is taken."""
+"""Width and height of the picture in CSS pixels, and seconds of the walk before it is taken."""
 SHOWN = (
     ("least PSNR of nine views, dB", "whole"),
     ("foreground PSNR, dB", "person"),
@@ -50,21 +51,24 @@ SHOWN = (
 
 @entry
 def page(run: Run, size: int = 512, frames: int = 20) -> None:
-    """The page that shows avatars (`humangs export --html`) against `hg.render`, in Chromium with
-    software WebGL.
+    """Compares the page that shows avatars (`humangs export --html`) with `hg.render`, in Chromium
+    with software WebGL.
 
-    Needs Debian's chromium and chromium-driver. Exact views: three cameras times three poses,
-    screenshots against `hg.render` of the same camera and pose. "Motion": the page plays 100 frames
-    on its own and is paused; its image is compared with `hg.render` from the camera and in the pose
-    that it reports. Frames per second: a turning camera, posed, sorted and drawn without waiting
-    for the screen, of the avatar and of one with about 60,000 Gaussians (a body of shorter edges).
+    Needs Debian's chromium and chromium-driver. Nine views (three cameras, three poses) are
+    screenshots, compared with `hg.render` of the same camera and pose. For "motion" the page plays
+    100 frames by itself and is paused. Its image is compared with `hg.render` from the camera and
+    in the pose that it reports. Frames per second are those of a turning camera, whose images are
+    posed, sorted and drawn without waiting for the screen. Measured are the shipped avatar and one
+    with about 60,000 Gaussians (a body with shorter edges).
 
     Options:
     size: side of the images in pixels
     frames: images that are timed
     """
-    if reason := missing():
+    reason = missing()
+    if reason:
         raise ValueError(reason)
+    # a column for each avatar, a line for each number
     avatars = {"avatar": shipped_person(), "finer": shipped_person(FINE_EDGE)}
     with tempfile.TemporaryDirectory() as folder:
         rows = [
@@ -81,6 +85,7 @@ def page(run: Run, size: int = 512, frames: int = 20) -> None:
 
 
 def _measured(avatar, file, size, frames):
+    """Writes the page of an avatar and returns its numbers."""
     row: dict[str, Any] = {
         "gaussians": len(avatar.gaussians.means),
         "bytes": write_page(file, avatar),
@@ -102,30 +107,24 @@ def _measured(avatar, file, size, frames):
 
 
 def test_views(avatar: Avatar, size: int) -> tuple[list[Camera], dict[str, BodyPose]]:
-    """Three cameras and three poses; all look at the person in the pose."""
+    """Returns three cameras, and {name: pose} of three poses in front of them."""
     rotations = {
         "T-pose": jnp.zeros((len(avatar.parents), 3)),
         "walk": load_motion().pose(WALK_FRAME).rotations,
         "held out": load_capture(f"{DEMO_CAPTURE}/held_out").pose(0).rotations,
     }
-    height, middle = (
-        float(np.ptp(np.asarray(avatar.rest_vertices)[:, 1])),
-        jnp.asarray(avatar.rest_vertices.mean(0)),
-    )
-    distance, K = (
-        1.35 * 0.5 * height / np.tan(0.5 * VERTICAL_FOV),
-        intrinsics_from_fov(VERTICAL_FOV, size, size),
-    )
+    height = float(np.ptp(np.asarray(avatar.rest_vertices)[:, 1]))
+    middle = jnp.asarray(avatar.rest_vertices.mean(0))
+    distance = 1.35 * 0.5 * height / np.tan(0.5 * VERTICAL_FOV)
+    K = intrinsics_from_fov(VERTICAL_FOV, size, size)
     cameras = orbit(middle, distance, jnp.asarray(AZIMUTHS), jnp.asarray(ELEVATIONS), K, size, size)
-    # the root moves from pose to pose: the cameras look at the T-pose's middle, so it is taken back
-    # there
-    return [cameras[i] for i in range(len(AZIMUTHS))], {
-        name: BodyPose(x, jnp.zeros(3)) for name, x in rotations.items()
-    }
+    # the cameras look at the middle of the T-pose, so the poses are not moved away from there
+    poses = {name: BodyPose(x, jnp.zeros(3)) for name, x in rotations.items()}
+    return [cameras[i] for i in range(len(AZIMUTHS))], poses
 
 
 def view_scores(browser: Chromium, avatar: Avatar, size: int) -> dict[str, tuple[float, float]]:
-    """PSNR of the whole image and of the person, dB, by pose and camera."""
+    """Returns {pose and camera: PSNR of the whole image and of the person in dB}."""
     cameras, poses = test_views(avatar, size)
     scores = {}
     browser.resize(size, size)
@@ -139,7 +138,7 @@ def view_scores(browser: Chromium, avatar: Avatar, size: int) -> dict[str, tuple
 
 
 def exact_image(browser: Chromium, camera: Camera, pose: BodyPose) -> Any:
-    """The screenshot of one camera and pose on white, (h, w, 3)."""
+    """Returns the screenshot of one camera and pose on white, (h, w, 3)."""
     view = {
         name: np.asarray(getattr(camera, name), float).tolist() for name in ("K", "cam_from_world")
     }
@@ -151,15 +150,17 @@ def exact_image(browser: Chromium, camera: Camera, pose: BodyPose) -> Any:
 
 
 def compare(image: Any, avatar: Avatar, camera: Camera, pose: BodyPose) -> tuple[float, float]:
-    """PSNR to `hg.render` of the whole image and of the person, dB."""
+    """Returns the PSNR in dB of an image against `hg.render`, of the whole and of the person."""
     rendering = render(skin(avatar, pose), camera, SPLAT_PRESETS[avatar.rendering])
     truth, image = jnp.clip(rendering.rgb, 0, 1), jnp.asarray(image)
     return float(psnr(image, truth)), float(masked_psnr(image, truth, rendering.alpha))
 
 
 def motion_scores(browser: Chromium, avatar: Avatar, frames: int) -> tuple[float, float]:
-    """The page plays by itself, sorted by its worker; then its image as `hg.render` draws it,
-    person and floor apart.
+    """Lets the page play this many frames by itself, and compares its last image with `hg.render`.
+
+    Returns the PSNR in dB of the whole image and of the person. The worker of the page sorts. The
+    floor and the controls are hidden.
     """
     browser.resize(*MOTION_WINDOW)
     browser.run(
@@ -187,14 +188,15 @@ def motion_scores(browser: Chromium, avatar: Avatar, frames: int) -> tuple[float
 
 @entry
 def viewer_picture(run: Run, avatar: Path, out: Path = Path("docs/images/viewer.png")) -> None:
-    """A picture of the page that shows an avatar, a moment after it was opened. Needs Debian's
-    chromium and chromium-driver.
+    """Takes a picture of the page that shows an avatar, a moment after it was opened. Needs
+    Debian's chromium and chromium-driver.
 
     Options:
     avatar: file written by humangs reconstruct
     out: PNG to write
     """
-    if reason := missing():
+    reason = missing()
+    if reason:
         raise ValueError(reason)
     with tempfile.TemporaryDirectory() as folder, Chromium(*PICTURE_WINDOW) as browser:
         write_page(Path(folder) / "avatar.html", Avatar.load(avatar))

@@ -1,8 +1,9 @@
-"""A checkpoint of the published network on stored inputs: every stage against the stored numbers.
+"""Runs a checkpoint of the published network on stored inputs, and compares every stage with the
+stored numbers.
 
-A blended transform is no rotation, and the quaternion that the release makes of it jumps where two
-of its four candidates tie. Where ours tie to within the bound, the nearer one counts: rounding
-decides there, in the release as here.
+A blended transform is no rotation. The quaternion that the release makes of it jumps where two of
+its four candidates tie. Rounding decides there, in the release and in this package. So where our
+candidates tie to within the bound, the one that is nearer to the stored quaternion counts.
 """
 
 from pathlib import Path
@@ -59,14 +60,18 @@ INPUTS = {  # name: axes
 PER_VIEW = ("mid_tokens", "mid_feature_map_stride4")
 """Stages whose first axis is subjects times views."""
 TIES, TIE_LEVELS = "candidates of posed_rotations", "their q_abs"
-"""What `compute_stages` gives beside the stages: see `nearest_candidates`."""
+"""Names of what `compute_stages` returns beside the stages, see `nearest_candidates`."""
 MAP_STRIDE, WEIGHTS_STRIDE = 4, 5
-"""Which pixels of the feature map and which Gaussians' skinning weights are stored."""
+"""Steps between the pixels of the feature map, and between the Gaussians whose skinning weights are
+stored.
+"""
 
 
 def load_arrays(path: Path) -> dict[str, Any]:
-    """The arrays of a file, inputs checked: all there, finite, and of shapes that fit each
-    other.
+    """Reads the arrays of a file.
+
+    Raises: ValueError if an input is missing, is not finite or has a shape that does not fit those
+        of the others, or if there is no stage.
     """
     arrays = read_npz(path)[0]
     sizes: dict[str, int] = {}
@@ -90,9 +95,9 @@ def load_arrays(path: Path) -> dict[str, Any]:
 
 
 def read_release_config(path: Path) -> dict[str, Any]:
-    """The settings of a release's configuration, as "part.name".
+    """Reads the settings of a release's configuration, as {"part.name": value}.
 
-    Raises: ValueError if it is no JSON object, or asks for what does not exist here.
+    Raises: ValueError if the file has no JSON object, or asks for what this package does not have.
     """
     content = read_json(path)
     if not isinstance(content, dict) or not isinstance(content.get("model"), dict):
@@ -109,7 +114,8 @@ def read_release_config(path: Path) -> dict[str, Any]:
             f"{path}: training.use_canonical_maps: the variant with canonical target maps is not"
             " supported"
         )
-    if (height := found.get("training.target_height")) not in (None, 1.8):
+    height = found.get("training.target_height")
+    if height not in (None, 1.8):
         raise ValueError(f"{path}: training.target_height must be 1.8, got {height!r}")
     return found
 
@@ -117,10 +123,11 @@ def read_release_config(path: Path) -> dict[str, Any]:
 def complete_config(
     config: HumanGSConfig, release: dict[str, Any], dtype: str, image_size: int
 ) -> HumanGSConfig:
-    """A checkpoint's configuration with what the release's one adds to it.
+    """Returns the configuration of a checkpoint, completed by that of the release.
 
-    Raises: ValueError where they do not agree.
+    Raises: ValueError where the two do not agree.
     """
+    # what both have must agree
     encoder, _, decoder = paper_parts(config.architecture)
     transformer = encoder.transformer
     found = {
@@ -142,9 +149,10 @@ def complete_config(
                 f"model.{name} is {release[name]!r} in the configuration, but {value!r} in the"
                 " checkpoint"
             )
-    tight, free = (
-        release.get(f"vertex_decoder.num_{kind}_gaussians") for kind in ("tight", "free")
-    )
+
+    # only the release tells the kinds of Gaussians and the pooling
+    tight = release.get("vertex_decoder.num_tight_gaussians")
+    free = release.get("vertex_decoder.num_free_gaussians")
     if tight is not None and free is not None:
         if tight + free != decoder.gaussians_per_vertex:
             raise ValueError(
@@ -158,8 +166,8 @@ def complete_config(
 
 
 def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
-    """The network's inputs of one subject, and its skinning weights (n, j) and joint transforms (j,
-    4, 4).
+    """Returns the network's inputs of one subject, its skinning weights (n, j) and its joint
+    transforms (j, 4, 4).
     """
 
     def own(name):
@@ -190,11 +198,10 @@ def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
 def compute_stages(
     variables: Any, inputs: Any, config: Any, skinning_weights: Any, joint_transforms: Any
 ) -> dict:
-    """Every stage of one subject, by its array's name and in its layout; jittable with `config`
-    static.
+    """Returns every stage of one subject, by the name and in the layout of its array.
 
-    And TIES (g, 4, 4), TIE_LEVELS (g, 4): all readings of the posed rotations, see
-    `nearest_candidates`.
+    TIES (g, 4, 4) and TIE_LEVELS (g, 4) are all candidates of the posed rotations, see
+    `nearest_candidates`. The function can be compiled with a static `config`.
     """
 
     def channels_first(x):
@@ -204,30 +211,27 @@ def compute_stages(
     stages = intermediates(variables, inputs, config)
     features, outputs = stages["reader"], stages["decoder"]
     gaussians, maps = outputs.gaussians, stages["encoder"].maps
-    if (
-        encoder.upsampler is not None
-    ):  # vertices read the last convolution only where they need it; here it is everywhere
+    # the network does the last convolution only where vertices read it; here it is done everywhere
+    if encoder.upsampler is not None:
         convolution = Convolution(
             int(reader.output_width or 0), nn.initializers.zeros, config.runtime.compute_dtype
         )
         maps = convolution.apply(part_variables(variables, "reader"), maps)
-    pixels, texture = (
-        encoder_pixels(inputs, config.forward_context()),
-        variables["params"]["encoder"]["tokenizer"]["texture"],
-    )
+    pixels = encoder_pixels(inputs, config.forward_context())
+    texture = variables["params"]["encoder"]["tokenizer"]["texture"]
 
     def heads(name):
         return stages[f"decoder.{name}_out"].reshape(
             len(features.local), decoder.gaussians_per_vertex, -1
         )
 
+    # the decoder reads the features of a vertex and the global token
     entering = [features.local]
-    if features.global_token is not None:
-        entering.append(
-            jnp.broadcast_to(
-                features.global_token, (len(features.local), *features.global_token.shape)
-            )
-        )
+    token = features.global_token
+    if token is not None:
+        entering.append(jnp.broadcast_to(token, (len(features.local), *token.shape)))
+
+    # skinned Gaussians, with all candidates of their rotations
     weights = corrected_skinning_weights(
         skinning_weights, outputs.skinning_offsets, decoder.gaussians_per_vertex
     )
@@ -261,16 +265,14 @@ def compute_stages(
 
 
 def nearest_candidates(found: dict[str, Any], reference: Any, bound: float) -> Any:
-    """Ours of the posed rotations; where candidates tie to within `bound`, the one nearest to the
-    reference.
+    """Returns our posed rotations (g, 4). Where candidates tie to within `bound`, the one that is
+    nearest to the reference is taken.
     """
     ours = np.asarray(found["posed_rotations"], np.float64)
     if TIES not in found or ours.shape != reference.shape:
         return ours
-    readings, levels = (
-        np.asarray(found[TIES], np.float64),
-        np.asarray(found[TIE_LEVELS], np.float64),
-    )
+    readings = np.asarray(found[TIES], np.float64)
+    levels = np.asarray(found[TIE_LEVELS], np.float64)
     tied = levels >= levels.max(-1, keepdims=True) - bound
     distances = [np.abs(readings - sign * reference[..., None, :]).max(-1) for sign in (1, -1)]
     best = np.argmin(np.where(tied, np.minimum(*distances), np.inf), axis=-1)
@@ -281,20 +283,17 @@ def nearest_candidates(found: dict[str, Any], reference: Any, bound: float) -> A
 def relative_errors(
     found: dict[str, Any], expected: dict[str, Any], bound: float = 0.0
 ) -> dict[str, float | None]:
-    """Largest error of each expected stage over its largest magnitude; None where none was found in
-    its shape.
+    """Returns the largest error of each expected stage, as a share of its largest magnitude.
 
-    bound: within which candidates of posed rotations tie.
+    The error is None where a stage was not found, has another shape or is not finite. Candidates of
+    posed rotations tie to within `bound`.
     """
     errors: dict[str, float | None] = {}
     for name, reference in expected.items():
-        ours, reference = (
-            np.asarray(found.get(name, np.nan), np.float64),
-            np.asarray(reference, np.float64),
-        )
-        if ours.shape != reference.shape or not (
-            np.isfinite(ours).all() and np.isfinite(reference).all()
-        ):
+        ours = np.asarray(found.get(name, np.nan), np.float64)
+        reference = np.asarray(reference, np.float64)
+        finite = np.isfinite(ours).all() and np.isfinite(reference).all()
+        if ours.shape != reference.shape or not finite:
             errors[name] = None
             continue
         if name == "posed_rotations":
@@ -306,30 +305,27 @@ def relative_errors(
 
 
 def check(checkpoint: Path, dtype: str) -> dict[str, Any]:
-    """{"dtype", "bound", "stages": {array: relative error, or None if it was not compared},
-    "passed"}.
+    """Runs a checkpoint and compares all stages.
 
-    For float64 `jax_enable_x64` must be set.
+    Returns {"dtype", "bound", "stages": {array: relative error, or None if it was not compared},
+    "passed"}. For float64 `jax_enable_x64` must be set.
     """
     found, expected = run_checkpoint(checkpoint, dtype)
     bound = BOUNDS[dtype]
-    errors = relative_errors(
-        found, {name: x for name, x in expected.items() if not name.startswith("in_")}, bound
-    )
+    stages = {name: x for name, x in expected.items() if not name.startswith("in_")}
+    errors = relative_errors(found, stages, bound)
     passed = all(error is not None and error <= bound for error in errors.values())
     return {"dtype": dtype, "bound": bound, "stages": errors, "passed": passed}
 
 
 def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """(what `compute_stages` gives for all subjects, the arrays of the file)."""
+    """Returns what `compute_stages` gives for all subjects, and the arrays of the file."""
     config, arrays = (checkpoint.with_suffix(suffix) for suffix in (".json", ".npz"))
     release, expected = read_release_config(config), load_arrays(arrays)
     # the width of a head is only needed where the checkpoint does not tell it
-    width = (
-        release.get("transformer.d_head")
-        if release.get("transformer.use_qk_norm") is False
-        else None
-    )
+    width = None
+    if release.get("transformer.use_qk_norm") is False:
+        width = release.get("transformer.d_head")
     converted = load_checkpoint(checkpoint, head_width=width)
     settings = complete_config(converted.config, release, dtype, expected["in_image"].shape[-2])
     if expected["in_lbs_weights"].shape != converted.skinning_weights.shape:
@@ -337,26 +333,23 @@ def run_checkpoint(checkpoint: Path, dtype: str) -> tuple[dict[str, Any], dict[s
             f"{arrays}: in_lbs_weights has shape {expected['in_lbs_weights'].shape}, the"
             f" checkpoint's {converted.skinning_weights.shape}"
         )
-    working = (
-        jnp.float64 if dtype == "float64" else jnp.float32
-    )  # bfloat16: products only, see `network.runtime`
+
+    # with bfloat16 only products are in fewer bits, see `network.runtime`
+    working = jnp.float64 if dtype == "float64" else jnp.float32
     variables = jax.tree.map(lambda x: jnp.asarray(x, working), converted.variables)
     compute = jax.jit(compute_stages, static_argnames="config")
-    with jax.default_matmul_precision(
-        "highest"
-    ):  # GPUs and TPUs multiply float32 in fewer bits otherwise
+    # GPUs and TPUs multiply float32 in fewer bits otherwise
+    with jax.default_matmul_precision("highest"):
         subjects = []
         for index in range(len(expected["in_image"])):
             inputs, weights, transforms = subject_inputs(expected, index, working)
-            subjects.append(
-                jax.tree.map(np.asarray, compute(variables, inputs, settings, weights, transforms))
-            )
-    found = {
-        name: (np.concatenate if name in PER_VIEW else np.stack)(
-            [subject[name] for subject in subjects]
-        )
-        for name in subjects[0]
-    }
+            stages = compute(variables, inputs, settings, weights, transforms)
+            subjects.append(jax.tree.map(np.asarray, stages))
+
+    found = {}
+    for name in subjects[0]:
+        join = np.concatenate if name in PER_VIEW else np.stack
+        found[name] = join([subject[name] for subject in subjects])
     return found, expected
 
 
@@ -366,36 +359,40 @@ def parity(
     checkpoints: tuple[Path, ...],
     dtypes: tuple[Literal["float32", "float64", "bfloat16"], ...] = ("float32",),
 ) -> int:
-    """Checkpoints of the published network on stored inputs: the largest error of every stage,
-    relative to its largest magnitude.
+    """Runs checkpoints of the published network on stored inputs, and shows the largest error of
+    every stage, relative to its largest magnitude.
 
-    Beside a checkpoint STEM.pt, in the released format, or its state dict STEM.safetensors, are
-    STEM.json, the release's configuration, which says what shapes do not tell (pooling, width of a
-    head), and STEM.npz with b subjects of v views:
+    A checkpoint is STEM.pt in the released format, or its state dict STEM.safetensors. Beside it
+    are two files. STEM.json is the release's configuration, which has what shapes do not tell
+    (pooling, width of a head). STEM.npz has b subjects of v views:
 
         in_image (b,v,3,h,w) in [0,1], in_c2w (b,v,4,4), in_fxfycxcy (b,v,4),
         in_smpl_canonical_vertices and in_smpl_posed_vertices (b,v,n,3), in_joint_transforms
         (b,j,4,4), in_lbs_weights (n,j), metric; in_position_map (b,v,h,w,3) and in_depth_map
-        (b,v,1,h,w) in normalised units out_ray_d (b,v,3,h,w), out_pose_feature (b,v,c,h,w),
+        (b,v,1,h,w) in normalised units; out_ray_d (b,v,3,h,w), out_pose_feature (b,v,c,h,w),
         mid_tokens (b*v,p,d), mid_block_0 and mid_encoder_out (b,l,d), mid_feature_map_stride4
         (b*v,d,h',w'), mid_decoder_input (b,n,c), mid_raw_geometry (b,n,k,10), mid_raw_appearance
         (b,n,k,4), asset_{means3D,rotations,scales,colors,opacity} (b,n*k,.), asset_lbs_weights
         (every fifth of n*k), posed_means3D, posed_rotations (b,n*k,.; the sign of a quaternion is
         free)
 
-    Exit status 1 if an error exceeds 2e-5 (float32), 1e-6 (float64) or 5e-2 (bfloat16), or an array
-    of a stage (any that is not in_*) could not be compared. Seconds for small networks.
+    The exit status is 1 if an error exceeds 2e-5 (float32), 1e-6 (float64) or 5e-2 (bfloat16), or
+    if an array of a stage (any that is not in_*) could not be compared. Takes seconds for small
+    networks.
 
     Tables: parity_stages
 
     Options:
-    dtypes: to compute in
+    dtypes: types to compute in
     """
+    # errors of each type and checkpoint
     columns = {}
     for dtype in dtypes:
         with jax.enable_x64(dtype == "float64"):
             for path in checkpoints:
                 columns[f"{dtype}, {path.stem}"] = check(path, dtype)
+
+    # a line for each array, in the order of the stages
     found = list(dict.fromkeys(name for column in columns.values() for name in column["stages"]))
     rows = [(stage, name) for stage, names in STAGES.items() for name in names if name in found]
     rows += [("unknown stage", name) for name in found if name not in {name for _, name in rows}]
@@ -409,6 +406,7 @@ def parity(
 
 
 def _shown(column: dict[str, Any], name: str) -> str:
+    """Formats the error of an array."""
     error = column["stages"].get(name)
     if error is None:
         return "NOT COMPARED"

@@ -1,4 +1,4 @@
-"""The paper's claims beside what docs/results says of them. Measures nothing."""
+"""Shows the paper's claims beside the results in docs/results. Measures nothing."""
 
 import itertools
 from collections.abc import Iterable, Mapping
@@ -38,48 +38,58 @@ CONTRADICTED, REPRODUCED, NOT_TESTED = (
     "not tested",
 )
 VERDICTS = CONTRADICTED, REPRODUCED, NOT_TESTED
-"""In the order of the page."""
+"""All verdicts in the order of the page."""
 
 
 class Pair(NamedTuple):
-    """Two variants, the better one by the paper first, each with its photos."""
+    """Two variants that a claim compares."""
 
     a: tuple[str, int | str]
+    """Name and test of the variant that the paper says is better."""
     b: tuple[str, int | str]
+    """Name and test of the other variant."""
     task: str = "reconstruction"
+    """One of the tasks of `bench.TASKS`."""
     score: str = "psnr"
+    """One of the scores of `bench.SCORES`."""
 
 
 class Claim(NamedTuple):
-    """pairs: what it is about.
-
-    Without them `measured` is what is known, and the verdict is given.
-    """
+    """A claim of the paper. Its verdict comes from `pairs`, or is given where there are none."""
 
     claim: str
+    """What is claimed."""
     paper: str
+    """The numbers of the paper, or how it supports the claim."""
     pairs: tuple[Pair, ...] = ()
+    """The differences that the claim is about."""
     measured: str = ""
+    """What is known, if there are no pairs."""
     verdict: tuple[str, str] = (NOT_TESTED, "")
+    """The verdict and its reason, if there are no pairs."""
 
 
 @entry
 def paper_claims(run: Run) -> None:
-    """The paper's claims beside what docs/results says of them. Measures nothing.
+    """Shows the paper's claims beside the results in docs/results. Measures nothing.
 
-    A verdict is one of three. The 95 % intervals of all differences that a claim is about lie on
-    the paper's side: "reproduced at toy scale"; one lies on the other side: "contradicted at toy
-    scale"; else, or where a variant that it needs is not trained, or has fewer than three seeds:
-    "not tested".
+    A verdict is one of three. "reproduced at toy scale": the 95 % intervals of all differences that
+    a claim is about lie on the paper's side. "contradicted at toy scale": one interval lies on the
+    other side. "not tested": neither, or a variant that the claim needs is not trained or has fewer
+    than three seeds.
     """
     report, cost = results("paper"), results("paper_cost")
-    rows = sorted(
-        judged(report, [*claims(), *of_cost(cost)]), key=lambda row: VERDICTS.index(row[3])
-    )
-    lines = [[*row[:3], f"{row[3]}: {row[4]}" if row[4] else row[3]] for row in rows]
+    rows = judged(report, [*claims(), *of_cost(cost)])
+    rows = sorted(rows, key=lambda row: VERDICTS.index(row[3]))
+    lines = []
+    for claim, paper, ours, verdict, why in rows:
+        lines.append([claim, paper, ours, f"{verdict}: {why}" if why else verdict])
     heads = ["claim", "what the paper says", "what we measured", "verdict"]
     texts = [markdown_table(heads, lines, "llll")]
-    added = [[name, said(report, x) or lacking(report, [x], 1)] for name, x in additions().items()]
+    added = [
+        [name, in_words(report, pair) or lacking(report, [pair], 1)]
+        for name, pair in additions().items()
+    ]
     texts += [
         "Our own additions, each alone added to the paper's network:",
         markdown_table(["", "foreground PSNR"], added, "ll"),
@@ -90,74 +100,72 @@ def paper_claims(run: Run) -> None:
 def judged(
     report: Mapping[str, Any], listed: Iterable[Claim]
 ) -> list[tuple[str, str, str, str, str]]:
-    """Rows: claim, the paper, ours, verdict, why."""
-    return [
-        (
-            (
-                row.claim,
-                row.paper,
-                "; ".join(filter(None, (said(report, x) for x in row.pairs))) or "-",
-                *judge(report, row.pairs),
-            )
-            if row.pairs
-            else (row.claim, row.paper, row.measured or "-", *row.verdict)
-        )
-        for row in listed
-    ]
+    """Returns a row for each claim: the claim, the paper's numbers, ours, the verdict, and why."""
+    rows = []
+    for row in listed:
+        ours, verdict = row.measured, row.verdict
+        if row.pairs:
+            ours = "; ".join(filter(None, (in_words(report, pair) for pair in row.pairs)))
+            verdict = judge(report, row.pairs)
+        rows.append((row.claim, row.paper, ours or "-", *verdict))
+    return rows
 
 
-def said(report: Mapping[str, Any], pair: Pair) -> str:
-    """A difference in words; nothing where a run is not trained."""
+def in_words(report: Mapping[str, Any], pair: Pair) -> str:
+    """Describes a difference, or returns "" where a run is not trained."""
+    if lacking(report, [pair], 1):
+        return ""
     names = " - ".join(f"`{name}` {test}" for name, test in pair[:2])
     unit, digits = ("", 4) if pair.score.startswith("lpips") else (" dB", 2)
-    return (
-        ""
-        if lacking(report, [pair], 1)
-        else f"{names}: {measured(report, pair).text(digits)}{unit}"
-    )
+    return f"{names}: {measured(report, pair).text(digits)}{unit}"
 
 
 def measured(report: Mapping[str, Any], pair: Pair) -> Difference:
-    """In the unit of the score; of LPIPS a gain is a smaller one."""
+    """Returns a difference in the unit of the score, above 0 where the first variant is better."""
     found = difference(report["runs"], *pair)
-    return found._replace(mean=-found.mean) if pair.score.startswith("lpips") else found
+    if pair.score.startswith("lpips"):
+        return found._replace(mean=-found.mean)
+    return found
 
 
 def lacking(report: Mapping[str, Any], pairs: Iterable[Pair], seeds: int) -> str:
-    """What is missing for a verdict that needs this many seeds; "": nothing."""
+    """Describes what is missing for a verdict that needs this many seeds, "" if nothing is."""
     ready, texts = trained_names(report), []
     for name in dict.fromkeys(name for pair in pairs for name, _ in pair[:2]):
+        count = len(finished(report["runs"], name))
         if name not in ready:
             texts.append(f"`{name}` is {state_of(report, name)}")
-        elif (count := len(finished(report["runs"], name))) < seeds:
+        elif count < seeds:
             texts.append(f"`{name}` has {count} of {seeds} seeds")
     return ", ".join(texts)
 
 
 def judge(report: Mapping[str, Any], pairs: Iterable[Pair]) -> tuple[str, str]:
-    """(verdict, why) of differences that the paper has above 0."""
-    if missing := lacking(report, pairs, SEEDS):
+    """Returns the verdict on differences that the paper has above 0, and its reason."""
+    missing = lacking(report, pairs, SEEDS)
+    if missing:
         return NOT_TESTED, missing
     found = [(x.mean, x.half or 0.0) for x in (measured(report, pair) for pair in pairs)]
     if any(mean + half < 0 for mean, half in found):
         return CONTRADICTED, ""
-    return (
-        (REPRODUCED, "")
-        if all(mean > half for mean, half in found)
-        else (NOT_TESTED, "an interval contains 0")
-    )
+    if all(mean > half for mean, half in found):
+        return REPRODUCED, ""
+    return NOT_TESTED, "an interval contains 0"
 
 
 def additions() -> dict[str, Pair]:
-    """What is ours and not the paper's, by name."""
+    """Returns {name: comparison with the reference} of the variants with an addition of ours."""
     names = [name for name, variant in variants().items() if variant.about == "ours"]
     return {name: Pair((name, PHOTOS), (REFERENCE, PHOTOS), score="psnr_fg") for name in names}
 
 
 def claims() -> list[Claim]:
+    """Returns the claims about the quality of avatars."""
+
     def ours(count=PHOTOS):
         return (REFERENCE, count)
 
+    # comparisons of the reference with another variant, in the tests that a claim is about
     def near(name):
         return tuple(Pair((REFERENCE, test), (name, test)) for test in NEAR)
 
@@ -255,6 +263,7 @@ def claims() -> list[Claim]:
 
 
 def of_cost(cost: Mapping[str, Any]) -> list[Claim]:
+    """Returns the claims about the cost of the network, judged by the numbers of `paper_cost`."""
     readers = [(row["cross-attention"], row["back-projection"]) for row in cost["rows"]]
     times = [dear["cpu_ms"] / cheap["cpu_ms"] for dear, cheap in readers]
     counts = [dear["operations"] / cheap["operations"] for dear, cheap in readers]
@@ -285,16 +294,17 @@ def of_cost(cost: Mapping[str, Any]) -> list[Claim]:
 
 
 def pair_of(a: Any, b: Any) -> str:
+    """Formats the printed PSNRs of two systems, each the first number of a row."""
     return f"{a[0]:.2f} against {b[0]:.2f} dB"
 
 
 def by_photos(a: str, b: str) -> str:
-    """Printed PSNR of two systems with 1, 2, 4 and 6 near photos."""
+    """Formats the printed PSNRs of two systems with 1, 2, 4 and 6 near photos."""
     return ", ".join(f"{x[0]:.2f} - {y[0]:.2f}" for x, y in zip(VIEWS[a], VIEWS[b], strict=True))
 
 
 def lost() -> str:
-    """What systems lose on the other data set."""
+    """Formats the decibels that systems lose on the other data set."""
     both = {name: DOMAINS[name] for name in (OURS, HUMANRAM, LVSM, GHG)}
     return ", ".join(
         f"{name} {there[0] - here[0]:+.1f}" for name, (here, there) in both.items() if there
@@ -302,7 +312,7 @@ def lost() -> str:
 
 
 def printed(a: str, b: str) -> str:
-    """What the tables of reconstruction say of two systems."""
+    """Formats the printed PSNRs of two systems in the tables of reconstruction."""
     sets = {"THuman2.1": (DOMAINS, 0), "THuman4.0": (RECONSTRUCTION, 0), "AvatarReX": (DOMAINS, 1)}
     return ", ".join(
         f"{name} {pair_of(table[a][i], table[b][i])}" for name, (table, i) in sets.items()

@@ -194,7 +194,7 @@ def test_verdicts_follow_from_intervals_and_need_trained_runs_of_three_seeds(rep
     verdict = claims.judge(report, [claims.Pair(("paper", 4), ("lhm", 1)), pair("paper", "lvsm")])
     assert verdict == (claims.NOT_TESTED, "`lhm` has 1 of 3 seeds, `lvsm` is not trained: 40 steps")
     assert "not trained: 0 steps" in claims.judge(report, [pair("paper", "gst")])[1]
-    text = claims.said(report, claims.Pair(("paper", 4), ("giga", 4)))
+    text = claims.in_words(report, claims.Pair(("paper", 4), ("giga", 4)))
     assert text.startswith("`paper` 4 - `giga` 4: -1.0") and text.endswith(" dB") and "+-" in text
 
 
