@@ -1,1 +1,3 @@
-"""Demo, presets and budgets, the check of a capture, photos without a calibration."""
+"""Applications: demonstration, presets and budgets, checks of captures, photos without a
+calibration.
+"""

@@ -1,8 +1,8 @@
-"""What `humangs start` will call, from what is known before: threads compile it while photos are
-read, people found and bodies fitted (`core.processes.Ahead`).
+"""Lists what `humangs start` will call. From these calls, threads compile programs while photos are
+read, people are found and bodies are fitted (`core.processes.Ahead`).
 
-Shapes decide on programs, not values: photos whose body is not known yet get one in the usual pose.
-A wrong guess costs time alone.
+A program depends on shapes, not on values. So photos whose body is not known yet get one in the
+usual pose. A wrong guess only costs time.
 """
 
 import dataclasses
@@ -33,17 +33,19 @@ from humangs_jax.data.photos import Photos
 from humangs_jax.network.weights import load_weights
 
 shipped_weights = functools.cache(load_weights)
-"""The weights that come with the package, read once."""
+"""Loads the weights that come with the package. They are read once."""
 
 
 def calls_of_found_people(photos: int) -> Iterator[Call]:
-    """The fit to what the detector will find in so many photos: one moment, and hands."""
+    """Yields the calls of the fit to people whom the detector will find in this number of photos:
+    photos of one moment, with hands.
+    """
     yield from calls_of_fit(load_body(), MEDIAPIPE_69, photos)
 
 
 def calls_after_fit(photos: Photos, keypoints: Keypoints) -> Iterator[Call]:
-    """What follows the fit to photos with masks: the body by the masks, movement between the
-    photos, the avatars that are compared, and the check.
+    """Yields the calls that follow the fit to photos with masks: the fit to the masks, the search
+    for movement between the photos, the avatars that are compared, and the check.
     """
     capture = with_usual_body(photos)
     kind = keypoints.set
@@ -64,7 +66,7 @@ def calls_after_fit(photos: Photos, keypoints: Keypoints) -> Iterator[Call]:
 
 
 def with_usual_body(photos: Photos) -> Capture:
-    """The photos as a capture, without masks, of a body in the pose of its model in every frame."""
+    """Returns photos as a capture without masks. Its body has zero rotations in every frame."""
     body = load_body()
     coefficients = without_expression(body).shape_directions.shape[-1]
     rotations = np.zeros((photos.frame_count, len(body.parents), 3), np.float32)

@@ -1,5 +1,5 @@
-"""The demonstration: an unseen person, four photos, one forward pass, some seconds of refinement,
-new views, a walk.
+"""Runs the demonstration: reconstructs an unseen person from four photos in one forward pass,
+refines the avatar for some seconds, and draws new views and a walk.
 """
 
 import contextlib
@@ -56,9 +56,13 @@ _PICTURES = (
     "novel_views.exr",
 )
 FILES = ("report.json", *_PICTURES, "avatar.npz", "avatar.ply", "avatar.html")
-"""What the demonstration writes; the first tells that a folder is of it."""
+"""Names of the files that the demonstration writes. The first one marks a folder as one of the
+demonstration.
+"""
 REPORTED = frozenset(("psnr", "views", "baseline_psnr"))
-"""Keys of the first."""
+"""Keys that report.json has at least. A folder whose report.json has them is one of the
+demonstration.
+"""
 
 
 def run_demo(
@@ -68,16 +72,20 @@ def run_demo(
     refine: RefineConfig | None = None,
     settings: Settings | None = None,
 ) -> dict[str, Any]:
-    """Make an avatar of the shipped person, and write what is made of it into `out` at the end;
-    returns what report.json holds.
+    """Makes an avatar of the shipped person. Writes files into `out`, all at the end, and returns
+    the content of report.json.
 
-    refine: how the avatar is fitted to its photos; None: not at all. settings: which photos are
-    used, how the network runs, how frames are drawn (their refinement is not used); None: all
-    photos, as the weights were trained.
+    Files are inputs.png, novel_views.png (truth, feed-forward, error), novel_views.exr,
+    animation.mp4 and .gif, avatar.npz, avatar.ply, avatar.html (see docs/viewer.md) and
+    report.json. With `refine` there is also refined.png (truth, feed-forward, refined), and
+    animation and avatar files are those of the refined avatar.
 
-    Files: inputs.png, novel_views.png (truth, feed-forward, error), novel_views.exr, animation.mp4
-    and .gif, avatar.npz, avatar.ply, avatar.html (see docs/viewer.md), report.json; with `refine`
-    also refined.png (truth, feed-forward, refined), and the others are of the refined avatar.
+    Arguments:
+        weights: file of the network's weights; None: the shipped ones.
+        frame_size: side of the animation's frames, pixels.
+        refine: how the avatar is refined by its photos; None: not at all.
+        settings: which photos are used, how the network runs, and how frames are drawn. Their
+        refinement is ignored. None: all photos, and as the weights were trained.
     """
     report: dict[str, Any] = {}
     settings = settings or Settings()
@@ -93,7 +101,8 @@ def run_demo(
 
 
 def _check_place(out: Path) -> None:
-    """Whether a folder is that of an earlier demo, or holds nothing with the name of what is made.
+    """Checks that a folder is one of an earlier demonstration, or has no file with the name of one
+    that will be written.
 
     Raises: ValueError, see `io.atomic.check_ours`.
     """
@@ -105,7 +114,9 @@ def _check_place(out: Path) -> None:
 
 
 def summary(report: dict[str, Any]) -> str:
-    """What `run_demo` found, in one line."""
+    """Returns the quality that `run_demo` has measured, in one line. report: what `run_demo`
+    returns.
+    """
     quality = (
         f"PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.3f}, foreground PSNR"
         f" {report['psnr_fg']:.2f} dB on {report['views']['held_out']} held-out views (vertex-color"
@@ -121,7 +132,9 @@ def summary(report: dict[str, Any]) -> str:
 def _calls_until_refined(
     variables: Variables, config: HumanGSConfig, inputs: Capture, truth: Capture
 ) -> Iterator[Call]:
-    """What the demonstration calls before it refines, the first ones first."""
+    """Yields what the demonstration calls before refinement, in this order, for background
+    compilation.
+    """
     yield from calls_of_reconstruct(variables, config, inputs)
     yield from calls_of_painted_body(inputs, truth)
 
@@ -134,7 +147,9 @@ def _write_demo(
     settings: Settings,
     ahead: Ahead,
 ) -> dict[str, Any]:
-    """Write the files of the demo into a folder, and return what report.json has."""
+    """Writes the files of the demonstration into a folder, and returns the content of
+    report.json.
+    """
     began, timings = time.perf_counter(), dict[str, Any]()
     with stage("loading"):
         inputs = _timed(timings, "load_capture", lambda: load_capture(DEMO_CAPTURE))
@@ -212,7 +227,9 @@ def _write_demo(
 
 
 def _refined(avatar: Avatar, photos: Capture, refine: RefineConfig) -> Refinement:
-    """The avatar after refinement. Raises: KeyboardInterrupt if it was interrupted."""
+    """Returns the refined avatar with its report. Raises: KeyboardInterrupt if refinement was
+    interrupted.
+    """
     with stage("refining"):
         run = refine_with_report(avatar, photos, refine, progress=True)
         if run.interrupted:
@@ -231,8 +248,8 @@ def _scores(images: np.ndarray, truth: Capture) -> dict[str, Any]:
 
 
 def _timed(timings: dict, name: str, run: Callable[[], Any], twice: bool = False) -> Any:
-    """Run a stage and record its seconds; `twice`: separately for compiling (first run less second)
-    and running (second).
+    """Runs a stage, records its time in `timings`, seconds, and returns the result. twice: run it
+    again, and record the second time as "run", and the difference to the first as "compile".
     """
     start = time.perf_counter()
     compiling = stage(COMPILING) if twice else contextlib.nullcontext()

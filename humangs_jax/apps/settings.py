@@ -1,8 +1,9 @@
-"""Speed against accuracy in one value: how many photos, how the network runs, how long refinement
-takes, how frames are drawn.
+"""Settings that trade speed against accuracy: how many photos are used, how the network runs, how
+long refinement takes, and how frames are drawn.
 
-`PRESETS` are points of the front that `python -m experiments tradeoff` has measured
-(docs/tradeoff.md). `tune` times them on a machine with a person and picks the best within a budget.
+`PRESETS` are the best trade-offs that `python -m experiments tradeoff` has measured
+(docs/tradeoff.md). `tune` times them on a machine with a person, and picks the best one within a
+budget.
 """
 
 import dataclasses
@@ -44,29 +45,29 @@ from humangs_jax.refinement.refine import Refinement, refine_with_report
 
 MEASURED = "tradeoff.md"
 _KIND = "humangs_jax settings"
-"""The field "kind" of a file of settings."""
+"""Value of the field "kind" in a file of settings."""
 
 
 @configuration
 class Settings:
-    """How an avatar is made and drawn. The size of the frames is not in it: it belongs to the
-    screen.
+    """How an avatar is made and drawn. The size of the frames is not among the settings, because it
+    depends on the screen.
     """
 
     views: Count | None = knob(
         None, cost="what the other photos show", gain="time in proportion", measured=MEASURED
     )
-    """The most photos that are used, chosen by `prepare_capture`; None for all."""
+    """Largest number of photos that are used. `prepare_capture` chooses them. None: all photos."""
     runtime: Runtime = dataclasses.field(default_factory=Runtime)
     """How the network runs."""
     refine_iterations: Iterations = knob(
         0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED
     )
-    """Iterations of the learned update, see `RefineConfig`; 0 for none."""
+    """Iterations of the learned update, see `RefineConfig`. 0: none."""
     refine_steps: RefineSteps = knob(
         0, cost="time in proportion", gain="detail of the photos", measured=MEASURED
     )
-    """Steps of the optimizer, see `RefineConfig`; 0 for none."""
+    """Steps of the optimizer, see `RefineConfig`. 0: none."""
     head_steps: RefineSteps = knob(
         0, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md"
     )
@@ -74,22 +75,24 @@ class Settings:
     refine_size: PhotoSide | None = knob(
         None, cost="detail of the photos", gain="time of a step", measured=MEASURED
     )
-    """Longer side to which larger photos are reduced for refinement, pixels; None: as they are."""
+    """Photos whose longer side exceeds this are reduced to it for refinement, pixels. None: no
+    photo is reduced.
+    """
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
         "as_trained", cost="see performance.md", gain="time of a frame", measured=MEASURED
     )
-    """How frames are splatted, as `FrameSettings.splat`."""
+    """How frames are splatted, see `FrameSettings.splat`."""
     prune: bool = knob(
         False,
         cost="less than 0.001 dB",
         gain="time of frames that are drawn often",
         measured=MEASURED,
     )
-    """Whether Gaussians that no image shows are left out, as `FrameSettings.prune`."""
+    """Whether Gaussians that no image shows are left out, see `FrameSettings.prune`."""
 
     @property
     def refinement(self) -> RefineConfig | None:
-        """What `refine` is given; None for no refinement."""
+        """The configuration that `refine` takes; None for no refinement."""
         if not self.refine_iterations and not self.refine_steps:
             return None
         return RefineConfig(
@@ -102,19 +105,21 @@ class Settings:
 
     @property
     def unrefined(self) -> "Settings":
-        """The same without refinement."""
+        """The same settings without refinement."""
         return dataclasses.replace(self, refine_iterations=0, refine_steps=0)
 
     def network(self, config: HumanGSConfig) -> HumanGSConfig:
-        """A network of these weights, run in this way."""
+        """Returns the configuration of a network with the runtime of these settings."""
         return dataclasses.replace(config, runtime=self.runtime)
 
     def photos(self, capture: Capture | PreparedCapture) -> PreparedCapture:
-        """The photos that are used."""
+        """Prepares a capture with the photos that these settings use."""
         return prepare_capture(capture, views=self.views)
 
     def shot(self, shot: FrameSettings) -> FrameSettings:
-        """A shot, drawn in this way where it does not say how."""
+        """Returns the settings of frames, drawn as these settings say. A `splat` that is given in
+        `shot` stays, and so does `prune`.
+        """
         splat = self.splat if shot.splat == "as_trained" else shot.splat
         return dataclasses.replace(shot, splat=splat, prune=shot.prune or self.prune)
 
@@ -142,7 +147,9 @@ PRESETS: Presets[Settings] = Presets(
     },
     "; those of training are in humangs_jax.training.config",
 )
-"""From the fastest to the slowest; docs/tradeoff.md has what each takes and gains."""
+"""Presets from the fastest to the slowest. docs/tradeoff.md has the time and the quality of
+each.
+"""
 
 
 @checked_arguments
@@ -153,14 +160,15 @@ def reconstruct_with(
     capture: Capture,
     progress: bool = False,
 ) -> Avatar:
-    """An avatar of the person of a capture: `reconstruct`, then `refine` where the settings say so.
+    """Makes an avatar of the person of a capture: calls `reconstruct`, then `refine` if the
+    settings ask for it.
 
     Args:
-        settings: of speed against accuracy, or the name of one of `PRESETS`.
-        variables: of the network; with `config`, what `load_weights` returns.
-        config: of the weights; its runtime is replaced by that of the settings.
-        capture: `Settings.photos` of it are used.
-        progress: show the bar of refinement.
+        settings: the settings, or the name of one of `PRESETS`.
+        variables: of the network. `load_weights` returns them with `config`.
+        config: of the network. The settings replace its runtime.
+        capture: the photos. `Settings.photos` chooses those that are used.
+        progress: whether to show the progress of refinement.
 
     Returns:
         The avatar.
@@ -188,14 +196,14 @@ def reconstruct_with(
 
 
 def save_settings(path: str | os.PathLike[str], settings: Settings, **about: Any) -> None:
-    """Write settings as JSON, with what else is to be known about them. Raises: OSError."""
+    """Writes settings as JSON. about: further entries of the file. Raises: OSError."""
     write_json(path, {"kind": _KIND, "settings": parse_json(config_to_json(settings)), **about})
 
 
 def load_settings(path: str | os.PathLike[str]) -> Settings:
-    """Settings that `save_settings` has written.
+    """Reads settings that `save_settings` has written.
 
-    Raises: FileNotFoundError; FileError naming the file and what is wrong.
+    Raises: FileNotFoundError; FileError that names the file and what is wrong.
     """
     with reading(path, "settings file"):
         content = parse_json(read_text(path))
@@ -211,9 +219,13 @@ def load_settings(path: str | os.PathLike[str]) -> Settings:
 # --------------------------------------------------------------------------------------------------
 
 _HEADROOM = 1.25
-"""Measured times times this have to be within the budget: a busy machine is slower later."""
+"""Measured times are multiplied by this before they are compared with the budget, because a busy
+machine is slower later.
+"""
 FRAMES = 16
-"""Frames that are timed for each preset; the 90th percentile counts."""
+"""Number of frames that are timed for each preset. The 90th percentile of their times is
+compared.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -221,16 +233,18 @@ class Cost:
     """What a preset costs on this machine with this person."""
 
     reconstruct_ms: float
-    """Milliseconds of making the avatar, with refinement."""
+    """Time in which the avatar is made, with refinement, milliseconds."""
     frame_ms: float
-    """Milliseconds of a frame."""
+    """Time of a frame, milliseconds."""
     memory_mb: float | None = None
-    """MiB that they add to the process at their peak; None where this is not known."""
+    """Memory that making the avatar and drawing its frames add to the process at their peak, MiB.
+    None where this cannot be measured.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
 class Tuned:
-    """What `tune` has found."""
+    """The preset that `tune` has found."""
 
     name: str
     """Name of the best preset within the budget."""
@@ -239,11 +253,11 @@ class Tuned:
 
     @property
     def settings(self) -> Settings:
-        """The settings, for `reconstruct_with`."""
+        """The settings of the best preset, for `reconstruct_with`."""
         return PRESETS[self.name]
 
     def __str__(self) -> str:
-        """One line: the preset and what it takes."""
+        """Returns one line with the preset and its costs."""
         return f"{self.name}: {_shown(self.measured[self.name])}"
 
 
@@ -258,27 +272,29 @@ def tune(
     size: int = 512,
     progress: bool = False,
 ) -> Tuned:
-    """The best preset within a budget, timed on this machine with this person.
+    """Finds the best preset within a budget, timed on this machine with this person.
 
-    The presets are timed from the fastest on, until one exceeds the budget. Compiling does not
-    count. Without masks, presets that refine are not tried.
+    Presets are timed from the fastest to the slowest, until one exceeds the budget. Compilation
+    does not count. Without masks, presets that refine are not tried.
 
     Args:
-        variables: of the network, with `config`: `load_weights`.
-        config: see `variables`.
+        variables: of the network. `load_weights` returns them with `config`.
+        config: of the network.
         capture: the person to reconstruct.
-        reconstruct_ms: the most that making the avatar may take, with refinement, milliseconds.
-        frame_ms: the most that a frame may take, milliseconds.
-        memory_mb: the most memory that this may add to the process, MiB.
+        reconstruct_ms: longest time in which the avatar may be made, with refinement, milliseconds.
+        None: no limit.
+        frame_ms: longest time that a frame may take, milliseconds. None: no limit.
+        memory_mb: most memory that this may add to the process, MiB. None: no limit.
         size: side of the frames, pixels.
-        progress: show a bar.
+        progress: whether to show a progress bar.
 
     Returns:
-        The preset (`.name`, `.settings`) and what all that were timed cost (`.measured`).
+        The preset (`.name`, `.settings`), and the costs of all presets that were timed
+        (`.measured`).
 
     Raises:
-        ValueError: if no preset is within the budget, saying what the fastest takes; or if memory
-            is limited where it cannot be measured.
+        ValueError: if no preset is within the budget; the message has the costs of the fastest.
+        Also if memory is limited where it cannot be measured.
 
     Examples:
         >>> tuned = hg.tune(*hg.load_weights(), capture, frame_ms=33)
@@ -322,7 +338,9 @@ def measure(
     capture: Capture,
     size: int = 512,
 ) -> Cost:
-    """What settings cost here: an avatar of this capture, and frames of it from all around."""
+    """Measures what settings cost on this machine: makes an avatar of the capture, and draws frames
+    of it from all around. size: side of the frames, pixels.
+    """
 
     def make():
         return reconstruct_with(settings, variables, config, capture)

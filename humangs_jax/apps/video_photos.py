@@ -1,8 +1,9 @@
-"""The photos of a video: its sharp frames, from all sides of the person.
+"""Chooses photos from a video: sharp frames that show the person from all sides.
 
-The person is followed through the frames that are offered (`capture.calibration.frame_choice`),
-reduced to `FOLLOWED` pixels: where one frame has found the person, the landmark network alone looks
-at the next. That tells which way the person faces in each, and which pose is the usual one.
+`capture.calibration.frame_choice` offers frames. The person is followed through them, at a longer
+side of 640 pixels. Where one frame has found the person, only the landmark network looks at the
+next. The landmarks show in which direction the person faces in each frame, and which pose is the
+usual one.
 """
 
 from collections.abc import Iterable, Sequence
@@ -47,16 +48,18 @@ from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.reading import read_json, reading, write_json
 
 MARK = "video.json"
-"""File in the folder of photos that names the video that they are of, and which frames."""
+"""File in the folder of photos that records the video and the frames that were chosen from it."""
 PATIENCE = 8
-"""Frames in a row without anybody after which nobody is looked for: to search a whole frame takes
-ten times as long as to follow somebody."""
+"""Number of frames in a row without anybody after which the search ends. Searching a whole frame
+takes ten times as long as following somebody.
+"""
 
 
 def video_of(place: Path) -> Path | None:
-    """The video that `place` is, or that is in a folder without photos; None if there is none.
+    """Returns the video at a path: the path itself, or the video of a folder without photos. None
+    if there is none.
 
-    Raises: CaptureError for several videos.
+    Raises: CaptureError if the folder has several videos.
     """
     if not place.is_dir():
         if place.is_file() and is_video(place):
@@ -76,10 +79,10 @@ def video_of(place: Path) -> Path | None:
 
 
 def photos_of_video(video: Path, folder: Path) -> str:
-    """Write the chosen frames into `folder / "images"`, and say so; a folder that an earlier run
-    wrote of this video stays.
+    """Writes the chosen frames into `folder / "images"`, and returns a line that describes them. If
+    an earlier run has made the folder from this video, the folder stays as it is.
 
-    Raises: CaptureError naming the video, or the folder if something else is there.
+    Raises: CaptureError that names the video, or the folder if it is something else.
     """
     with reading(video, "video", CaptureError):
         status = video.stat()
@@ -129,10 +132,11 @@ def _told(
 
 
 def seconds_of_photos(folder: Path, names: Sequence[str]) -> Float[np.ndarray, " v"] | None:
-    """Seconds at which views were taken, by the names of their photos, if the folder of photos is
-    of one video.
+    """Returns the times at which photos were taken in a video, (v,), seconds. They follow from the
+    names of the photos.
 
-    None for other folders, and where the video does not say its rate.
+    Returns None if the folder of photos is not of one video, if the video does not have a rate, or
+    if names have no ascending numbers.
     """
     known = None
     if (folder / MARK).is_file():
@@ -150,8 +154,9 @@ def seconds_of_photos(folder: Path, names: Sequence[str]) -> Float[np.ndarray, "
 
 
 def _by_direction(video: Path, sharpness: Float[np.ndarray, " n"]) -> list[int]:
-    """Numbers of sharp frames that are spread over the directions from which they see the
-    person; none if it does not turn.
+    """Chooses sharp frames that see the person from different directions, and returns their
+    numbers. Returns an empty list if the person does not turn, or is not found in half of the
+    offered frames.
     """
     offered, worth = offered_frames(sharpness)
     # the person is followed in frames of 640 pixels: twice what the landmark network looks at
@@ -170,8 +175,9 @@ def _by_direction(video: Path, sharpness: Float[np.ndarray, " n"]) -> list[int]:
 
 
 def followed(frames: Iterable[UInt[np.ndarray, "h w 3"]], count: int) -> Iterable[Landmarks | None]:
-    """The largest person of the first frame that shows one, in all frames; None where the person
-    is not found. It ends early where nobody is found in `PATIENCE` frames in a row.
+    """Follows the largest person of the first frame that shows somebody. Yields the person's
+    landmarks in each frame, or None where the person is not found. Ends early if nobody is found in
+    `PATIENCE` frames in a row.
     """
     networks, last, missed = Networks(), None, 0
     for frame in bar(frames, total=count, desc="following the person", unit="frame"):

@@ -43,15 +43,11 @@ from humangs_jax.viewer.page_face import pack_face
 
 VERSION = 1
 WEIGHTS = 8
-"""Number of skinning weights that are kept for each Gaussian.
-
-The shipped body has at most 7.
-"""
+"""Number of skinning weights that are kept for each Gaussian. The shipped body has at most 7."""
 STEPS = 65535
 SMALLEST_SCALE = 1e-7
-"""Smallest scale of a Gaussian, metres; it keeps the logarithm finite for flat Gaussians.
-
-A thousandth of eps2d for a camera at any distance.
+"""Smallest scale of a Gaussian, metres. It keeps the logarithm finite for flat Gaussians, and is
+too small to be seen: a thousandth of eps2d for a camera at any distance.
 """
 _SMALLEST_RANGE = 1e-6
 """Least range of quantized values. It keeps the division finite where all values are equal."""
@@ -66,27 +62,28 @@ class Packed:
     Each array of `data` is little-endian and begins at a multiple of 4 bytes. `low`, `high` and
     `step` are in the header.
 
-    Of the Gaussians: means uint16 (g, 3), from low to high, per axis, metres. scales uint16 (g, 3),
-    log of metres, from low to high. quats int16 (g, 4), unit, wxyz, times 32767. opacities uint16
-    (g,), [0, 1]. colors uint16 (g, 3), from low to high. harmonics uint16 (g, k, 3), from low to
-    high; only if the Gaussians have some. weights uint16 (g, 8), skinning weights, the largest
-    first; every row sums to 65535. weight_joints uint8 (g, 8).
+    Gaussians: means uint16 (g, 3), from low to high, per axis, metres. scales uint16 (g, 3), log of
+    metres, from low to high. quats int16 (g, 4), unit, wxyz, times 32767. opacities uint16 (g,),
+    [0, 1]. colors uint16 (g, 3), from low to high. harmonics uint16 (g, k, 3), from low to high;
+    only if the Gaussians have some. weights uint16 (g, 8), skinning weights, the largest first;
+    every row sums to 65535. weight_joints uint8 (g, 8), joints of the weights.
 
-    Of the light, if the avatar has one: light_normals int8 (g, 3), times 127. light_shading uint16
-    (g,), from low to high.
+    Light, if the avatar has one: light_normals int8 (g, 3), times 127. light_shading uint16 (g,),
+    from low to high.
 
-    Of the skeleton and the motion: rest_joints float32 (j, 3), metres. rotations int16 (m, j, 3),
-    axis-angle times step, radians. translations float32 (m, 3), metres.
+    Skeleton and motion: rest_joints float32 (j, 3), metres. rotations int16 (m, j, 3), axis-angle
+    divided by step, radians. translations float32 (m, 3), metres.
 
-    Of the shape, if the body is known: shape_directions int16 (s, n, 3), how vertices move per unit
-    of a shape coefficient, times step, metres. shape_joints float32 (s, j, 3), the same of joints,
+    Shape, if the body is known: shape_directions int16 (s, n, 3), how vertices move per unit of a
+    shape coefficient, divided by step, metres. shape_joints float32 (s, j, 3), how joints move,
     metres.
 
-    Of an avatar with a face: face_..., see `page_face.pack_face`; its hidden Gaussians come last.
+    Face, if the avatar has one: face_..., see `page_face.pack_face`. Hidden Gaussians of the face
+    come last.
     """
 
     header: dict[str, Any]
-    """What the page reads as JSON: counts, names, ranges, and where each array begins."""
+    """What the page reads as JSON: counts, names, ranges, and the place of each array."""
     data: bytes
     """The arrays, one after the other."""
 
@@ -99,11 +96,11 @@ def pack(
 ) -> Packed:
     """Packs an avatar and a motion for the page.
 
-    motion: None for a page without one. body: the model that the avatar's vertices belong to, which
-    the sliders of shape need; None: there are no sliders. motion_name: shown in the page.
+    motion: None for a page without motion. body: the model to which the avatar's vertices belong,
+    for sliders of shape; None: there are no sliders. motion_name: name that the page shows.
 
-    Raises: ValueError, one line, for numbers that are not finite or out of range, a motion of other
-    joints, or a body that does not explain the avatar's vertices.
+    Raises: ValueError (one line) for numbers that are not finite or out of range, for a motion of
+    other joints, or for a body that does not explain the avatar's vertices.
     """
     # a page with wrong numbers would show nothing and not say why
     check_values(
@@ -170,10 +167,11 @@ def pack(
 def largest_weights(
     weights: Float[np.ndarray, "g j"],
 ) -> tuple[Int[np.ndarray, "g 8"], Int[np.ndarray, "g 8"]]:
-    """Returns the joints and values of the 8 largest weights of each row, largest first.
+    """Returns the joints and the values of the 8 largest weights of each row, both (g, 8), largest
+    first.
 
-    A value of 65535 is a weight of 1, and rows sum to 65535. Weights that are left out are shared
-    among the others in proportion; the largest one takes what rounding leaves.
+    A value of 65535 is a weight of 1, and rows sum to 65535. Smaller weights are left out and
+    shared among the others in proportion. The largest one takes the error of rounding.
     """
     weights = np.pad(
         np.asarray(weights, np.float64), ((0, 0), (0, max(0, WEIGHTS - weights.shape[1])))
@@ -188,9 +186,9 @@ def largest_weights(
 
 
 def _fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | None:
-    """Finds the shape coefficients (s,) with which the body has the avatar's vertices.
-
-    None: the root-mean-square error is a millimetre or more, or the sizes differ.
+    """Finds the shape coefficients, (s,), with which the body has the avatar's vertices. Returns
+    None if the root-mean-square error is a millimetre or more, or if the numbers of vertices or
+    joints differ.
     """
     target = np.asarray(avatar.rest_vertices, np.float64)
     if body.template.shape != target.shape or len(body.parents) != len(avatar.parents):
@@ -203,7 +201,9 @@ def _fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | 
 
 
 def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any, Any]]:
-    """Returns the values of avatar and motion that have to be finite, by name."""
+    """Returns the values of avatar and motion that have to be finite, by name. Each comes with the
+    range `FINITE`.
+    """
     values = {
         name: (getattr(avatar, name), FINITE)
         for name in ("skinning_weights", "rest_vertices", "rest_joints")
@@ -217,7 +217,7 @@ def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any,
 
 
 def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    """Adds Gaussians, skinning and light to the header and the arrays, in 16 bits or fewer."""
+    """Adds Gaussians, skinning and light to the header and to the arrays, in 16 bits or fewer."""
     g = avatar.gaussians
     means, quats, scales, opacities, colors = (
         np.asarray(x, np.float64) for x in (g.means, g.quats, g.scales, g.opacities, g.colors)
@@ -253,9 +253,9 @@ def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np
 def _pack_shape(
     avatar: Avatar, body: BodyModel, header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> None:
-    """Adds how each shape coefficient moves vertices and joints to the header and the arrays.
+    """Adds to the header and to the arrays how each shape coefficient moves vertices and joints.
 
-    Gaussians move with their vertex; they are stored vertex by vertex.
+    Gaussians are stored vertex by vertex and move with their vertex.
 
     Raises: ValueError if the body does not explain the avatar's vertices.
     """
@@ -313,10 +313,10 @@ def page_html(
 ) -> str:
     """Returns the page as text.
 
-    motion: None for the walk that comes with the package, if the avatar has its number of joints.
-    title, motion_name: shown in the page.
+    motion: None for the walk that comes with the package, if the avatar has as many joints. title,
+    motion_name: names that the page shows.
 
-    Raises: ValueError, one line, for an avatar or a motion that cannot be drawn (see `pack`).
+    Raises: ValueError (one line) for an avatar or a motion that cannot be drawn, see `pack`.
     """
     name = motion_name or ("walk" if motion is None else "motion")
     if motion is None:
@@ -401,7 +401,8 @@ def show(avatar: Avatar, motion: Motion | None = None, height: int = 560) -> Not
 def serve(text: str, port: int = 0, open_browser: bool = True) -> None:
     """Serves a page on this machine only, until Ctrl-C.
 
-    port: 0 for any free port. Raises: ArgumentError, one line, if the port cannot be used.
+    text: the page. port: 0 for any free port. Raises: ArgumentError (one line) if the port cannot
+    be used.
     """
     with page_server({"/": text}, port) as server:
         url = f"http://127.0.0.1:{server.server_address[1]}/"
@@ -413,7 +414,7 @@ def serve(text: str, port: int = 0, open_browser: bool = True) -> None:
 
 
 def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
-    """Makes a server of texts on 127.0.0.1, which does not run yet.
+    """Makes a server of texts on 127.0.0.1. The caller has to start it.
 
     pages: texts by path. A request gets the text that the mapping has at that moment.
 
@@ -445,9 +446,8 @@ def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
 
 
 def known_body(avatar: Avatar) -> BodyModel | None:
-    """Returns the shipped body with the avatar's vertices, which the sliders of shape need.
-
-    None: no shape of that body has the avatar's vertices.
+    """Returns the shipped body that has the avatar's vertices, for sliders of shape. Returns None
+    if no shape of that body has these vertices.
     """
     if avatar.parents != PARENTS:
         return None

@@ -16,17 +16,17 @@ from humangs_jax.body.motion import Motion
 def pack_face(
     avatar: Avatar, motion: Motion | None, header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> Avatar:
-    """Returns the avatar with its hidden Gaussians after the others.
-
-    What moves and shows Gaussians is added to the header and to the arrays, which are:
+    """Adds the face to the header and to the arrays. Returns the avatar with its hidden Gaussians
+    after the others.
 
     face_rows uint16 (g,): the row of `face_directions` that each Gaussian follows, 65535 for none.
-    face_directions int16 (e, rows, 3): times step, metres. face_eyes uint8 (g, 2): shares of both
-    eyes, times 255. face_vertices uint16 (hidden,): the vertex that is nearest, for sliders of
-    shape. face_shown uint8 (hidden,): the expression that shows a Gaussian; 255 for those that are
-    seen between the lips. face_lips float32 (4, 3), face_lip_directions float32 (e, 4, 3): metres.
-    face_turns float32 (e, 2, 3): of both eyes. motion_faces int16 (m, e): coefficients times
-    motion.face_step; only if the motion has some.
+    face_directions int16 (e, rows, 3): how rows move with each expression, divided by step, metres.
+    face_eyes uint8 (g, 2): shares of both eyes, times 255. face_vertices uint16 (hidden,): the
+    nearest vertex of each hidden Gaussian, for sliders of shape. face_shown uint8 (hidden,): the
+    expression that shows a hidden Gaussian, or 255 for one that is seen between the lips. face_lips
+    float32 (4, 3): points of the lips, metres. face_lip_directions float32 (e, 4, 3): how these
+    points move, metres. face_turns float32 (e, 2, 3): turns of both eyes. motion_faces int16
+    (m, e): coefficients divided by motion.face_step; only if the motion has some.
     """
     face = avatar.face
     assert face is not None
