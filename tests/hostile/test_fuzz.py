@@ -4,6 +4,7 @@ HUMANGS_FUZZ_INPUTS=N makes N files for each reader, the same ones in each run.
 """
 
 import contextlib
+import copy
 import gzip
 import io
 import json
@@ -69,9 +70,12 @@ def of_pickle(draw, data):
 
 
 def places(value, path=()):
+    """Paths of keys to a value and to all values within it."""
     yield path
-    keys = value if isinstance(value, dict) else ()
-    if isinstance(value, list):
+    keys = ()
+    if isinstance(value, dict):
+        keys = value
+    elif isinstance(value, list):
         keys = range(len(value))
     for key in keys:
         yield from places(value[key], (*path, key))
@@ -81,7 +85,8 @@ def of_json(draw, data):
     value = json.loads(data)
     for _ in range(draw(st.integers(1, 3))):
         path = draw(st.sampled_from(list(places(value))))
-        new = draw(st.sampled_from(VALUES))
+        # a copy: a later change may go into it
+        new = copy.deepcopy(draw(st.sampled_from(VALUES)))
         if not path:
             return json.dumps(new).encode()
         parent = value
