@@ -22,7 +22,7 @@ shown whole.
 def around_person(
     capture: Capture,
     vertices: Mapping[int, Float[Array, "n 3"]],
-    marks: Sequence[Float[np.ndarray, "k 2"]] | None = None,
+    marks: Sequence[Float[np.ndarray, "_k 2"]] | None = None,
 ) -> tuple[Capture, Int[np.ndarray, "v 2"]]:
     """Cuts photos, masks and cameras of a capture to windows around the person. All windows have
     the same size. Returns the capture, and the upper left corner (x, y) of each window, (v, 2),
@@ -82,7 +82,7 @@ def _box(
     capture: Capture,
     view: int,
     vertices: Float[Array, "n 3"],
-    marks: Sequence[Float[np.ndarray, "k 2"]] | None,
+    marks: Sequence[Float[np.ndarray, "_k 2"]] | None,
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
     """Returns the least and the largest (x, y), each (2,), of the pixels of body, mask and marks
     that lie in a photo. None if there are none. vertices: in the world, (n, 3), metres.

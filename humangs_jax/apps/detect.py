@@ -163,7 +163,7 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
     return same_people(found, photos.cameras, photos.frames.tolist())
 
 
-Hidden = Sequence[Bool[np.ndarray, "h w"] | None] | Bool[np.ndarray, "v h w"] | None
+Hidden = Sequence[Bool[np.ndarray, "_h _w"] | None] | Bool[np.ndarray, "v h w"] | None
 """Pixels of each photo that do not show the person, one array (h, w) or None per photo. None: no
 photo has such pixels.
 """
@@ -205,7 +205,7 @@ def without_hidden_landmarks(photos: list[PhotoPeople], hidden: Hidden) -> list[
 
 
 def without_others(
-    pictures: Iterable[Float[np.ndarray, "h w 3"]], others: Hidden
+    pictures: Iterable[Float[np.ndarray, "_h _w 3"]], others: Hidden
 ) -> Iterator[Float[np.ndarray, "h w 3"]]:
     """Paints over other people and things in front of the person with the colors around them, so
     that the detector finds the person alone. Yields the photos.
@@ -225,8 +225,8 @@ def without_others(
 
 def with_masked(
     found: list[PhotoPeople],
-    masks: Sequence[Float[np.ndarray, "h w"]],
-    on_white: Sequence[Float[np.ndarray, "h w 3"]],
+    masks: Sequence[Float[np.ndarray, "_h _w"]],
+    on_white: Sequence[Float[np.ndarray, "_h _w 3"]],
 ) -> list[PhotoPeople]:
     """Makes sure that the person of each given mask is among the people of its photo. Where the
     mask of nobody found matches, the detector looks again at the photo cut to the mask, and the

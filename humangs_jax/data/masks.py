@@ -93,8 +93,8 @@ class _Shift(NamedTuple):
 
 
 def masks_at_edges(
-    images: Sequence[Float[np.ndarray, "h w 3"]], masks: Sequence[Float[np.ndarray, "h w"]]
-) -> list[tuple[Float[np.ndarray, "h w"], float]]:
+    images: Sequence[Float[np.ndarray, "_h _w 3"]], masks: Sequence[Float[np.ndarray, "_h _w"]]
+) -> list[tuple[Float[np.ndarray, "_h _w"], float]]:
     """Returns each mask with its silhouette moved to the photo's edges, and by how many pixels of
     the photo it was too large (negative: too small).
 

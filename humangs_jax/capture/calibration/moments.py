@@ -40,7 +40,7 @@ class Moments(NamedTuple):
     """What cameras lack, a line each."""
 
 
-def find_moments(times: Mapping[str, Float[np.ndarray, " n"]]) -> Moments:
+def find_moments(times: Mapping[str, Float[np.ndarray, " _n"]]) -> Moments:
     """Finds the moments that several cameras show.
 
     Arguments: times: seconds at which each camera has its frames; NaN where that is not known.
@@ -85,7 +85,7 @@ def _clock(
 
 
 def _all_moments(
-    clocks: Mapping[str, Float[np.ndarray, " n"]], steps: Mapping[str, float]
+    clocks: Mapping[str, Float[np.ndarray, " _n"]], steps: Mapping[str, float]
 ) -> Float[np.ndarray, " m"]:
     """The times of the slowest camera, in seconds. Times at which it has no frame (before its
     start, in its gaps, after its end) are added.
@@ -123,7 +123,7 @@ def nearest(times: Float[np.ndarray, " n"], moments: Float[np.ndarray, " m"]) ->
 
 
 def _notes(
-    clocks: Mapping[str, Float[np.ndarray, " n"]],
+    clocks: Mapping[str, Float[np.ndarray, " _n"]],
     frames: Mapping[str, Sequence[int | None]],
     steps: Sequence[float],
 ) -> tuple[str, ...]:
@@ -147,7 +147,7 @@ def _notes(
 
 
 def _warnings(
-    clocks: Mapping[str, Float[np.ndarray, " n"]],
+    clocks: Mapping[str, Float[np.ndarray, " _n"]],
     frames: Mapping[str, Sequence[int | None]],
     moments: Float[np.ndarray, " m"],
 ) -> tuple[str, ...]:

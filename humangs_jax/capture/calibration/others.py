@@ -50,7 +50,7 @@ def find_others(folder: Path | None, images: Path, photos: Sequence[Path]) -> di
 
 def others_as_shown(
     folder: Path | None, images: Path, photos: Sequence[Path]
-) -> list[Bool[np.ndarray, "h w"] | None]:
+) -> list[Bool[np.ndarray, "_h _w"] | None]:
     """Where others stand in front, in each photo as it is shown. None for a photo without a mask of
     others.
 
