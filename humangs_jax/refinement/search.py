@@ -212,10 +212,12 @@ class Task(NamedTuple):
     """The avatar with the scales that the learned update was trained with: the low-pass that the
     avatar came with is taken out.
     """
+    given: list[Photo]
+    """The photos as they were given, with all their pixels. They say whether a state is better."""
     photos: list[Photo]
-    """The photos, with all their pixels."""
+    """The photos that are fitted: those given, or moved as `align` does, with all their pixels."""
     seen: list[Photo]
-    """The photos without the pixels that are held out."""
+    """The photos that are fitted, without the pixels that are held out."""
     graph: Graph | None
     """The graph of the learned update; None without iterations."""
     config: RefineConfig
@@ -261,7 +263,7 @@ def prepare(
     if config.iterations:
         graph = graph_of(np.asarray(start.gaussians.means))
     settings = dataclasses.replace(config, **HOST_SETTINGS)
-    task = Task(start, fresh, photos, seen, graph, config, settings, clock)
+    task = Task(start, fresh, photos, photos, seen, graph, config, settings, clock)
     parameters, splat = unconstrained(start.gaussians), planned(start, views)
     if graph is not None:
         Ahead().add(calls_of_update(parameters, start, seen, graph, splat))
@@ -362,7 +364,7 @@ def _search_by_blocks(
     """
     hidden = [
         replace(all, counted=from_host(np.asarray(all.counted) & ~np.asarray(seen.counted)))
-        for all, seen in zip(task.photos, task.seen, strict=True)
+        for all, seen in zip(task.given, task.seen, strict=True)
     ]
     # a small crop may have no block to hold out
     any_hidden = any(np.asarray(photo.counted).any() for photo in hidden)
@@ -420,10 +422,10 @@ def _search_by_photo(
     length = round(TRIAL * total / len(trials))
     gains: dict[float, list[float]] = {}
     for number, (view, begin) in enumerate(trials.items()):
-        before = psnr_of(task, begin, [task.photos[view]])
+        before = psnr_of(task, begin, [task.given[view]])
         shown = TRIAL * number / len(trials), TRIAL * (number + 1) / len(trials)
         for found in steps(task, begin, used[used != view], length, length, shown):
-            gain = psnr_of(task, found, [task.photos[view]]) - before
+            gain = psnr_of(task, found, [task.given[view]]) - before
             gains.setdefault(int(found.state.done) / length, []).append(gain)
             yield found._replace(kept=False)
     helpful = [share for share, each in gains.items() if np.mean(each) > -ALLOWED_LOSS]
@@ -447,7 +449,7 @@ def _trial_gains(
     of `used`. The state after these iterations is stored in `tried` under the photo's number.
     """
     for view in asked:
-        photo = [task.photos[view]]
+        photo = [task.given[view]]
         before = psnr_of(task, start, photo)
         tried[view], _ = iterated(task, start, used[used != view])
         yield psnr_of(task, tried[view], photo) - before
@@ -549,14 +551,19 @@ def avatar_comparison(
 def psnr_of(task: Task, found: Candidate, photos: Sequence[Photo]) -> float:
     """Returns the mean `aligned_psnr` of a state, dB, over the photos of which some pixels count;
     `LARGEST_PSNR` if no pixel counts.
+
+    photos: as they were given. Where photos are moved, each is first moved to what the state draws.
+    A photo that was moved to the start would favour the start.
     """
-    scores = [
-        aligned_psnr(
-            image, _side_by_side(photo.image, photo.mask), counted=np.asarray(photo.counted)
-        )
-        for image, photo in zip(images_of(task, found, photos), photos, strict=True)
-        if np.asarray(photo.counted).any()
-    ]
+    scores = []
+    for image, photo in zip(images_of(task, found, photos), photos, strict=True):
+        counted = np.asarray(photo.counted)
+        if not counted.any():
+            continue
+        shown = _side_by_side(photo.image, photo.mask)
+        if task.moved:
+            shown = moved_photo(shown, smooth_moves(image, shown))
+        scores.append(aligned_psnr(image, shown, counted=counted))
     if scores:
         return float(np.mean(scores))
     return LARGEST_PSNR

@@ -409,6 +409,26 @@ def test_photos_that_are_off_by_pixels_are_moved_to_where_the_avatar_is(body, pi
         )
 
 
+def test_a_held_out_photo_is_compared_where_each_state_draws_the_person(body, monkeypatch):
+    """A photo that was moved to the start would favour it over a state beside it."""
+    avatar = toy_avatar(body, 0.0)
+    capture = shifted(toy_capture(body, avatar, views=4), 2)
+    monkeypatch.setattr(search, "iterated", lambda task, start, used: (start, 0.0))
+    config = dataclasses.replace(STEPS, iterations=4)
+    task, start, each = search.prepare(
+        avatar, crop_to_person(prepare_capture(capture)), config, search.Clock(config)
+    )
+    task, _ = search.align(task, start, each)
+    assert task.moved
+    # the first photo has moved down by two pixels: this state draws it there
+    down = 2 * 3.6 * 2 * np.tan(np.pi / 12) / HEIGHT
+    parameters = start.state.parameters
+    lower = replace(parameters, means=parameters.means - jnp.asarray([0.0, down, 0.0]))
+    beside = start._replace(state=replace(start.state, parameters=lower))
+    scores = [search.psnr_of(task, state, task.given[:1]) for state in (start, beside)]
+    assert scores[1] > scores[0]  # the moved photo prefers the start by 1.9 dB
+
+
 def test_a_photo_that_contradicts_the_others_is_left_out_and_named(four, monkeypatch):
     """By its name among all views of the capture, one of which shows nobody."""
     avatar, capture = four
