@@ -389,6 +389,7 @@ def predictions_method(folder: str | Path, people: int) -> Method:
         found = [(i, file) for i, file in enumerate(files.values()) if file is not None]
         if not found:
             return _nothing(case, missing)
+        # alpha channels are the coverage: all images have one, or none
         size = case.truth.images.shape[1:3]
         read = [_read_prediction(file, size, background) for _, file in found]
         coverage = [alpha for _, alpha in read if alpha is not None]

@@ -528,10 +528,12 @@ def _blended(
     rgb = features[:, :3] + transmittance * background[:, None]
     depth = jnp.where(alpha > 0, nearest + safe_divide(features[:, 3:4], alpha), 0.0)
     rgb, alpha_image, depth = (tiles_to_image(tiles, grid) for tiles in (rgb, alpha, depth))
+    # outputs that are computed only if they are asked for
     depth_sum, distortion = None, None
     if config.depth_sum:
         depth_sum = tiles_to_image(nearest * alpha + features[:, 3:4], grid)[..., 0]
     if config.distortion:
+        # the last two channels are the first and the second moment of the depth
         first, second = features[:, -2:-1], features[:, -1:]
         spread = 2 * jnp.maximum(alpha * second - first * first, 0.0)
         distortion = tiles_to_image(spread, grid)[..., 0]
