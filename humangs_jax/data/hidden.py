@@ -98,8 +98,8 @@ def hidden_line(before: Capture, after: Capture) -> str | None:
         known = before.unknown
     new = (after.unknown & ~known).any(axis=(1, 2))
     names = [name for name, hidden in zip(after.names, new, strict=True) if hidden]
-    told = "the mask has a hole where the body is: something is in front, and unknown there"
-    return f"{few(names)}: {told}" if names else None
+    reason = "the mask has a hole where the body is: something is in front, and unknown there"
+    return f"{few(names)}: {reason}" if names else None
 
 
 def hidden_parts(capture: Capture) -> Bool[np.ndarray, "v h w"] | None:

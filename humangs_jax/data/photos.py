@@ -382,11 +382,11 @@ def _check_orientations(
             )
             raise CaptureError(file, "orientation", problem)
     if flagged and warns:
-        told = (
+        advice = (
             "K, mask and keypoints have to be of the pixels as stored (`humangs import cameras`"
             " turns such photos)"
         )
-        logger.warning("%s: EXIF orientation of %s is ignored: %s", folder, few(flagged, 1), told)
+        logger.warning("%s: EXIF orientation of %s is ignored: %s", folder, few(flagged, 1), advice)
 
 
 def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) -> None:

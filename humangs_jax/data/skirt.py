@@ -152,9 +152,9 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
         shown += inside.reshape(ROWS, -1).sum(axis=1)
         clear = np.maximum(clear, np.where(inside, apart, 0).reshape(ROWS, -1).max(axis=1))
     # the skirt goes down to the first height that the votes are against
-    told = asked >= VOTES
-    skirt = told & (shown >= SHOWN * asked)
-    ends = np.flatnonzero(told & ~skirt)
+    decided = asked >= VOTES
+    skirt = decided & (shown >= SHOWN * asked)
+    ends = np.flatnonzero(decided & ~skirt)
     rows = np.flatnonzero(skirt[: ends[0] if len(ends) else ROWS])
     # wide trousers look like a skirt, so some cloth must be well clear of both legs
     certain = clear[rows] > (CLEAR if len(ends) else LONG_CLEAR)

@@ -398,10 +398,10 @@ def evaluate(
     kept = None
     if keep is not None:
         own_key, key_of = method_key(len(people.names), avatar, weights, predictions, method)
-        said = {
+        settings = {
             "name": name,
             "method": own_key,
-            "source": _told(source),
+            "source": _source_text(source),
             "protocol": repr(rules),
             "inputs": inputs,
             "indices": indices_key(choice),
@@ -409,7 +409,7 @@ def evaluate(
             "lpips": networks_key(networks),
             "images": page_images,
         }
-        kept = KeptScores(Path(keep), said, key_of, ordered=page_images > 0)
+        kept = KeptScores(Path(keep), settings, key_of, ordered=page_images > 0)
     # one person at a time, so that memory holds the images of one
     rows, missing, scored, gallery = [], [], [], _Gallery(page_images)
     for index in bar(range(len(people.names)), desc="evaluate", unit="person", shown=progress):
@@ -434,7 +434,7 @@ def evaluate(
     # what was compared, for reports
     people_shown = {row.person for row in rows}
     about = {
-        "source": printable(_told(source)),
+        "source": printable(_source_text(source)),
         "counts": (
             f"{_counted(len(rows), 'image', 'images')} of"
             f" {_counted(len(people_shown), 'person', 'people')}"
@@ -463,7 +463,7 @@ def evaluate(
     )
 
 
-def _told(source: Any) -> str:
+def _source_text(source: Any) -> str:
     """Returns the name of a source for reports: a path as it was given, or the name of the type of
     any other source.
     """

@@ -190,7 +190,7 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
         names, values = checked_track(found.face, len(rotations))
         faces = from_host(values)
     motion = Motion(from_host(rotations), from_host(translations), rate, faces, names)
-    # what the user is told about the file
+    # the warnings about the file
     if isinstance(found, Poses) and found.frames is not None:
         motion, filled = _without_gaps(motion, found.frames, path)
         note = "; ".join(filter(None, (note, filled)))

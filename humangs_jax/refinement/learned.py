@@ -278,10 +278,10 @@ class Refiner(nn.Module):
         clusters = dense("enter")(norm("norm")(jnp.mean(features[graph.members], axis=1)))
         for i in range(self.cluster_layers):
             normed = norm(f"norm_{i}")(clusters)
-            said = nn.relu(dense(f"message_{i}")(normed))
-            everywhere = jnp.broadcast_to(jnp.mean(said, axis=0), said.shape)
+            message = nn.relu(dense(f"message_{i}")(normed))
+            everywhere = jnp.broadcast_to(jnp.mean(message, axis=0), message.shape)
             heard = jnp.concatenate(
-                [normed, neighbor_mean(said, graph.clusters), everywhere], axis=-1
+                [normed, neighbor_mean(message, graph.clusters), everywhere], axis=-1
             )
             clusters = clusters + dense(f"update_{i}_1")(nn.relu(dense(f"update_{i}_0")(heard)))
         around = jnp.sum(

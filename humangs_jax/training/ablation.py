@@ -241,8 +241,8 @@ def _checked_variants(
             runs[name] = run = vary(base, changes)
             jax.eval_shape(lambda run=run: init_state(run, None))  # whether its network can be made
         except (TypeError, ValueError, ZeroDivisionError) as error:
-            said = (str(error).splitlines() or [type(error).__name__])[0]
-            raise ArgumentError("variants", f"{name!r}: {said}") from error
+            message = (str(error).splitlines() or [type(error).__name__])[0]
+            raise ArgumentError("variants", f"{name!r}: {message}") from error
         missing = missing_networks(run, networks)
         if missing:
             raise ArgumentError(

@@ -228,11 +228,11 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
             raise InvalidFileError(
                 OTHERS.get(suffix, f"not known: expected a file ending in {known}")
             )
-        # what the file holds and is not used is said in one line
-        said: list[str] = []
-        gaussians = imported(form.reader)(data, said)
-        if said:
-            logger.warning("%s: %s", path, printable("; ".join(dict.fromkeys(said))))
+        # what the file holds and is not used is notes in one line
+        notes: list[str] = []
+        gaussians = imported(form.reader)(data, notes)
+        if notes:
+            logger.warning("%s: %s", path, printable("; ".join(dict.fromkeys(notes))))
         if y_up:
             return _between_worlds(gaussians, form)
         return gaussians
@@ -310,16 +310,16 @@ def _written() -> Formats[ExportFormat]:
     return EXPORTS.where(lambda each: not each.mesh)
 
 
-def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], said: list[str]) -> Gaussians:
+def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], notes: list[str]) -> Gaussians:
     """Returns Gaussians made of the arrays of a file: means, quaternions (wxyz), scales, opacities,
     colors and perhaps harmonics, in this order, each under its name in the file.
 
     Gaussians with a number that is not finite are left out, and a line with their count is appended
-    to `said`.
+    to `notes`.
 
     Raises: InvalidFileError if no Gaussian is left, or for numbers out of range.
     """
-    arrays = _finite(arrays, said)
+    arrays = _finite(arrays, notes)
     count = len(next(iter(arrays.values())))
     fields = ("means", "quats", "scales", "opacities", "colors", "harmonics")
     shapes = ((3,), (4,), (3,), (), (3,), (None, 3))
@@ -331,9 +331,9 @@ def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], said: list[str]) ->
     return Gaussians(**{name: from_host(array, jnp.float32) for name, array in values.items()})
 
 
-def _finite(arrays: Mapping[str, np.ndarray], said: list[str]) -> Mapping[str, np.ndarray]:
+def _finite(arrays: Mapping[str, np.ndarray], notes: list[str]) -> Mapping[str, np.ndarray]:
     """Returns the rows of the arrays that are finite in all of them, also when rounded to float32.
-    A line with the count of the others is appended to `said`.
+    A line with the count of the others is appended to `notes`.
     """
     count = len(next(iter(arrays.values())))
     keep = np.ones(count, bool)
@@ -352,7 +352,7 @@ def _finite(arrays: Mapping[str, np.ndarray], said: list[str]) -> Mapping[str, n
     if not keep.any():
         raise InvalidFileError(f"{', '.join(bad)}: none of {count:,} Gaussians has finite numbers")
     left_out = count - int(keep.sum())
-    said.append(f"{left_out:,} of {count:,} Gaussians are left out: {', '.join(bad)}: not finite")
+    notes.append(f"{left_out:,} of {count:,} Gaussians are left out: {', '.join(bad)}: not finite")
     return {name: array[keep] for name, array in arrays.items()}
 
 

@@ -35,9 +35,9 @@ COLUMNS = 64
 """Rows of harmonics that stand side by side in their picture."""
 
 
-def read_sog(data: bytes, said: list[str]) -> Gaussians:
+def read_sog(data: bytes, notes: list[str]) -> Gaussians:
     """Returns the Gaussians in the bytes of a bundle. Lines about what is left out are appended to
-    `said`.
+    `notes`.
 
     Raises: InvalidFileError; for damaged files also other errors.
     """
@@ -53,7 +53,9 @@ def read_sog(data: bytes, said: list[str]) -> Gaussians:
             raise InvalidFileError(f"{META}: version {found}, expected {VERSION}: {convert}")
         model = meta.get("model", USUAL)
         if model != USUAL:
-            said.append(f"model {shown(model)} is not applied (SplatConfig.antialiased draws such)")
+            notes.append(
+                f"model {shown(model)} is not applied (SplatConfig.antialiased draws such)"
+            )
         # one pixel of a picture holds one Gaussian
         count = _whole(meta.get("count"), "count")
         check_limit("gaussians", count, "Gaussians")
@@ -78,7 +80,7 @@ def read_sog(data: bytes, said: list[str]) -> Gaussians:
         raise InvalidFileError(
             f"quats: expected alpha from {FIRST_PLACE} on, got {quats[:, 3].min()}"
         )
-    return loaded(arrays | harmonics, said)
+    return loaded(arrays | harmonics, notes)
 
 
 def _root(archive: zipfile.ZipFile) -> str:

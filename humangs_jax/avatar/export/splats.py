@@ -111,17 +111,17 @@ def write_ply(
     replace_file(path, lambda temporary: content.write(str(temporary)))
 
 
-def read_ply(data: bytes, said: list[str]) -> Gaussians:
+def read_ply(data: bytes, notes: list[str]) -> Gaussians:
     """Returns the Gaussians in the bytes of a `.ply`. Lines about unused properties are appended to
-    `said`.
+    `notes`.
 
     Raises: InvalidFileError; for damaged numbers also other errors.
     """
     elements = _elements(data)
-    said += _unused(elements)
+    notes += _unused(elements)
     vertex = elements.get("vertex", {})
     if "chunk" in elements:
-        return _unpacked(elements["chunk"], vertex, elements.get("sh", {}), said)
+        return _unpacked(elements["chunk"], vertex, elements.get("sh", {}), notes)
     arrays = {
         "x, y, z": _columns(vertex, *"xyz"),
         "rot_*": _columns(vertex, *(f"rot_{i}" for i in range(4))),
@@ -132,7 +132,7 @@ def read_ply(data: bytes, said: list[str]) -> Gaussians:
     if FILTER in vertex:
         fused = _fused(arrays["scale_*"], arrays["opacity"], _columns(vertex, FILTER))
         arrays["scale_*"], arrays["opacity"] = fused
-    return loaded(arrays | _harmonics(vertex), said)
+    return loaded(arrays | _harmonics(vertex), notes)
 
 
 def _fused(
@@ -199,9 +199,9 @@ def _harmonics(
     return {"f_rest_*": rest.reshape(len(rest), 3, count // 3).swapaxes(1, 2)}
 
 
-def _unpacked(chunk: Columns, vertex: Columns, sh: Columns, said: list[str]) -> Gaussians:
+def _unpacked(chunk: Columns, vertex: Columns, sh: Columns, notes: list[str]) -> Gaussians:
     """Returns the Gaussians of a compressed `.ply` of PlayCanvas. Lines about what is left out are
-    appended to `said`.
+    appended to `notes`.
     """
     words = {name: _columns(vertex, f"packed_{name}", dtype=np.uint32)[:, 0] for name in WORDS}
     bits = {
@@ -235,7 +235,7 @@ def _unpacked(chunk: Columns, vertex: Columns, sh: Columns, said: list[str]) -> 
         "opacity": bits["color"][:, 3],
         "packed_color": between(colors, *"rgb") if "min_r" in chunk else colors,
     }
-    return loaded(arrays | _harmonics(sh, REST), said)
+    return loaded(arrays | _harmonics(sh, REST), notes)
 
 
 _ELEVEN = [(21, 11), (11, 10), (0, 11)]
@@ -366,9 +366,9 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     write_bytes(path, rows[order].tobytes())
 
 
-def read_splat(data: bytes, said: list[str]) -> Gaussians:
+def read_splat(data: bytes, notes: list[str]) -> Gaussians:
     """Returns the Gaussians in the bytes of a `.splat`. Lines about what is left out are appended
-    to `said`.
+    to `notes`.
 
     Raises: InvalidFileError.
     """
@@ -386,7 +386,7 @@ def read_splat(data: bytes, said: list[str]) -> Gaussians:
         "opacity": rgba[:, 3],
         "color": rgba[:, :3],
     }
-    return loaded(arrays, said)
+    return loaded(arrays, notes)
 
 
 # Checkpoints of gsplat's trainer (https://github.com/nerfstudio-project/gsplat,
@@ -397,9 +397,9 @@ def read_splat(data: bytes, said: list[str]) -> Gaussians:
 SPLATS = "splats"
 
 
-def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
+def read_checkpoint(data: bytes, notes: list[str]) -> Gaussians:
     """Returns the Gaussians in the bytes of a gsplat checkpoint. Lines about what is left out are
-    appended to `said`.
+    appended to `notes`.
 
     Raises: InvalidFileError; for damaged files also other errors.
     """
@@ -448,7 +448,7 @@ def read_checkpoint(data: bytes, said: list[str]) -> Gaussians:
         )
     if functions:
         arrays[f"{SPLATS}.shN"] = tensor("shN", functions, 3)
-    return loaded(arrays, said)
+    return loaded(arrays, notes)
 
 
 # `.glb`: glTF 2.0 with KHR_gaussian_splatting
@@ -524,9 +524,9 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     writer.write(path, document)
 
 
-def read_glb(data: bytes, said: list[str]) -> Gaussians:
+def read_glb(data: bytes, notes: list[str]) -> Gaussians:
     """Returns the Gaussians in the bytes of a `.glb`, those of each node moved by its transform.
-    Lines about what is left out are appended to `said`.
+    Lines about what is left out are appended to `notes`.
 
     Raises: InvalidFileError; for damaged numbers also other errors.
     """
@@ -556,13 +556,13 @@ def read_glb(data: bytes, said: list[str]) -> Gaussians:
     check_limit("gaussians", sum(counts), "Gaussians")
     spaces = {shown(part["extensions"][EXTENSION].get("colorSpace", SRGB)) for part, _ in placed}
     if spaces != {shown(SRGB)}:
-        said.append(
+        notes.append(
             f"colors of {', '.join(sorted(spaces))} are taken as they are: images of them have"
             " these colors, too"
         )
-    said += _other_parts(placed)
+    notes += _other_parts(placed)
     # all parts become one set of Gaussians, in one space
-    parts = [_part(content, binary, part["attributes"], place, said) for part, place in placed]
+    parts = [_part(content, binary, part["attributes"], place, notes) for part, place in placed]
     if len({None if part.harmonics is None else part.harmonics.shape[1] for part in parts}) > 1:
         raise InvalidFileError("parts with harmonics of different degrees: expected one degree")
     return jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *parts)
@@ -589,7 +589,7 @@ def _part(
     binary: bytes,
     attributes: dict[str, int],
     place: Float[np.ndarray, "4 4"],
-    said: list[str],
+    notes: list[str],
 ) -> Gaussians:
     def array(name: str) -> np.ndarray:
         if name not in attributes:
@@ -606,7 +606,7 @@ def _part(
     )
     if count:
         arrays["SH"] = np.stack([array(name) for name in COEFFICIENTS[:count]], axis=1)
-    gaussians = loaded(arrays, said)
+    gaussians = loaded(arrays, notes)
     if np.array_equal(place, np.eye(4)):
         return gaussians
     return factored(

@@ -170,24 +170,24 @@ def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g
 # --------------------------------------------------------------------------------------------------
 
 
-def read_spz(data: bytes, said: list[str]) -> Gaussians:
+def read_spz(data: bytes, notes: list[str]) -> Gaussians:
     """Returns the Gaussians in the bytes of a `.spz`. Lines about what is left out are appended to
-    `said`.
+    `notes`.
 
     Raises: InvalidFileError; for damaged files also the errors of gzip and zstd.
     """
     if data.startswith(b"NGSP"):
-        header, parts = _with_table(data, said)
+        header, parts = _with_table(data, notes)
     else:
         header, parts = _of_gzip(data)
     # what is in the file and not used
     if header.flags & ANTIALIASED:
-        said.append(
+        notes.append(
             "trained antialiased, as Mip-Splatting does; drawn without that it looks thicker from"
             " afar"
         )
     if header.flags & MORE_BEHIND and header.version < WITH_TABLE:
-        said.append("records of other programs at its end are not used")
+        notes.append("records of other programs at its end are not used")
     count, version = header.count, header.version
     # each part holds one property of all Gaussians
     positions, opacities, colors, scales, quats, harmonics = (
@@ -214,7 +214,7 @@ def read_spz(data: bytes, said: list[str]) -> Gaussians:
         arrays["sh"] = (
             harmonics.reshape(count, COUNTS[header.degree], 3) / np.float32(HARMONIC_STEPS) - 1
         )
-    return loaded(arrays, said)
+    return loaded(arrays, notes)
 
 
 def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header:
@@ -258,12 +258,12 @@ def _check_size(size: int, header: _Header, more: bool = False) -> None:
         )
 
 
-def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
+def _with_table(data: bytes, notes: list[str]) -> tuple[_Header, list[bytes]]:
     """Returns the header and the six arrays of a file of version 4.
 
     The table must fit the file and the number of Gaussians before anything is unpacked, so that
     nothing becomes larger than it may. Lines about records that are not used are appended to
-    `said`.
+    `notes`.
     """
     header = _checked_header(data, (WITH_TABLE,), len(data))
     begin = HEADER.size + TABLE_PLACE.size
@@ -276,7 +276,7 @@ def _with_table(data: bytes, said: list[str]) -> tuple[_Header, list[bytes]]:
             f"table of {header.streams} streams at {place:,}: expected it within {len(data):,}"
             " bytes"
         )
-    said += _records(data[begin:place])
+    notes += _records(data[begin:place])
     rows = list(TABLE_ROW.iter_unpack(data[place:end]))
     sizes = [header.count * width for width in header.widths]
     filled = [size for size in sizes if size]

@@ -271,8 +271,8 @@ def import_calibration(
     warnings += about_masks
     named_masks, used = _mask_line(calibration, masks, photos)
     if named_masks is not None:
-        told = notes if used else warnings
-        told.append(named_masks)
+        lines = notes if used else warnings
+        lines.append(named_masks)
     if cameras > 1 and frames == len(photos) > 1:
         warnings.append(_no_common_frame(calibration))
     names = names_from_paths([photo.key + ".png" for photo in photos])
@@ -291,7 +291,7 @@ def import_calibration(
             f"the person is cut off at the border of {few(cut, 1)}: what is beyond is unknown"
         )
     centers = "whole numbers (0.5 added to cx and cy)" if pixel_centers == "integer" else "+0.5"
-    said = f"{calibration.format} ({calibration.file}): {calibration.convention}"
+    convention = f"{calibration.format} ({calibration.file}): {calibration.convention}"
     return ImportReport(
         out=out,
         cameras=cameras,
@@ -304,7 +304,7 @@ def import_calibration(
         heic=heic,
         masks=photos[0].mask is not None,
         checks=checks,
-        read_as=f"read as: {said}; {up} up; {scale:g} m per unit; pixel centres at {centers}",
+        read_as=f"read as: {convention}; {up} up; {scale:g} m per unit; pixel centres at {centers}",
         notes=tuple(notes),
         warnings=(*checks.warnings, *warnings),
         unused=tuple(unused_photos(photos, images, calibration)),

@@ -172,10 +172,10 @@ def named_after(temporary: Path, folder: Path) -> Generator[None]:
     try:
         yield
     except ValueError as error:
-        said = str(error)
-        if str(temporary) not in said:
+        message = str(error)
+        if str(temporary) not in message:
             raise
-        raise CaptureError("", "", said.replace(str(temporary), str(folder))) from error
+        raise CaptureError("", "", message.replace(str(temporary), str(folder))) from error
 
 
 def _moments(
@@ -228,7 +228,7 @@ def frame_times(path: Path, seconds: float | None = None) -> Float[np.ndarray, "
         lines = _finished(path, [*command, "-f", "null", "-"]).decode(errors="replace")
         found = re.findall(r"^frame:.*pts_time:(\S+)", lines, re.MULTILINE)
         if not found:
-            raise _said(path, b"")
+            raise _ffmpeg_error(path, b"")
         return np.asarray([float(each) if each != "NOPTS" else np.nan for each in found])
 
 
@@ -314,7 +314,7 @@ def _frame_size(path: Path, shown: _Shown) -> tuple[int, int]:
         [*_ffmpeg(path, filters), "-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "pipe:1"],
     )
     if not first:
-        raise _said(path, b"")
+        raise _ffmpeg_error(path, b"")
     with image_in(first) as image:
         return image.size
 
@@ -475,8 +475,8 @@ def _small_frames(
         command += ["-f", "rawvideo", "-pix_fmt", pixels, "pipe:1"]
         size = w * h * (1 if pixels == "gray" else 3)
         with (
-            tempfile.TemporaryFile() as said,
-            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=said) as process,
+            tempfile.TemporaryFile() as output,
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=output) as process,
         ):
             assert process.stdout is not None
             # a video that does not end is stopped by the clock, and one of too many pixels while it
@@ -491,8 +491,8 @@ def _small_frames(
                     yield np.frombuffer(data, np.uint8).reshape(h, w, -1)
                     data = process.stdout.read(size)
                 if process.wait():
-                    said.seek(0)
-                    raise _said(path, said.read())
+                    output.seek(0)
+                    raise _ffmpeg_error(path, output.read())
             finally:
                 clock.cancel()
                 process.kill()
@@ -557,7 +557,7 @@ def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int
     table.unlink(missing_ok=True)
     count = sum(1 for _ in folder.iterdir())
     if not count:
-        raise _said(path, b"")
+        raise _ffmpeg_error(path, b"")
     return count
 
 
@@ -571,10 +571,10 @@ def _finished(path: Path, command: Sequence[str], folder: Path | None = None) ->
             f"its frames take more than {_LONGEST_SECONDS:,} seconds: expected a shorter video"
         ) from None
     if done.returncode:
-        raise _said(path, done.stderr)
+        raise _ffmpeg_error(path, done.stderr)
     return done.stdout
 
 
-def _said(path: Path, text: bytes) -> ValueError:
-    said = " ".join(text.decode(errors="replace").split()) or "no frame"
-    return ValueError(said.replace(f"file:{path.resolve()}", path.name))
+def _ffmpeg_error(path: Path, text: bytes) -> ValueError:
+    message = " ".join(text.decode(errors="replace").split()) or "no frame"
+    return ValueError(message.replace(f"file:{path.resolve()}", path.name))

@@ -445,8 +445,8 @@ def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str
             single.append(str(frame))
     if single:
         frames, each = ("frame", "") if len(single) == 1 else ("frames", "each ")
-        told = f"{each}seen by one view: distance and height are hardly determined"
-        yield f"{frames} {few(single)}: {told}"
+        effect = f"{each}seen by one view: distance and height are hardly determined"
+        yield f"{frames} {few(single)}: {effect}"
 
 
 def _motion_warnings(

@@ -102,7 +102,7 @@ def in_order(detections: Detections, count: int) -> Detections:
     warnings = detections.warnings
     usual = known and best == 0 and count == 25
     if not usual:
-        warnings = (*warnings, _said(order, known, count))
+        warnings = (*warnings, _order_note(order, known, count))
 
     # the points of the body in the order of the set, and the hands behind them
     rows = [order.points.index(name) for name in order.set.names[:count]]
@@ -113,7 +113,7 @@ def in_order(detections: Detections, count: int) -> Detections:
     return dataclasses.replace(detections, set=order.set, images=tuple(images), warnings=warnings)
 
 
-def _said(order: Order, known: bool, count: int) -> str:
+def _order_note(order: Order, known: bool, count: int) -> str:
     if known:
         return f"{count} points in the order of {order.name}, by where they lie"
     others = " or ".join(each.name for each in _ORDERS[count] if each is not order)

@@ -245,8 +245,8 @@ def _video_subject(
         shown += [(frame, number) for frame in usable & set(masked)]
     missing = {reason: number for reason, number in missing.items() if number}
     if not shown:
-        told = ", ".join(f"{reason}: {number}" for reason, number in missing.items())
-        raise CaptureError(name, "", f"no photo with a mask and a pose ({told or 'no cameras'})")
+        reasons = ", ".join(f"{reason}: {number}" for reason, number in missing.items())
+        raise CaptureError(name, "", f"no photo with a mask and a pose ({reasons or 'no cameras'})")
     # frame after frame, so that the poses are read in their order
     frames, owners = np.asarray(sorted(shown), np.int32).T
 
