@@ -1,1 +1,3 @@
-"""Reconstruct, animate, light, frames, layers, videos; `export`: a table of formats."""
+"""Avatars: reconstruction, animation, light, frames, layers and videos. `export` has the table of
+formats.
+"""

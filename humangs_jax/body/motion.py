@@ -1,4 +1,4 @@
-"""Motions: one body pose per frame, of SMPL-X's joints or those of another body."""
+"""Motions of a body: one pose per frame, for the joints of SMPL-X or of another body."""
 
 import functools
 from collections.abc import Sequence
@@ -17,28 +17,31 @@ from humangs_jax.geometry.axes import UPRIGHT, upright_matrix
 from humangs_jax.io.reading import check_limit
 
 PELVIS = np.array([0.0, -0.35, 0.0])
-"""Where SMPL-X's root joint (and the shipped body's) is in T-pose, metres: worlds are turned about
-it. Other bodies are off by a constant, which `grounded` removes."""
+"""Position of the root joint of SMPL-X and of the shipped body in T-pose, metres. Worlds are turned
+about this point. The root of another body lies elsewhere, which shifts its motion by a constant
+that `grounded` removes.
+"""
 
 
 @pytree_dataclass
 class Motion:
-    """Poses over time."""
+    """Poses of a body over time."""
 
     rotations: Float[Array, "m j 3"]
-    """Axis-angle of each joint relative to its parent, radians."""
+    """Axis-angle of each joint relative to its parent, (m, j, 3), radians."""
     translations: Float[Array, "m 3"]
-    """Translation in each frame, metres, applied last."""
+    """Translation in each frame, applied last, (m, 3), metres."""
     fps: float = static_field(default=DEFAULT_FPS)
     """Frames per second."""
     expressions: Float[Array, "m e"] | None = None
-    """Coefficients of expressions, mostly in [0, 1]; None: nothing is known of the face."""
+    """Coefficients of expressions, (m, e), mostly in [0, 1]. None: nothing is known of the face."""
     expression_names: tuple[str, ...] = static_field(default=())
-    """Which expressions these are, such as ARKit's "jawOpen"."""
+    """Names of the expressions, such as ARKit's "jawOpen"."""
 
     def pose(self, frame: int, expression_names: Sequence[str] = ()) -> BodyPose:
-        """Returns one frame, with its expression for a face that has these expressions
-        (`avatar.expression_names`).
+        """Returns the pose of one frame. expression_names: expressions of the face that will move
+        (`avatar.expression_names`). The pose has coefficients for them if the motion has any of
+        them.
         """
         faces = self.expressions_of(expression_names)
         expression = None
@@ -48,7 +51,7 @@ class Motion:
         return BodyPose(*pose, expression)
 
     def part(self, frames: slice) -> "Motion":
-        """Returns some of the frames, at the same rate."""
+        """Returns the motion of some of the frames, at the same rate."""
         faces = None
         if self.expressions is not None:
             faces = taken(self.expressions, frames)
@@ -60,8 +63,8 @@ class Motion:
         )
 
     def expressions_of(self, names: Sequence[str]) -> Float[Array, "m e"] | None:
-        """Returns the coefficients of a face that has these expressions, 0 where the motion says
-        nothing; None if it has none of them.
+        """Returns the coefficients for a face with these expressions, (m, e). They are 0 for
+        expressions that the motion does not have. Returns None if it has none of them.
         """
         own = self.expression_names
         if self.expressions is None or not set(names) & set(own):
@@ -72,10 +75,11 @@ class Motion:
         return known[:, np.asarray(index)]
 
     def at_rate(self, fps: float | int) -> "Motion":
-        """Returns the motion at another frame rate, between two frames interpolated: rotations on
-        the shortest way, positions linearly.
+        """Returns the motion at another frame rate. Between two frames, rotations are interpolated
+        on the shortest way, and positions and expressions linearly. fps: frames per second.
 
-        Raises: ValueError for a rate that is not positive, or more frames than the limit.
+        Raises: ValueError if the rate is not positive, or if there would be more frames than the
+        limit.
         """
         if not (np.isfinite(fps) and fps > 0):
             raise ValueError(f"fps: expected a positive number of frames per second, got {fps}")
@@ -108,19 +112,22 @@ def _between(
     next_translations: Float[Array, "m 3"],
     share: Float[Array, " m"],
 ) -> tuple[Float[Array, "m j 3"], Float[Array, "m 3"]]:
-    """Returns frames between frames; where the share is 0, the frame itself."""
+    """Returns frames that lie between frames and the next ones, by the share of the next one, (m,),
+    0 to 1. Where the share is 0, it is the frame itself.
+    """
     turned = quaternion.interpolate(rotations, next_rotations, share[:, None])
     moved = translations + share[:, None] * (next_translations - translations)
     return jnp.where(share[:, None, None] > 0, turned, rotations), moved
 
 
 def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion:
-    """Moves a motion by a constant so that the person starts at x = z = 0 and, at its lowest,
-    stands on y = 0.
+    """Moves a motion by a constant so that the person starts at x = z = 0, and stands on y = 0
+    where the person is lowest.
 
     Arguments:
-        rest, parents: of the body that will move. Its lowest joint is asked, and as far below it as
-        in T-pose is the sole.
+        rest: vertices and joints at rest of the body that will move. The lowest joint of the motion
+        decides the height. The sole is as far below it as it is below the lowest joint in T-pose.
+        parents: parents of the joints of that body.
     """
     moved = _on_the_floor(rest, parents, motion.rotations, motion.translations)
     return replace(motion, translations=moved)
@@ -133,7 +140,7 @@ def _on_the_floor(
     rotations: Float[Array, "m j 3"],
     translations: Float[Array, "m 3"],
 ) -> Float[Array, "m 3"]:
-    """Returns the translations of `grounded`."""
+    """Returns the translations that `grounded` gives to the motion, (m, 3), metres."""
     transforms = jax.vmap(joint_transforms, in_axes=(None, None, 0, 0))
     transforms = transforms(rest.joints, parents, rotations, translations)
     joints = transform.apply(transforms, rest.joints)
@@ -148,8 +155,8 @@ def turned_upright(
     up: str,
     pelvis: Float[np.ndarray, "3"] = PELVIS,
 ) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]:
-    """Poses and positions in a world turned so that the axis `up` becomes +y. pelvis: the root
-    joint in T-pose, metres.
+    """Turns a world so that its axis `up` becomes +y. Returns the rotations and translations of the
+    poses in the turned world. pelvis: root joint in T-pose, (3,), metres.
     """
     if up == "y":
         return rotations, translations

@@ -1,3 +1,3 @@
-"""Array types and axes, configurations with ranges and JSON, registries, checks of arguments,
-compiling, processes.
+"""The core: array types and axes, configurations with ranges and JSON, registries, checks of
+arguments, compilation, processes.
 """

@@ -1,6 +1,4 @@
-"""Faults of published versions of JAX that change numbers in silence, and how a process avoids
-them.
-"""
+"""Works around faults of published versions of JAX that silently change numbers."""
 
 import os
 import sys
@@ -8,19 +6,22 @@ import warnings
 from importlib.metadata import PackageNotFoundError, version
 
 WRONG_SUMS = "0.10.2"
-"""The version of jaxlib that computes wrong sums on CPUs. A vmapped product of a small matrix and a
-vector, then summed, is wrong in thousands of rows from 32,769 rows on
-(https://github.com/jax-ml/jax/issues/39103). 0.10.1 and 0.11.1 and later compute it right."""
+"""The version of jaxlib that computes wrong sums on CPUs. The sum of a vmapped product of a small
+matrix and a vector is wrong in thousands of rows, from 32,769 rows on
+(https://github.com/jax-ml/jax/issues/39103). 0.10.1, and 0.11.1 and later, compute it right.
+"""
 RIGHT_SUMS = "--xla_cpu_experimental_ynn_fusion_type=-LIBRARY_FUSION_TYPE_REDUCE"
-"""The flag of XLA that cures it: sums are not given to the library YNNPACK. It costs no time."""
+"""The flag of XLA that avoids the fault, because sums then do not go to the library YNNPACK. It
+costs no time.
+"""
 
 
 def avoid_wrong_sums() -> None:
-    """Set the flag that jaxlib 0.10.2 needs to compute right sums on CPUs.
+    """Sets the flag that jaxlib 0.10.2 needs to compute right sums on CPUs.
 
-    `import humangs_jax` calls it. XLA reads its flags when the first array is made: if that has
-    happened, a warning says what to do. Other versions of jaxlib, and a flag of the user for the
-    same option, are left alone.
+    `import humangs_jax` calls it. XLA reads its flags when the first array is made. If that has
+    happened already, a warning says what to do. Nothing is changed for other versions of jaxlib, or
+    if the user has set this flag.
     """
     try:
         installed = version("jaxlib")
@@ -41,6 +42,6 @@ def avoid_wrong_sums() -> None:
 
 
 def _has_started() -> bool:
-    """Says whether JAX has started a backend in this process."""
+    """Returns whether JAX has started a backend in this process."""
     bridge = sys.modules.get("jax._src.xla_bridge")
     return bridge is not None and bool(getattr(bridge, "_backends", {}))

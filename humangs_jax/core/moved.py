@@ -1,4 +1,4 @@
-"""Modules that have moved are still imported under the names that they had, with a warning."""
+"""Lets modules that have moved be imported under their old names, with a warning."""
 
 import importlib
 import sys
@@ -19,11 +19,13 @@ MOVED = {
     "humangs_jax.fitting": "humangs_jax.capture.fitting",
     "humangs_jax.people": "humangs_jax.synthetic",
 }
-"""New names of modules and packages by their old ones, the longest first."""
+"""New names of modules and packages by their old names. A longer old name comes before a shorter
+one with the same beginning.
+"""
 
 
 def new_name(name: str) -> str | None:
-    """Returns the name that a module has now, by its old one; None for what has not moved.
+    """Returns the present name of a module, given its old name; None for a name that has not moved.
 
     Examples:
         >>> new_name("humangs_jax.people.bank")
@@ -36,7 +38,9 @@ def new_name(name: str) -> str | None:
 
 
 class _MovedModules:
-    """Finds modules by their old names: the same modules, imported once."""
+    """Import hook that finds modules by their old names. It gives the same module objects as the
+    new names, so that each is imported once.
+    """
 
     def __init__(self) -> None:
         self._specs: dict[str, Any] = {}
@@ -44,15 +48,15 @@ class _MovedModules:
     def find_spec(
         self, name: str, path: Any = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Returns a spec that leads to the module of today; None for every other name."""
+        """Returns a spec that leads to the module under its new name; None for every other name."""
         if not name.startswith("humangs_jax.") or new_name(name) is None:
             return None
         return ModuleSpec(name, self)  # ty: ignore[invalid-argument-type]
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        """Imports the module of today.
+        """Imports the module under its new name, and warns about the old one.
 
-        Raises: ModuleNotFoundError by its new name if there is none.
+        Raises: ModuleNotFoundError, with the new name, if there is no such module.
         """
         new = str(new_name(spec.name))
         module = importlib.import_module(new)
@@ -62,12 +66,12 @@ class _MovedModules:
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """Runs nothing again; the module keeps the spec of its new name."""
+        """Does not run the module again, and gives it the spec of its new name."""
         old = getattr(module.__spec__, "name", "")
         module.__spec__ = self._specs.pop(old, module.__spec__)
 
 
 def find_moved_modules() -> None:
-    """Make the old names known to `import`."""
+    """Registers the import hook for old names. A second call has no effect."""
     if not any(isinstance(finder, _MovedModules) for finder in sys.meta_path):
         sys.meta_path.insert(0, _MovedModules())

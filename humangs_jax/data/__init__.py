@@ -1,3 +1,3 @@
-"""Captures, network inputs, masks; tables of the formats that are read; `loading`, `datasets`,
-`preprocess`.
+"""Data: captures, network inputs, masks, and tables of the formats that are read. The packages are
+`loading`, `datasets` and `preprocess`.
 """

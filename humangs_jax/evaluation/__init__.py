@@ -1,1 +1,1 @@
-"""Protocols, cases, scores, the report."""
+"""Evaluation: protocols, cases, scores, and the report."""

@@ -1,1 +1,3 @@
-"""Quaternions (wxyz), 3x3 SVD, transforms, `Camera` and its lenses, Plücker rays, meshes."""
+"""Geometry: quaternions (wxyz), axes, transforms, `Camera` with its lenses, Plücker rays,
+meshes.
+"""

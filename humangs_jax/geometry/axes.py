@@ -1,4 +1,4 @@
-"""Axes of a world by name: which one is up, and the rotation that makes it +y."""
+"""Axes of a world by name: finds which one points up, and the rotation that turns it to +y."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,30 +15,32 @@ UPRIGHT = {
     "x": (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)),
     "-x": (np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)),
 }
-"""The rotation (quaternion, wxyz) that turns the named axis to +y."""
+"""The rotation that turns the named axis to +y, as a quaternion (wxyz)."""
 CLEARLY_UP = 0.5
-"""Mean cosine between a person's own up and an axis from which on the person stands along that
-axis.
+"""Least mean cosine between the up direction of a person's pelvis and an axis of the world at which
+the person stands along that axis.
 """
 
 
 def upright_matrix(up: str) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation that turns the named axis to +y: a matrix of 0 and +-1."""
+    """Returns the rotation that turns the named axis to +y, a matrix of 0 and +-1, (3, 3)."""
     return np.asarray(quaternion.to_matrix(jnp.asarray(UPRIGHT[up])), np.float64).round()
 
 
 def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
-    """Returns the name of the axis that a vector points along most, and its component there."""
+    """Returns the name of the axis along which a vector points most, and the size of its component
+    there.
+    """
     axis = int(np.argmax(np.abs(direction)))
     sign = "-" if direction[axis] < 0 else ""
     return sign + "xyz"[axis], float(np.abs(direction[axis]))
 
 
 def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
-    """Returns the axis of the world that the pelvis's own y axis points along on average; None if
-    none is clear.
+    """Returns the axis of the world along which the y axis of the pelvis points on average. Returns
+    None if it points along none clearly.
 
-    Arguments: root: axis-angle of the pelvis in each frame.
+    Arguments: root: axis-angle of the pelvis in each frame, (m, 3), radians.
     """
     mean = Rotation.from_rotvec(np.asarray(root, np.float64)).as_matrix()[..., 1].mean(axis=0)
     axis, cosine = nearest_axis(mean)

@@ -1,1 +1,3 @@
-"""Untrusted files: read within one set of limits, refused in one line; atomic writes."""
+"""Files: reads untrusted files within one set of limits, refuses them in one line, and writes files
+whole or not at all.
+"""

@@ -1,4 +1,6 @@
-"""Photos that several steps of one command read are decoded once, within a bound on memory."""
+"""Keeps decoded photos, so that each photo that several steps of a command read is decoded once,
+within a limit of memory.
+"""
 
 import contextlib
 import contextvars
@@ -10,13 +12,17 @@ import numpy as np
 from humangs_jax.core.array_types import Float, UInt8
 
 WHOLE_LEVELS = np.float32(255)
-"""Pixels that are whole multiples of 1 / 255 are kept as bytes, others as they are."""
+"""Number of levels of a byte. Pixels that are whole multiples of 1 / 255 are kept as bytes, and
+others as they are.
+"""
 
 
 class Decoded:
-    """Keeps pixels by the content of their files, so that a copy of a photo counts as that photo.
-    Photos are read in turn, again and again: what comes first stays, and what does not fit any more
-    is left out.
+    """Keeps pixels by the content of their files, so that a copy of a photo counts as the same
+    photo. Photos are read in turn, again and again. So the first photos stay, and photos that no
+    longer fit are not kept.
+
+    Arguments: most: limit of memory, bytes.
     """
 
     def __init__(self, most: int) -> None:
@@ -24,8 +30,8 @@ class Decoded:
         self.pixels: dict[bytes, UInt8[np.ndarray, "h w c"] | Float[np.ndarray, "h w c"]] = {}
 
     def find(self, key: bytes) -> Float[np.ndarray, "h w c"] | None:
-        """Returns the pixels of a content, in an array that is the caller's; None if they are
-        not kept.
+        """Returns the pixels of a file's content, (h, w, c), 0 to 1, in a new array. Returns None
+        if they are not kept.
         """
         pixels = self.pixels.get(key)
         if pixels is None:
@@ -35,7 +41,7 @@ class Decoded:
         return pixels.copy()
 
     def keep(self, key: bytes, pixels: Float[np.ndarray, "h w c"]) -> None:
-        """Keep pixels if there is room."""
+        """Keeps the pixels of a file's content if there is room."""
         if key in self.pixels or pixels.size > self.room:
             return
         levels = np.rint(pixels * WHOLE_LEVELS).astype(np.uint8)
@@ -51,8 +57,9 @@ _current: contextvars.ContextVar[Decoded | None] = contextvars.ContextVar("decod
 
 @contextlib.contextmanager
 def decoded_once(most: int = 256 << 20) -> Generator[None]:
-    """Lets `io.images` decode each photo once within the block, as long as its pixels fit into
-    `most` bytes (by default those of twenty photos of four megapixels); then all are forgotten.
+    """Within the block, lets `io.images` decode each photo only once. Pixels are kept as long as
+    they fit into `most` bytes, by default those of twenty photos of four megapixels. At the end of
+    the block all are dropped.
     """
     token = _current.set(Decoded(most))
     try:
@@ -62,17 +69,19 @@ def decoded_once(most: int = 256 << 20) -> Generator[None]:
 
 
 def forget_decoded() -> None:
-    """Free what has been kept, when no step that is left reads photos; none is kept any more."""
+    """Drops all kept pixels and keeps no more. For a time when no later step reads photos."""
     kept = _current.get()
     if kept is not None:
         kept.pixels, kept.room = {}, 0
 
 
 def kept_photos() -> Decoded | None:
-    """Returns what is kept at present; None outside of `decoded_once`."""
+    """Returns the store of decoded photos; None outside of `decoded_once`."""
     return _current.get()
 
 
 def content_key(data: bytes, as_stored: bool = False) -> bytes:
-    """Returns the key of the pixels of a file. as_stored: whether its color profile is left out."""
+    """Returns the key of the pixels of a file. data: bytes of the file. as_stored: whether its
+    color profile is not applied.
+    """
     return hashlib.blake2b(data, salt=bytes([as_stored])).digest()

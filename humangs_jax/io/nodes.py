@@ -1,4 +1,4 @@
-"""Nodes of a glTF file: their tree, and where they lie at times of an animation.
+"""Reads the nodes of a glTF file: their tree, and their places at the times of an animation.
 
 https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#nodes-and-hierarchy
 """
@@ -13,20 +13,22 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.io.reading import InvalidFileError, shown
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
-"""What a track of an animation moves, and how many numbers a key has."""
+"""What a track of an animation can move, with the number of values in a key."""
 
 
 Nodes = list[dict[str, Any]]
 Track = tuple[Float[np.ndarray, " keys"], Float[np.ndarray, "keys c"], bool]
-"""Times, values, and whether a value stays until the next time."""
+"""Times in ascending order, values, and whether a value stays until the next time instead of being
+interpolated.
+"""
 Tracks = dict[tuple[int, str], Track]
-"""Tracks by node and path."""
+"""Tracks by number of the node and path, which is a key of `PATHS`."""
 
 
 def node_parents(nodes: Nodes) -> list[int]:
-    """Returns the parent of each node, -1 for roots.
+    """Returns the number of each node's parent, -1 for roots.
 
-    Raises: InvalidFileError for a node with two parents.
+    Raises: InvalidFileError for a child that is no node, or for a node with two parents.
     """
     parents = [-1] * len(nodes)
     for i, node in enumerate(nodes):
@@ -38,9 +40,9 @@ def node_parents(nodes: Nodes) -> list[int]:
 
 
 def with_ancestors(joints: Iterable[int], parents: Sequence[int]) -> list[int]:
-    """Returns the joints and the nodes above them, parents first.
+    """Returns the joints and all nodes above them, parents first.
 
-    Raises: InvalidFileError for nodes that are above themselves.
+    Raises: InvalidFileError if a node lies above itself.
     """
     order: list[int] = []
     placed: set[int] = set()
@@ -76,9 +78,10 @@ def world_matrices(
 
 
 def node_matrices(nodes: Nodes) -> list[Float[np.ndarray, "4 4"]]:
-    """Returns where the nodes of a GLB file lie when nothing moves.
+    """Returns the places of the nodes of a GLB file without animation, a matrix (4, 4) for each,
+    world from node.
 
-    Raises: InvalidFileError; what damaged numbers raise.
+    Raises: InvalidFileError. Damaged numbers may raise other errors.
     """
     parents = node_parents(nodes)
     world = world_matrices(
@@ -112,7 +115,7 @@ def _local(
 
 
 def _sampled(track: Track, times: Float[np.ndarray, " m"], path: str) -> Float[np.ndarray, "m c"]:
-    """Returns the values of a track at some times."""
+    """Returns the values of a track at some times, (m, c). path: what the track moves."""
     keys, values, stepped = track
     if stepped or len(keys) == 1:
         step = times[1] - times[0] if len(times) > 1 else 1.0

@@ -1,1 +1,1 @@
-"""Unreduced losses and their weights, SSIM, perceptual loss, LPIPS."""
+"""Losses before reduction and their weights, SSIM, the perceptual loss, LPIPS."""

@@ -1,1 +1,3 @@
-"""`humangs`, one module over exchangeable `parts`; presets, weights files, conversion."""
+"""The network: `humangs` is one module over exchangeable `parts`. Also presets, weights files, and
+conversion.
+"""

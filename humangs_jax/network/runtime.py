@@ -1,5 +1,5 @@
-"""How the network runs, which weights files do not record (`Runtime`), and what the weights were
-trained with.
+"""How the network runs (`Runtime`), which weights files do not record, and how its weights were
+trained (`Conventions`).
 """
 
 from typing import Any, ClassVar, Literal
@@ -24,7 +24,10 @@ AttentionKernel = Literal["xla", "cudnn", "chunked"]
 
 @configuration
 class Runtime:
-    """How the network runs. Raises: ValueError for values out of range."""
+    """How the network runs.
+
+    Raises: ValueError for values out of range.
+    """
 
     tokens: TokenSelection | None = knob(
         None,
@@ -32,7 +35,7 @@ class Runtime:
         gain="5 x in time at a foreground share of 0.2",
         measured="performance.md",
     )
-    """Patches that become tokens: "all", those that the "foreground" touches, or None: as the
+    """Patches that become tokens: "all", or those that the "foreground" touches. None: as the
     weights were trained.
     """
     token_capacity: CapacityOrAuto = knob(
@@ -41,17 +44,18 @@ class Runtime:
         gain="time and memory",
         measured="performance.md",
     )
-    """Slots for foreground tokens over all views, 0: room for all patches. `reconstruct` and
-    `stack_captures` fit it to the photos; in training it is for the largest number of photos, see
-    `training.forward.token_share`."""
+    """Number of slots for foreground tokens, over all views. 0: room for all patches. `reconstruct`
+    and `stack_captures` fit it to the photos. In training it is for the largest number of photos,
+    see `training.forward.token_share`.
+    """
     dtype: Literal["float32", "bfloat16", "float16"] = knob(
         "float32",
         cost="bfloat16: 1e-2 of relative error; float16: 1e-3, not for training",
         gain="time on accelerators; none on CPUs",
         measured="stability.md",
     )
-    """Type of the encoder's products; parameters, norms, softmax statistics and the decoder stay
-    float32 at least.
+    """Number type of the encoder's products. Parameters, norms, softmax statistics and the decoder
+    are float32 or wider.
     """
     attention: Literal["auto"] | AttentionKernel = knob(
         "auto",
@@ -66,24 +70,25 @@ class Runtime:
         gain="compile time on TPU and GPU",
         measured="performance.md",
     )
-    """Run the blocks as one compiled loop.
-
-    Their parameters are copied side by side in every call (12 layers of 768: 340 MB).
+    """Whether the blocks run as one compiled loop. Then their parameters are copied side by side in
+    every call (12 layers of 768: 340 MB).
     """
     remat: Literal["none", "full", "dots"] = knob(
         "none", cost="a third more arithmetic", gain="memory of training", measured="performance.md"
     )
-    """What a block recomputes in the backward pass instead of keeping it: nothing, all ("full"), or
-    all but the results of attention and of products with weights ("dots"). On a CPU only a `scan`
-    recomputes: XLA merges what is computed twice outside of loops."""
+    """What a block recomputes in the backward pass instead of keeping it: nothing ("none"),
+    everything ("full"), or everything but the results of attention and of products with weights
+    ("dots"). On a CPU this works only with `scan`, because outside of loops XLA merges what is
+    computed twice.
+    """
     max_edge_length: Edge | None = knob(
         None,
         cost="three times the Gaussians at 0.017",
         gain="detail where photos have more than the vertices of the body",
         measured="refinement.md",
     )
-    """Metres to which edges of the body are split beyond what the weights were trained with, None
-    for no more.
+    """Length to which edges of the body are split, beyond what the weights were trained with,
+    metres. None: no further splitting.
     """
     body_vertices: Vertices | None = knob(
         None,
@@ -91,16 +96,17 @@ class Runtime:
         gain="Gaussians and the time of a frame in proportion",
         measured="tradeoff.md",
     )
-    """Vertices to which the body is decimated, fewer than the weights were trained with, None for
-    no fewer. Gaussians shrink or grow with the distance between vertices, so that they cover as
-    much as before."""
+    """Number of vertices to which the body is decimated, fewer than the weights were trained with.
+    None: no further decimation. Gaussians shrink or grow with the distance between vertices, so
+    that they cover as much as before.
+    """
     image_size: InputSide | None = knob(
         None,
         cost="detail of the photos",
         gain="tokens grow with its square",
         measured="tradeoff.md",
     )
-    """Side of the photos in pixels, a multiple of the patch size; None: as the weights were
+    """Side of the photos, pixels, a multiple of the patch size. None: as the weights were
     trained.
     """
     crop: bool = knob(
@@ -109,7 +115,8 @@ class Runtime:
         gain="pixels of the person in place of background: 0.3 dB in the foreground on average",
         measured="evaluation.md",
     )
-    """Photos are cut to the square around the person's mask before they are brought to that size.
+    """Whether photos are cut to the square around the person's mask before they are resized to
+    `image_size`.
     """
     displacement: bool | None = knob(
         None,
@@ -117,18 +124,19 @@ class Runtime:
         gain="boundaries and hems of bodies that are a centimetre off, and skirts",
         measured="benchmarks/quality.md",
     )
-    """The body is moved to the edges of the masks first (`data.vertex_offsets`), for weights that
-    look at the pixels of the "person". None: where a part of it sticks out of the masks; True:
-    always, which costs PSNR where the body is right. False: never; a capture's own displacement,
-    which else comes first, and a skirt (`data.skirt`) are left out, too."""
+    """Whether the body is first moved to the edges of the masks (`data.vertex_offsets`), for
+    weights whose `pixels` are "person". None: if a part of it sticks out of the masks. True:
+    always, which costs PSNR where the body is right. False: never, and a displacement of the
+    capture, which otherwise comes first, and a skirt (`data.skirt`) are left out, too.
+    """
     raster: RasterConfig = RasterConfig()
     """Buffers of the mesh rasterizer."""
     renamed_fields: ClassVar[dict[str, str]] = {"longest_edge": "max_edge_length"}
 
     @property
     def compute_dtype(self) -> Any:
-        """The dtype of Linen modules; None promotes inputs and parameters, so that float64
-        stays.
+        """The dtype of Linen modules. None for float32: modules then promote inputs and parameters,
+        so that float64 stays.
         """
         if self.dtype == "float32":
             return None
@@ -137,9 +145,9 @@ class Runtime:
 
 @configuration
 class Conventions:
-    """What the weights were trained with.
+    """How the weights were trained.
 
-    No tensor's shape depends on it; with other values the results are worse.
+    No shape of a tensor depends on it, but with other values the results are worse.
     """
 
     image_size: InputSide = knob(
@@ -148,49 +156,58 @@ class Conventions:
         gain="tokens grow with its square, attention with its fourth power",
         measured="performance.md",
     )
-    """Side of the photos, pixels (the network takes any multiple of the patch size)."""
+    """Side of the photos, pixels. The network takes any multiple of the patch size."""
     tokens: TokenSelection = "all"
     """Patches that became tokens."""
     pixels: Literal["all", "person"] = "all"
-    """Pixels that count. For "person" only those of the masks do, where there are masks. No photo
-    then sees the body where it covers the background, and Gaussians of vertices that lie off the
-    person in all photos are dropped."""
+    """Pixels that count. "person": only those of the masks, if there are masks. A photo then does
+    not see the body where the body covers background, and Gaussians of vertices that lie off the
+    person in all photos are dropped.
+    """
     position_map: Literal["plain", "gouraud"] = "plain"
-    """Shading of the position maps."""
+    """How position maps are drawn: canonical positions that are interpolated ("plain"), or lit by a
+    point light as in the release ("gouraud").
+    """
     ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
-    """Unit of the rays' origins. The release divides camera centres by s, and the ray origins taken
-    from them once more, so that the moments of its rays ("twice_normalized") fit no camera."""
+    """How ray origins are normalized: divided by the unit of the subject once or twice. The release
+    divides camera centres by the unit, and divides ray origins that it takes from them once more
+    ("twice_normalized"), so that the moments of its rays fit no camera.
+    """
     pool: Literal["visible", "all"] = "visible"
-    """Views that are averaged for a vertex: those that see it (paper) or all (release)."""
+    """Views that are averaged for a vertex: those that see the vertex (paper), or all (release)."""
     pixel_grid: PixelGrid = "half_pixel"
     """How pixels become positions on feature maps, see `network.maps`."""
     skinning: Literal["affine", "rotation"] = "affine"
-    """How the Gaussians are posed."""
+    """How Gaussians are posed, see `rendering.gaussians.skin_gaussians`."""
     rendering: Literal["exact", "inria"] = "exact"
-    """How they are drawn."""
+    """Conventions with which Gaussians are drawn, a name of
+    `rendering.splat_config.SPLAT_PRESETS`.
+    """
     leg_blend_distance: Length | None = None
-    """Gaussians between the legs farther than this from their vertex, metres, move with both
-    (`body.model.blend_leg_weights`);
-    None: all with their vertex."""
+    """Gaussians between the legs that are farther than this from their vertex, metres, move with
+    both legs (`body.model.blend_leg_weights`). None: all move with their vertex.
+    """
     light: bool = False
-    """Other poses are drawn in the light of the photos (`Avatar.light`)."""
+    """Whether other poses are drawn in the light of the photos (`Avatar.light`)."""
     pixel_footprint: Length | None = None
-    """Metres that a pixel of the training images shows of the person, if their low-pass is to be
-    part of the scales (`Gaussians.pixel_footprint`); None: it stays with the renderer."""
+    """Size that a pixel of the training images has on the person, metres, if the low-pass of the
+    images is to be part of the scales (`Gaussians.pixel_footprint`). None: only the renderer
+    applies a low-pass.
+    """
     body_vertices: Vertices | None = knob(
         None,
         cost="detail of the body",
         gain="Gaussians, reads and decoding in proportion",
         measured="evaluation.md",
     )
-    """Number of vertices to which bodies are decimated; None: they are not."""
+    """Number of vertices to which bodies are decimated. None: no decimation."""
     max_edge_length: Edge | None = knob(
         None,
         cost="Gaussians grow as it shrinks",
         gain="detail where the body is coarse",
         measured="evaluation.md",
     )
-    """Metres to which their edges are split afterwards; None: they are not."""
+    """Length to which edges of bodies are split after decimation, metres. None: no splitting."""
     renamed_fields: ClassVar[dict[str, str]] = {
         "skinning_reach": "leg_blend_distance",
         "low_pass": "pixel_footprint",

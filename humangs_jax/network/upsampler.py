@@ -1,11 +1,14 @@
-"""Feature aggregation: token maps of several depths fused and upsampled four times.
+"""Fuses token maps of several depths, and upsamples the result four times.
 
-With hidden width H: each map 1x1 -> H, concatenated, 3x3 -> 2H, norm, LeakyReLU; then twice a 4x4
-transposed convolution of stride 2 (2H -> H, H -> H/2), norm, LeakyReLU, and a 3x3 convolution (->
-H, norm, LeakyReLU; -> out, bare). Maps are (v, h, w, c).
+With hidden width H, each map goes through a 1x1 convolution to H channels. All are concatenated,
+and a 3x3 convolution to 2H, norm and LeakyReLU follow. Then a 4x4 transposed convolution of stride
+2 is applied twice, from 2H to H and from H to H/2, each with norm and LeakyReLU. The first is
+followed by a 3x3 convolution to H with norm and LeakyReLU, the second by a 3x3 convolution to the
+output, without them. Maps are (v, h, w, c).
 
-The last convolution is half of that arithmetic, and only body vertices read what it computes, from
-positions between its pixels. So the reader applies it to what the vertices have read of its input.
+The last convolution takes half of the arithmetic, and only body vertices read its output, at
+positions between its pixels. So it is not in this module. The reader applies it to values of its
+input that the vertices have read.
 """
 
 from typing import Annotated, Any, Literal
@@ -21,8 +24,8 @@ from humangs_jax.network.maps import Convolution
 
 SLOPE = 0.2
 MOMENTUM = 0.9
-"""Momentum of the running statistics; torch calls it 0.1, and takes the unbiased variance: larger
-by one part in v * h * w.
+"""Momentum of the running statistics, which is 0.1 in torch's notation. torch takes the unbiased
+variance, which is larger by one part in v * h * w.
 """
 KAIMING = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 
@@ -32,21 +35,25 @@ class UpsamplerConfig:
     """Sizes of the upsampler."""
 
     hidden: Annotated[int, Range(2, 16_384)] = 256
-    """H, the hidden width."""
+    """Width H of the hidden layers."""
     features: Literal["intermediate", "final"] = "intermediate"
-    """All four depths are aggregated ("intermediate"), or the last is upsampled alone ("final", an
-    ablation).
+    """Whether all four depths are fused ("intermediate"), or only the last one is upsampled
+    ("final", an ablation).
     """
 
 
 class UpConvolution(nn.Module):
-    """4x4 transposed convolution, stride 2, padding 1: (v, h, w, c) -> (v, 2h, 2w, features).
+    """4x4 transposed convolution with stride 2 and padding 1, from (v, h, w, c) to
+    (v, 2h, 2w, features).
 
-    An output row 2i needs input rows i - 1, i under kernel rows 3, 1, and row 2i + 1 needs rows i,
-    i + 1 under 2, 0; the same for columns. So one matrix product of all 2x2 neighbourhoods to 4 *
-    features channels, interleaved, does it: as a dilated convolution (or a 2x2 one) its backward
-    pass on a CPU is twenty times slower. The kernel (4, 4, c, features) is stored unflipped: input
-    pixel (i, j) adds kernel[a, b] to output pixel (2i + a - 1, 2j + b - 1).
+    Output row 2i needs input rows i - 1 and i, under kernel rows 3 and 1. Output row 2i + 1 needs
+    input rows i and i + 1, under kernel rows 2 and 0. The same holds for columns. So it is computed
+    as one matrix product of all 2x2 neighbourhoods to 4 * features channels, which are then
+    interleaved. As a dilated convolution, or a 2x2 one, its backward pass on a CPU would take
+    twenty times as long.
+
+    The kernel (4, 4, c, features) is stored unflipped: input pixel (i, j) adds kernel[a, b] to
+    output pixel (2i + a - 1, 2j + b - 1).
     """
 
     features: int
@@ -75,7 +82,9 @@ class UpConvolution(nn.Module):
 
 
 class Upsampler(nn.Module):
-    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, hidden / 2), input of the last convolution."""
+    """Upsamples token maps, each (v, h, w, d), to (v, 4h, 4w, hidden / 2). The result is the input
+    of the last convolution.
+    """
 
     config: UpsamplerConfig
     """Sizes of the upsampler."""
@@ -93,7 +102,8 @@ class Upsampler(nn.Module):
     ) -> Float[Array, "v 4*h 4*w c"]:
         """Fuses and upsamples the maps.
 
-        present: views that count in the batch statistics; None: all.
+        train: whether norms use the statistics of the batch. present: views that count in these
+        statistics, (v,); None: all.
         """
         hidden = self.config.hidden
         mask = None

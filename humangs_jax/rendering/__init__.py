@@ -1,3 +1,3 @@
-"""`projection`, `tiling`, `compositing`, composed in `splatting`, the API; `reference` is the
-oracle; `mesh`: rasterizer, position maps.
+"""Rendering: `splatting`, the API, composes `projection`, `tiling` and `compositing`. `reference`
+is a plain renderer to compare with. `mesh` has the rasterizer and position maps.
 """

@@ -1,4 +1,4 @@
-"""Front-to-back compositing of splats over tiles, and its hand-written gradient.
+"""Composites splats front to back over tiles, with a gradient written by hand.
 
 A splat is a row of numbers (see `splat_rows.pack_splats`). With d the offset of a pixel centre from
 the splat's centre,
@@ -8,27 +8,28 @@ the splat's centre,
     T_k+1   = T_k (1 - alpha_k),  w_k = alpha_k T_k
     C       = sum_k w_k f_k
 
-where r^T r = conic / 2 and conic = cov2d^-1, T_0 = 1 before the nearest splat, and f_k holds the
+Here r^T r = conic / 2 and conic = cov2d^-1. T_0 = 1 before the nearest splat, and f_k holds the
 splat's features, rgb and z.
 
 A pixel ends before the first splat whose T_k+1 <= transmittance_stop. The exponent is a sum of
-squares, hence never positive, and accurate for needles, where the conic's quadratic form cancels.
+squares. Hence it is never positive, and it is accurate for needles, for which the quadratic form of
+the conic loses digits.
 
-Gradient, front to back as well: with g the cotangent of C, g_T that of the final T, and Q = g . C +
-g_T T_end,
+The gradient runs front to back as well. With g the cotangent of C, g_T that of the final T, and Q =
+g . C + g_T T_end,
 
-    dL/dalpha_k = (g . f_k) T_k - (Q - sum_{i <= k} w_i g . f_i) / (1 - alpha_k),
+    dL/dalpha_k = (g . f_k) T_k - (Q - sum_{i <= k} w_i g . f_i) / (1 - alpha_k)
 
-so that the backward pass saves nothing per pair: it recomputes alpha and T in the same order with
-the same decisions. alpha enters as log alpha, whose derivative is dL/dalpha_k alpha_k =: e_k, 0
-where alpha was clamped or skipped; the sums over pixels of e_k (1, dx, dy, dx^2, dx dy, dy^2) give
-the gradient of a splat's shape. They are matrix products with monomials about the tile's centre
-that are moved to the splat's centre afterwards.
+So nothing has to be saved for each pair: the backward pass recomputes alpha and T in the same order
+with the same decisions. alpha enters as log alpha. Its derivative is e_k := dL/dalpha_k alpha_k,
+and 0 where alpha was clamped or skipped. The sums of e_k (1, dx, dy, dx^2, dx dy, dy^2) over pixels
+give the gradient of a splat's shape. They are computed as matrix products with monomials about the
+tile's centre, and moved to the splat's centre afterwards.
 
-The order of the work is a schedule: `compositing_on_cpu` and `compositing_on_accelerators`. Pixels
-and splats are taken relative to a tile's centre, so that nothing is lost in float32 however large
-the image. `vmap` joins the tiles of all images into one list of tiles: a batch is one call with
-more tiles, not a loop of masked loops.
+A schedule decides the order of the work: `compositing_on_cpu` or `compositing_on_accelerators`.
+Pixels and splats are measured from a tile's centre, so that float32 loses nothing however large the
+image is. `vmap` joins the tiles of all images into one list of tiles. So a batch is one call with
+more tiles, not a loop over images.
 """
 
 import functools
@@ -49,7 +50,9 @@ from humangs_jax.rendering.splat_rows import R00, R01, R11, Composited
 from humangs_jax.rendering.tiling import TileGrid, TileLists
 
 Schedule = Callable[[TileGrid, SplatConfig], Callable[..., PyTree]]
-"""Makes the function that draws, or its gradient, for one grid and one configuration."""
+"""Type of the functions that make a drawing function, or its gradient, for one grid and one
+configuration.
+"""
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
@@ -87,7 +90,9 @@ composite.defvjp(_composite_fwd, _composite_bwd)
 def _scheduled(
     on_cpu: Schedule, elsewhere: Schedule, grid: TileGrid, config: SplatConfig, *arrays: Array
 ) -> PyTree:
-    """Calls what one of two schedules makes: the platform decides when the program is compiled."""
+    """Calls the function that one of two schedules makes. The platform for which the program is
+    compiled decides which one.
+    """
     return lax.platform_dependent(
         *arrays, cpu=on_cpu(grid, config), default=elsewhere(grid, config)
     )
@@ -96,8 +101,8 @@ def _scheduled(
 def _splat_gradients(
     splats: Float[Array, "g width"], sums: Float[Array, "g width"]
 ) -> Float[Array, "g width"]:
-    """Returns the gradient of the rows from their sums over pixels: of e (1, dx, dy, dx^2, dx dy,
-    dy^2), and of w g.
+    """Returns the gradient of the rows, (g, width), from sums over pixels: sums of e (1, dx, dy,
+    dx^2, dx dy, dy^2) in the first six columns, and of w g in the others.
     """
     r00, r01, r11 = (splats[:, i] for i in (R00, R01, R11))
     e, ex, ey, exx, exy, eyy = sums[:, :6].T

@@ -1,22 +1,22 @@
-"""Compositing for accelerators: few fat steps, see `rendering.compositing`.
+"""Composites on accelerators, in few large steps. For symbols see `rendering.compositing`.
 
-A sequential step costs microseconds there, however little it does. So every list is cut into
-chunks of `CHUNK` splats, and the chunks of ALL lists of all images of a batch, B at once, become
-arrays (B, k, p) (p pixels of a tile). The chain over a list becomes products, because along it
-only log T accumulates:
+There, a sequential step costs microseconds, however little it does. So every list is cut into
+chunks of `CHUNK` splats. B chunks, from all lists of all images of a batch, are processed at once
+as arrays (B, k, p), with k splats of a chunk and p pixels of a tile. Along a list only log T
+accumulates, so the chain over the list becomes products:
 
     log T_j = (sum of the log(1 - alpha) before the chunk)
               + (strict lower triangle (k, k)) @ log(1 - alpha)
 
-The sum before the chunk is a product, too, with the 0-1 matrix (B, B) of "earlier chunk of the
-same list". To it comes the sum of the list that runs on from the step before, which is all that
-steps hand on. The sums over i <= j of w_i g . f_i of the backward pass are formed by the same two
-products.
+The sum before the chunk is a product, too, with the 0-1 matrix (B, B) that says "earlier chunk of
+the same list". The first list of a step may continue from the step before. Its sum so far is added,
+and is all that steps hand on. The backward pass forms the sums over i <= j of w_i g . f_i by the
+same two products.
 
-T agrees with the other schedule's to |log T| eps. Past the stop log T can rise by rounding only
-while alpha is 0; hence the final log T sums log(1 - alpha) over the splats before the stop. A NaN
-spreads to other tiles of its step. Sums over splats are scattered: on a GPU the last bit may
-differ between runs.
+T agrees with that of the other schedule to |log T| eps. Behind the stop, rounding can raise log T
+only while alpha is 0. Hence the final log T is the sum of log(1 - alpha) over the splats before the
+stop. A NaN spreads to other tiles of its step. Sums over splats are scattered, so on a GPU the last
+bit may differ between runs.
 """
 
 import functools
@@ -55,8 +55,8 @@ STEP_BYTES = 64 << 20
 them.
 """
 STEP_CHUNKS = 2048
-"""Largest B. The product over earlier chunks costs 2 B / k flops per pair, at this B half of the
-triangular product.
+"""Largest B, the number of chunks in a step. The product over earlier chunks costs 2 B / k flops
+per pair, at this B half of the triangular product.
 """
 
 
@@ -104,23 +104,29 @@ class _Tail(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """What one step of the forward pass hands to the next."""
+    """The values that one step of the forward pass hands to the next."""
 
     sums: Float[Array, "t n+1 p"]
-    """Sums of w f, and behind them the sum of log(1 - alpha), which is the final log T."""
+    """Sums of w f, and after them the sum of log(1 - alpha), which is the final log T, (t, n + 1,
+    p).
+    """
     lengths: Int[Array, " t"]
-    """Number of splats of each list that have been read, as in `Composited`."""
+    """Number of splats of each list that have been read, (t,), as in `Composited`."""
     peaks: Float[Array, " g"]
-    """The largest w of each splat so far, as in `Composited`."""
+    """The largest w of each splat so far, (g,), as in `Composited`."""
     medians: Float[Array, "t p"] | None
-    """The smallest z so far behind which T is one half or less, as in `Composited`."""
+    """The smallest z so far behind which T is one half or less, (t, p), as in `Composited`. None if
+    it is not wanted.
+    """
     tail: _Tail
-    """log T of the last list."""
+    """Sum of log(1 - alpha) of the last list so far, which may continue in the next step."""
 
 
 @functools.lru_cache
 def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Composited]:
-    """Returns a function with the arguments and results of that of `forward_by_blocks`."""
+    """Returns a drawing function with the arguments and results of the function that
+    `forward_by_blocks` returns.
+    """
     log_stop = _log_stop(config)
 
     @joined_over_batch
@@ -174,7 +180,9 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Comp
 
 @functools.lru_cache
 def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Array]:
-    """Returns a function with the arguments and results of that of `backward_by_blocks`."""
+    """Returns a gradient function with the arguments and results of the function that
+    `backward_by_blocks` returns.
+    """
     log_stop = _log_stop(config)
 
     @joined_over_batch
@@ -225,8 +233,8 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
 
 
 def _most_chunks(capacity: int, t: int) -> int:
-    """Returns the largest number of chunks of t lists: full chunks, and one chunk per list that is
-    not full.
+    """Returns the largest number of chunks that t lists can have: full chunks, and for each list
+    one that is not full. capacity: number of items of all lists.
     """
     return capacity // CHUNK + min(t, capacity)
 
@@ -240,20 +248,22 @@ def _chunks_per_step(grid: TileGrid, dtype: np.dtype | type, capacity: int, t: i
 
 
 def _log_stop(config: SplatConfig) -> float:
-    """Returns the log T at which a pixel ends."""
+    """Returns the logarithm of T at which a pixel ends."""
     if config.transmittance_stop > 0:
         return math.log(config.transmittance_stop)
     return -math.inf
 
 
 def _slice(chunks: Chunks, i: Array | int, step: int) -> Chunks:
-    """Returns the chunks of step i."""
+    """Returns the chunks of step i. step: number of chunks in a step."""
     parts = (lax.dynamic_slice_in_dim(v, i * step, step) for v in chunks[:-1])
     return Chunks(*parts, chunks.steps)
 
 
 def _fading(raw: Array, config: SplatConfig) -> tuple[Array, Array]:
-    """Returns alpha and log(1 - alpha), which is finite."""
+    """Returns alpha and log(1 - alpha), both with the shape of `raw`. The logarithm is always
+    finite.
+    """
     alpha = visible_alpha(raw, config)
     # -1000 stands for log 0 where 1 - alpha_max rounds to 0: its exp is 0, 0 times it is no NaN
     return alpha, jnp.maximum(jnp.log1p(-alpha), -1e3)
@@ -262,8 +272,9 @@ def _fading(raw: Array, config: SplatConfig) -> tuple[Array, Array]:
 def _sums_before(
     x: Float[Array, "b k p"], tiles: Int[Array, " b"], tail: _Tail
 ) -> tuple[Array, Array]:
-    """Returns sums of x (B, k, p) along its lists: the sum of all that comes before each chunk, (B,
-    p), and the sum from there to before each splat, (B, k, p).
+    """Returns two sums of x (B, k, p) along its lists: the sum of everything before each chunk,
+    (B, p), and the sum from the beginning of the chunk up to before each splat, (B, k, p). tail:
+    the sum of the list that continues from the step before.
     """
     b, k, _ = x.shape
     triangle = jnp.broadcast_to(jnp.asarray(np.tri(k, k=-1), x.dtype), (b, k, k))
@@ -275,10 +286,10 @@ def _sums_before(
 
 
 def _tail(tiles: Array, before: Array, through: Array) -> _Tail:
-    """Returns the sum of the step's last list, up to the end of its chunk in this step."""
+    """Returns the sum of the step's last list, up to the end of its last chunk in this step."""
     return _Tail(tiles[-1], before[-1] + through[-1, -1])
 
 
 def _no_tail(t: int, p: int, dtype: np.dtype | type) -> _Tail:
-    """Returns the tail for the first step. Its tile is that of no list."""
+    """Returns the tail for the first step. Its tile number t belongs to no list."""
     return _Tail(jnp.asarray(t, jnp.int32), jnp.zeros(p, dtype))

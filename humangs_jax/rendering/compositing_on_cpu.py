@@ -1,11 +1,13 @@
-"""Compositing for CPUs: small blocks of tiles, see `rendering.compositing`.
+"""Composites on CPUs, in small blocks of tiles. For symbols see `rendering.compositing`.
 
-Tiles come by falling list length in blocks of `config.block`; a block takes its lists in chunks
-until the longest list ends or all its pixels have. A chunk's arrays (block, chunk, pixels) stay
-in the cache. Its chain of splats is unrolled, once for each array that the loop carries: XLA
-makes ONE kernel of each, which runs the chain in registers. Once a pixel has stopped, the loop
-carries -T, which keeps the final T. Compile with `core.processes.compiler_options`: sharing small
-kernels out over threads costs more than it gains, and the barriers have to be kept.
+Tiles are ordered by list length, longest first, and taken in blocks of `config.block`. A block
+takes its lists in chunks until the longest list ends or all its pixels have ended. The arrays of a
+chunk (block, chunk, pixels) stay in the cache. The chain of splats in a chunk is unrolled, once for
+each array that the loop carries. XLA makes ONE kernel of each chain, which runs in registers. Once
+a pixel has ended, the loop carries -T, which keeps the final T.
+
+Compile with `core.processes.compiler_options`. To share small kernels out over threads would cost
+more than it gains, and the barriers have to be kept.
 """
 
 import functools
@@ -39,7 +41,7 @@ class _Chain(NamedTuple):
     chunk: Array | int
     """Number of the chunk."""
     transmittance: Float[Array, "block p"]
-    """T in front of the chunk; -T once a pixel has ended."""
+    """T in front of the chunk, (block, p). It is -T once a pixel has ended."""
     features: Float[Array, "block n p"]
     """Sum of w f so far."""
     lengths: Int[Array, " block"]
@@ -47,14 +49,18 @@ class _Chain(NamedTuple):
     live: Bool[Array, " block"]
     """Whether a list has splats left and some pixel of its tile has not ended."""
     peaks: Float[Array, " g"]
-    """The largest w of each splat so far, in all blocks."""
+    """The largest w of each splat so far, in all blocks, (g,)."""
     medians: Float[Array, "block p"] | None
-    """The smallest z so far behind which T is one half or less."""
+    """The smallest z so far behind which T is one half or less, (block, p). None if it is not
+    wanted.
+    """
 
 
 @functools.lru_cache
 def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Composited]:
-    """Returns the function (splats, items, starts, counts) -> `Composited`."""
+    """Returns the drawing function (splats, items, starts, counts) -> `Composited`. Tile t has the
+    splats `items[starts[t] : starts[t] + counts[t]]`.
+    """
     block, k, stop = config.block, config.chunk, config.transmittance_stop
 
     @joined_over_batch
@@ -113,7 +119,7 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Comp
             final = jnp.abs(chain.transmittance)  # the sign marked pixels that had ended
 
             def placed(of_all, of_block):
-                """Puts the block's tiles at their places among all tiles; padding is dropped."""
+                """Puts the block's tiles at their places among all tiles, and drops padding."""
                 return of_all.at[tile].set(of_block, mode="drop", unique_indices=True)
 
             medians = None
@@ -153,11 +159,11 @@ class _BackwardChain(NamedTuple):
 
 @functools.lru_cache
 def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Array]:
-    """Returns the function (splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums over
-    pixels for each splat, (g, 6 + n).
+    """Returns the gradient function (splats, items, starts, lengths, g (t, n, p), Q (t, p)) -> sums
+    over pixels for each splat, (g, 6 + n).
 
-    Columns: the moments of e = dL/d log alpha about the splat's centre (1, dx, dy, dx^2, dx dy,
-    dy^2), then the gradient of the features, the sums of w g.
+    The first six columns are the moments of e = dL/d log alpha about the splat's centre: 1, dx, dy,
+    dx^2, dx dy, dy^2. The others are the gradient of the features, the sums of w g.
     """
     block, k, stop = config.block, config.chunk, config.transmittance_stop
 
@@ -220,5 +226,5 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
 
 
 def _lists_of(tile: Array, starts: Array, counts: Array) -> Iterator[Array]:
-    """Returns starts and lengths of the lists of some tiles. Padding has empty lists."""
+    """Returns the starts and lengths of the lists of some tiles. Padding tiles get empty lists."""
     return (v.at[tile].get(mode="fill", fill_value=0) for v in (starts, counts))

@@ -1,11 +1,11 @@
-"""Every knob of the splatting renderer, in one frozen dataclass, and its presets. For JAX it is a
+"""All settings of the splatting renderer in one frozen dataclass, and its presets. For JAX it is a
 pytree without leaves.
 
 Two rasterizers set the conventions: INRIA's diff-gaussian-rasterization
 (https://github.com/graphdeco-inria/diff-gaussian-rasterization) and gsplat
-(https://github.com/nerfstudio-project/gsplat). Ours are gsplat's where they differ, except that
-nothing is cut at three standard deviations: a footprint ends where its alpha falls below
-`ALPHA_MIN`, so the image follows from the formula and not from a bounding box.
+(https://github.com/nerfstudio-project/gsplat). Where they differ, ours are those of gsplat, with
+one exception: nothing is cut at three standard deviations. A footprint ends where its alpha falls
+below `ALPHA_MIN`, so the image follows from the formula and not from a bounding box.
 """
 
 import dataclasses
@@ -57,35 +57,36 @@ INRIA have 0.99.
 """
 
 TRANSMITTANCE_STOP = 1e-4
-"""A pixel ends before the splat that would leave a transmittance T <= this. INRIA and gsplat have
-the same value.
+"""Least transmittance of a pixel. A pixel ends before the splat that would leave a transmittance T
+of this or less. INRIA and gsplat have the same value.
 """
 
 LARGEST_FOOTPRINT = 1e9
-"""Gaussians with a longer projected axis are not drawn, pixels. The fourth power of a longer axis
-could overflow float32.
+"""Longest axis of a projected Gaussian, pixels. Gaussians with a longer axis are not drawn, because
+its fourth power could overflow float32.
 """
 
 
 @jax.tree_util.register_static
 @configuration
 class SplatConfig:
-    """What is drawn, where footprints end, what is computed, in which buffers, on which schedule.
-    docs/knobs.md gives what each knob costs and gains.
+    """Settings that decide what is drawn, where footprints end, what is computed, how large buffers
+    are, and in which schedule the work is done. docs/knobs.md has the cost and the gain of each.
     """
 
     near: Annotated[float, Range(0, 1e6)] = NEAR
-    """Metres; nearer Gaussians are not drawn."""
+    """Gaussians whose centre is nearer than this are not drawn, metres."""
     eps2d: Annotated[float, Range(0, 1e6)] = EPS2D
-    """Pixels^2 added to the projected variances."""
+    """Variance that is added to projected variances, pixels^2."""
     antialiased: bool = False
-    """Opacities are dimmed by what these pixels^2 add to the footprint, so that what a Gaussian
-    weighs stays the same (gsplat's "antialiased"; Mip-Splatting's 2D filter). Gaussians with a
-    `pixel_footprint` are dimmed by theirs anyway."""
+    """Whether opacities are dimmed as the added variance enlarges the footprint, so that the total
+    weight of a Gaussian stays the same (gsplat's "antialiased"; Mip-Splatting's 2D filter).
+    Gaussians with a `pixel_footprint` are always dimmed, by their part.
+    """
     alpha_min: Annotated[float, Range(1e-12, 1)] = ALPHA_MIN
-    """Alphas below are skipped."""
+    """Smaller alphas are skipped."""
     alpha_max: Share = ALPHA_MAX
-    """Alphas are clamped to it."""
+    """Larger alphas are clamped to this."""
     transmittance_stop: Share = knob(
         TRANSMITTANCE_STOP,
         cost="55 dB at 0.001, 40 dB at 0.01",
@@ -94,23 +95,25 @@ class SplatConfig:
     )
     """A pixel ends before its transmittance would fall to this."""
     jacobian_margin: Spread | None = None
-    """None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat; of cameras
-    without lens.
+    """None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat. It applies to
+    cameras without lens.
     """
     normalize_quats: bool = True
-    """False: quaternions are not normalised, as in INRIA's rasterizer."""
+    """Whether quaternions are normalised. INRIA's rasterizer does not."""
     radius_sigma: Annotated[float, Range(1e-6, 100)] | None = knob(
         None,
         cost="61 dB at 2.5, 52 dB at 2, 46 dB at 1.5; splats are cut at tile borders",
         gain="14 %, 27 %, 35 % of the time",
         measured="performance.md",
     )
-    """Standard deviations at which footprints end; a splat is drawn on whole tiles, all that its
-    footprint meets. None: where alpha falls below alpha_min, so that nothing is lost. Smaller
-    values draw faster; the image then depends on tile_size."""
+    """Number of standard deviations at which footprints end. None: they end where alpha falls below
+    alpha_min, so that nothing is lost. Smaller values draw faster. A splat is drawn on all tiles
+    that its footprint meets, so with a number the image depends on tile_size.
+    """
     square: bool = False
-    """INRIA's footprint: the square around the splat whose half side is `radius_sigma` times the
-    larger standard deviation, rounded up to pixels, at tiles as INRIA counts them."""
+    """Whether footprints are those of INRIA: squares around the splat, on tiles as INRIA counts
+    them. Half a side is `radius_sigma` times the larger standard deviation, rounded up to pixels.
+    """
     visibility: bool = knob(
         False,
         cost="memory of one number a Gaussian",
@@ -122,9 +125,9 @@ class SplatConfig:
     )
     """Whether `Rendering.visibility` is computed."""
     means2d: bool = False
-    """Whether `Rendering.means2d`, centres on the image, is returned."""
+    """Whether `Rendering.means2d`, the centres on the image, is returned."""
     radii: bool = False
-    """Whether `Rendering.radii`, half the sides of the footprints, is computed."""
+    """Whether `Rendering.radii`, half the sides of footprints, is computed."""
     depth_sum: bool = False
     """Whether `Rendering.depth_sum`, gsplat's "D", is computed."""
     depth_median: bool = False
@@ -137,18 +140,18 @@ class SplatConfig:
         gain="memory, one compilation",
         measured="performance.md",
     )
-    """Room for (splat, tile) pairs. None: an eager call measures its need. A traced call (under
-    jit, grad or vmap) cannot, and takes `buffers.default_pairs(g, width, height)`; what does not
-    fit is counted in `Rendering.overflow`, and `plan_buffers` measures a capacity for such calls.
+    """Room for (splat, tile) pairs. None: an eager call measures how many it needs. A traced call
+    (under jit, grad or vmap) cannot measure, and takes `buffers.default_pairs(g, width, height)`.
+    Pairs that do not fit are counted in `Rendering.overflow`. `plan_buffers` measures the capacity
+    for traced calls.
     """
     max_rows: Capacity | None = knob(
         None, cost="as max_pairs", gain="a little time", measured="performance.md"
     )
-    """Room for (splat, row of tiles) pairs. None: as many as pairs, always enough in practice."""
+    """Room for (splat, row of tiles) pairs. None: as many as pairs, which is enough in practice."""
     warn_overflow: bool = False
-    """Traced calls log a warning whenever something did not fit.
-
-    It adds a callback to the program.
+    """Whether traced calls log a warning when something did not fit. It adds a callback to the
+    program.
     """
     tile_size: Annotated[int, Range(1, 4096)] = knob(
         8,
@@ -156,12 +159,17 @@ class SplatConfig:
         gain="8 is best on CPUs: 4 takes 2.3 x, 16 takes 1.3 x the time",
         measured="performance.md",
     )
-    """Pixels. From here on: the schedule, which changes the time, not the image (but for rounding).
+    """Side of a tile, pixels. This field and the next ones are the schedule. They change the time,
+    and the image only by rounding.
     """
     block: Chunk = 32
-    """Tiles that are composited together; on CPUs only. From 16 to 64 times differ by 4 %."""
+    """Number of tiles that are composited together, on CPUs only. From 16 to 64 times differ by 4
+    %.
+    """
     chunk: Chunk = 8
-    """Splats of a list taken at once; on CPUs only. From 4 to 16 times differ by 6 %."""
+    """Number of splats of a list that are taken at once, on CPUs only. From 4 to 16 times differ by
+    6 %.
+    """
 
     def __post_init__(self):
         if not self.alpha_min < self.alpha_max < 1:
@@ -199,13 +207,14 @@ SPLAT_PRESETS: Presets[SplatConfig] = Presets(
     },
     '; "as_trained" of Settings and FrameSettings is SPLAT_PRESETS[avatar.rendering]',
 )
-"""exact: every alpha of 1/255 and more, in float32. near_exact and fast: see docs/performance.md
-for their errors and gains. inria: the conventions of diff-gaussian-rasterization, which the
-published weights were trained with."""
+"""Presets by name. exact: draws every alpha of 1/255 and more, in float32. near_exact and fast: see
+docs/performance.md for their errors and gains. inria: the conventions of
+diff-gaussian-rasterization, with which the published weights were trained.
+"""
 
 
 def splat_config(config: SplatConfig | str) -> SplatConfig:
-    """Returns the preset of a name. A configuration is returned unchanged.
+    """Returns the preset with a name. A configuration is returned unchanged.
 
     Raises: ValueError for an unknown name.
     """
@@ -218,10 +227,12 @@ def splat_config(config: SplatConfig | str) -> SplatConfig:
 
 
 def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
-    """Returns the configuration with the conventions of drawing that weights record, "exact" or
-    "inria".
+    """Returns the configuration with the conventions that weights record for drawing. rendering:
+    "exact" or "inria".
 
-    It is returned as it is where it has none of the other conventions: other knobs are the user's.
+    The configuration is returned unchanged if it differs from the preset of the other name in all
+    of `jacobian_margin`, `normalize_quats` and `square`. Otherwise all fields in which the two
+    presets differ take the values of `rendering`. Other fields stay as the user has set them.
     """
     wanted, other = SPLAT_PRESETS["inria"], SPLAT_PRESETS["exact"]
     if rendering == "exact":

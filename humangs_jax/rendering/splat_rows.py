@@ -1,7 +1,7 @@
-"""Splats as rows of numbers: packed, taken in chunks from their lists, and their moments. Both
-schedules of compositing work with them.
+"""Stores splats as rows of numbers: packs them, takes them in chunks from their lists, and computes
+their moments. Both schedules of compositing use these functions.
 
-The formulas and the symbols are those of `rendering.compositing`.
+Formulas and symbols are those of `rendering.compositing`.
 """
 
 import functools
@@ -32,11 +32,13 @@ R11 = 4
 LOG_OPACITY = 5
 """Column with the logarithm of the opacity."""
 FEATURES = slice(6, None)
-"""Columns of red, green, blue, z, and any others: their number is static, XLA unrolls them."""
+"""Columns of red, green, blue, z, and any further features. Their number is static, because XLA
+unrolls them.
+"""
 Z = 9
-"""The column of z."""
+"""Column with z."""
 HALF = 0.5
-"""The transmittance at the median depth."""
+"""Transmittance at the median depth."""
 
 
 def pack_splats(
@@ -55,8 +57,8 @@ def pack_splats(
 
 
 class Composited(NamedTuple):
-    """What lists of splats look like: p pixels of each of t tiles, and what is known of each of g
-    splats.
+    """What compositing lists of splats gives: values at p pixels of each of t tiles, and values of
+    each of g splats.
     """
 
     features: Float[Array, "t n p"]
@@ -64,20 +66,22 @@ class Composited(NamedTuple):
     transmittance: Float[Array, "t p"]
     """The final T, (t, p); 1 where lists are empty."""
     lengths: Int[Array, " t"]
-    """How many splats of each list were read until all pixels of its tile had ended, (t,)."""
+    """Number of splats of each list that were read until all pixels of its tile had ended, (t,)."""
     peaks: Float[Array, " g"]
-    """The largest w of each splat, (g,); 0 unless `config.visibility`."""
+    """The largest w of each splat, (g,). 0 unless `config.visibility`."""
     medians: Float[Array, "t p"] | None
-    """The z of the splat at which T falls to one half, (t, p), metres; infinite where it never
-    does. Lists run front to back, so it is the smallest z behind which T is one half or less. None
-    unless `config.depth_median`."""
+    """The z of the splat at which T falls to one half, (t, p), metres. Infinite where it never
+    does. Lists run front to back, so this is the smallest z behind which T is one half or less.
+    None unless `config.depth_median`.
+    """
 
 
 def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """Under `vmap`, calls a function of (splats, items, starts, more per tile...) once, with the
-    tiles of all images.
+    """Wraps a function of (splats, items, starts, further arrays per tile...) so that `vmap` calls
+    it once, with the tiles of all images together.
 
-    It must return arrays per tile or per splat: they are cut into those of the images.
+    The function must return arrays per tile or per splat. They are divided among the images
+    afterwards.
     """
     function = jax.custom_batching.custom_vmap(function)
 
@@ -111,8 +115,8 @@ def take_chunk(
     """Takes the first k splats of each of b lists, `items[starts : starts + counts]`, which lie on
     `tiles`.
 
-    Returns their numbers (g past the end of a list), rows, centres from that of the tile, and raw
-    alphas (0 past the end).
+    Returns the numbers of the splats (g past the end of a list), their rows, their centres relative
+    to that of the tile, pixels, and raw alphas (0 past the end).
     """
     # numbers and rows of the splats
     slot = jnp.arange(k, dtype=jnp.int32)
@@ -152,7 +156,7 @@ def largest_weights(
 
 
 def visible_alpha(raw: Float[Array, "*b"], config: SplatConfig) -> Float[Array, "*b"]:
-    """Returns alpha for its raw value: clamped above, 0 if it is skipped."""
+    """Returns alpha for its raw value: at most `alpha_max`, and 0 below `alpha_min`."""
     return jnp.where(raw < config.alpha_min, 0.0, jnp.minimum(raw, config.alpha_max))
 
 
@@ -165,7 +169,7 @@ def monomials(grid: TileGrid, dtype: np.dtype | type) -> np.ndarray:
 def moments_about_splat(
     moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y: Float[Array, "*b"]
 ) -> Float[Array, "*b 6"]:
-    """Returns the moments of (pixel - splat) for those of (pixel - centre of the tile).
+    """Returns the moments of (pixel - splat), given those of (pixel - centre of the tile).
 
     x, y: (splat - centre of the tile), pixels.
     """
@@ -181,4 +185,4 @@ def moments_about_splat(
 
 
 product = functools.partial(jnp.matmul, precision=EXACT)
-"""Sums over pixels, as a matrix product."""
+"""Matrix product in full precision, for sums over pixels."""

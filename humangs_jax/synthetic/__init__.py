@@ -1,1 +1,1 @@
-"""People from seeds."""
+"""Synthetic people, made from seeds."""

@@ -1,1 +1,1 @@
-"""State, step, sharding, checkpoints, log, validation, loop, diagnosis."""
+"""Training: state, step, sharding, checkpoints, log, validation, loop, diagnosis."""

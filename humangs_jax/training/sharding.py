@@ -1,11 +1,11 @@
-"""How a run is divided among many devices: batches among all of them, the state among those along
-one axis of the mesh.
+"""Divides a run among many devices: each batch among all devices, and the state among the devices
+along one axis of the mesh.
 
-Data parallelism over both axes of the mesh ("data", "fsdp"); parameters, moments and averages are
-divided along "fsdp" and equal along "data". A step gathers the parameters once, works on its
-subjects, and sends every device the sum of its part of the gradient (ZeRO stage 3, Rajbhandari
-et al., 2020, https://arxiv.org/abs/1910.02054, with one gathering a step: the network is small
-beside what it computes).
+The mesh has the axes "data" and "fsdp". Data parallelism uses both. Parameters, moments and
+averages are divided along "fsdp" and equal along "data". A step gathers the parameters once, works
+on its subjects, and sends every device the sum of its part of the gradient. This is ZeRO stage 3
+(Rajbhandari et al., 2020, https://arxiv.org/abs/1910.02054), but with one gathering per step,
+because the network is small compared to what it computes.
 """
 
 import functools
@@ -22,16 +22,16 @@ from humangs_jax.training.state import TrainState
 
 AXES = ("data", "fsdp")
 SMALLEST_DIVIDED = 1 << 10
-"""Elements of the smallest array that is worth dividing: below, the messages cost more than the
-memory.
+"""Number of elements of the smallest array that is divided. For smaller ones messages cost more
+than the memory.
 """
 
 T = TypeVar("T")
 
 
 def training_mesh(fsdp: int | None = None, devices: Sequence[jax.Device] | None = None) -> Mesh:
-    """All devices (of all processes) as a mesh of `AXES`. fsdp: devices that share one copy of the
-    state; None: all.
+    """Returns a mesh of all devices (of all processes) with the axes `AXES`. fsdp: number of
+    devices that share one copy of the state; None: all. devices: None for `jax.devices()`.
 
     Raises: ValueError if fsdp does not divide the number of devices.
     """
@@ -46,8 +46,8 @@ def training_mesh(fsdp: int | None = None, devices: Sequence[jax.Device] | None 
 
 
 def divided_axis(shape: tuple[int, ...], parts: int) -> int | None:
-    """The axis of an array of the state along which it is divided: the longest that can be; None
-    for none.
+    """Returns the axis along which an array of the state is divided: the longest one that `parts`
+    divides. None if the array is not divided.
     """
     if np.prod(shape) < SMALLEST_DIVIDED or parts == 1:
         return None
@@ -56,7 +56,9 @@ def divided_axis(shape: tuple[int, ...], parts: int) -> int | None:
 
 
 def partition(tree: PyTree, mesh: Mesh) -> PyTree:
-    """PartitionSpec of every leaf of parameters, or of what has their shapes."""
+    """Returns the PartitionSpec of every leaf of parameters, or of another tree with their
+    shapes.
+    """
 
     def spec(leaf):
         axis = divided_axis(leaf.shape, mesh.shape["fsdp"])
@@ -68,7 +70,7 @@ def partition(tree: PyTree, mesh: Mesh) -> PyTree:
 
 
 def state_shardings(state: TrainState, mesh: Mesh) -> TrainState:
-    """NamedSharding of every leaf of a state; batch statistics are whole everywhere."""
+    """Returns the NamedSharding of every leaf of a state. Batch statistics are not divided."""
 
     def named(spec):
         return NamedSharding(mesh, spec)
@@ -81,18 +83,18 @@ def state_shardings(state: TrainState, mesh: Mesh) -> TrainState:
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
-    """Sharding of a batch: its first axis is divided among all devices."""
+    """Returns the sharding of a batch, whose first axis is divided among all devices."""
     return NamedSharding(mesh, PartitionSpec(AXES))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Sharding of arrays of which every device has a copy."""
+    """Returns the sharding of arrays of which every device has a copy."""
     return NamedSharding(mesh, PartitionSpec())
 
 
 def place(tree: T, shardings: PyTree) -> T:
-    """Equal host or local arrays of every process as global ones; `shardings`: a tree of them, or
-    one for all leaves.
+    """Makes global arrays from host or local arrays, which have to be equal in all processes.
+    shardings: a tree of shardings, or one for all leaves.
     """
     if isinstance(shardings, NamedSharding):
         shardings = jax.tree.map(lambda _: shardings, tree)
@@ -105,7 +107,8 @@ def place(tree: T, shardings: PyTree) -> T:
 
 
 def whole(tree: T, mesh: Mesh) -> T:
-    """Arrays of this process's default device equal to those that are divided among devices.
+    """Copies arrays that are divided among devices to this process's default device, as whole
+    arrays.
 
     All processes must call it.
     """
@@ -118,7 +121,9 @@ def _replicate(mesh: Mesh) -> Callable[[PyTree], PyTree]:
 
 
 def gather(params: PyTree, specs: PyTree) -> PyTree:
-    """Inside `shard_map`: whole parameters from this device's parts."""
+    """Gathers whole parameters from the parts on the devices. Only for use inside `shard_map`.
+    specs: PartitionSpec of every leaf.
+    """
 
     def one(part, spec):
         if len(spec):
@@ -129,7 +134,9 @@ def gather(params: PyTree, specs: PyTree) -> PyTree:
 
 
 def mean_parts(gradients: PyTree, specs: PyTree, mesh: Mesh) -> PyTree:
-    """Inside `shard_map`: this device's parts of the mean over all devices of whole gradients."""
+    """Averages whole gradients over all devices, and returns this device's part of the mean. Only
+    for use inside `shard_map`. specs: PartitionSpec of every leaf.
+    """
 
     def one(gradient, spec):
         if len(spec):
@@ -147,12 +154,16 @@ def join_processes(
     process_count: int | None = None,
     process_index: int | None = None,
 ) -> None:
-    """Become one of several processes; call it before anything else asks for devices.
+    """Makes this process one of several. Call it before anything else asks for devices.
 
-    Arguments: coordinator "host:port" of process 0, how many processes, which of them this is. All
-    None: as the cluster tells (SLURM, Open MPI, Kubernetes and TPU pods do, see
-    `jax.distributed.initialize`).
-    Raises: ValueError unless all or none are given, or where no cluster is recognised.
+    If all arguments are None, the cluster gives them (SLURM, Open MPI, Kubernetes and TPU pods do,
+    see `jax.distributed.initialize`).
+
+    Arguments:
+        coordinator: "host:port" of process 0.
+        process_count: number of processes.
+        process_index: index of this process.
+    Raises: ValueError if some are given and others are not, or if no cluster is recognised.
     """
     given = (coordinator, process_count, process_index)
     if None in given and any(value is not None for value in given):

@@ -1,8 +1,8 @@
-"""The tables of the formats in which avatars are exported for other programs (docs/export.md), and
-of the formats of videos.
+"""Tables of the formats in which avatars are exported for other programs (docs/export.md), and of
+the formats of videos.
 
-`gaussians` has the functions that read and write, `splats` and `spz` the formats of Gaussians,
-`mesh` those of the body.
+`gaussians` has the functions that read and write, `splats` and `spz` the formats of Gaussians, and
+`mesh` the formats of the body.
 """
 
 import dataclasses

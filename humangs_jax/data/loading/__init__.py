@@ -1,11 +1,11 @@
-"""The loader of batches. The people and views of a step are a pure function of (seed, step), so
-that a run that resumes sees the same batches.
+"""Makes batches. The people and views of a step are a pure function of (seed, step), so that a run
+that resumes sees the same batches.
 
-A `Source` has examples by number: `CaptureSource` (people on disk: capture folders, written
-synthetic sets, data sets), `GeneratedSource` (people made on the fly from keys) and `Mixture`
-(several of these by weight). `Loader` makes batches of the examples of one source. Each process
-makes the rows of its devices, some batches ahead of the loop. Several threads make examples in
-order, and one thread prepares the batches that are asked for next. Threads suffice, because
+A `Source` gives examples by number. `CaptureSource` has people on disk (capture folders, written
+synthetic sets, data sets), `GeneratedSource` people who are made on the fly from keys, and
+`Mixture` several sources by weight. `Loader` makes batches of the examples of one source. Each
+process makes the rows of its devices, some batches ahead of the loop. Several threads make examples
+in order, and one thread prepares the batches that are asked for next. Threads suffice, because
 decoding and jitted functions release the interpreter's lock.
 """
 
