@@ -1,5 +1,5 @@
-"""Images of an evaluation: the same views of many people, their faces, hands, hems and shoes;
-README's pictures.
+"""Draws the images of an evaluation, with the same views of many people and their faces, hands,
+hems and shoes, and the pictures of README.
 """
 
 import dataclasses
@@ -41,43 +41,43 @@ from humangs_jax.synthetic.subject import SPLITS, expressed_subject, make_subjec
 from humangs_jax.synthetic.writer import stand
 
 CROP = 0.75
-"""Share of the image's width that is shown: cameras keep the whole height of a person in a square
-frame.
-"""
+"""Share of the image's width that is shown. Images are square, and a person fills their height."""
 DETAILS = {
     "face": (("left_eye", "right_eye"), 0.3),
     "hand": (("left_middle1", "left_index1"), 0.3),
     "hem": (("left_hip", "left_knee"), 0.5),
     "shoe": (("left_ankle", "left_foot"), 0.36),
 }
-"""What is looked at closely: joints in whose middle it is, and the side of the square in metres."""
+"""{detail: (joints in whose middle it is, side of the square that shows it in metres)}."""
 DETAIL_PIXELS = 96
+"""Side of the picture of a detail."""
 
 
 def cropped(image: np.ndarray) -> np.ndarray:
+    """Returns the middle of an image, `CROP` of its width."""
     width = image.shape[1]
     left = round(0.5 * (1 - CROP) * width)
     return image[:, left : width - left]
 
 
 def frontal_view(photos: Capture, held_out: Capture, views: Sequence[int]) -> int:
-    """Which of these views looks in the direction of the first photo."""
+    """Returns the one of these views that looks most nearly in the direction of the first photo."""
     directions = np.asarray(held_out.cameras.cam_from_world)[list(views), 2, :3]
     return views[int(np.argmax(directions @ np.asarray(photos.cameras.cam_from_world)[0, 2, :3]))]
 
 
 def details(image: np.ndarray, capture: Capture, view: int) -> np.ndarray:
-    """Squares of an image of this view, (details, `DETAIL_PIXELS`, `DETAIL_PIXELS`, 3); white
-    beyond its border.
+    """Returns the details of an image of this view, (details, `DETAIL_PIXELS`, `DETAIL_PIXELS`, 3).
+
+    They are white beyond the border of the image.
     """
     body, camera = capture.body, capture.cameras[view]
     pose = capture.pose(int(np.asarray(capture.frames)[view]))
     joints = pose_body(body, shape_body(body, jnp.asarray(capture.betas)), pose).joints
     squares = []
     for names, side in DETAILS.values():
-        (x, y), depth = project(
-            camera, joints[np.asarray([body.joint_names.index(name) for name in names])].mean(0)
-        )
+        numbers = np.asarray([body.joint_names.index(name) for name in names])
+        (x, y), depth = project(camera, joints[numbers].mean(0))
         half = max(2, round(0.5 * side * float(camera.K[0, 0]) / float(depth)))
         padded = np.pad(image, ((half, half), (half, half), (0, 0)), constant_values=1.0)
         top, left = (int(np.clip(round(float(value)), 0, image.shape[0])) for value in (y, x))
@@ -92,7 +92,7 @@ def write_triples(
     across: int = 2,
     headers: tuple[str, ...] = ("truth", "feed-forward", "refined"),
 ) -> None:
-    """The same images of every person, as a JPEG; `across` people a row."""
+    """Writes the same images of every person as a JPEG, with `across` people in a row."""
     tiles = np.stack([image for drawn in people.values() for image in drawn])
     headers *= min(across, len(people))
     sheet = Image.fromarray(to_uint8(tile(tiles, headers=headers, columns=len(headers))))
@@ -128,8 +128,8 @@ POSES: dict[str, dict[str, tuple[float, float, float]]] = {
 def readme_pictures(
     run: Run, avatar: Path, out: Path = Path("docs/images"), size: int = 512
 ) -> None:
-    """README's row of pictures and its animation: the demo's photos, its avatar from two sides, in
-    new poses, and its face.
+    """Draws README's row of pictures and its animation: the demo's photos, its avatar from two
+    sides and in new poses, and the face of the avatar.
 
     Options:
     avatar: avatar.npz of `humangs demo`
@@ -148,6 +148,7 @@ def readme_pictures(
             rotations[person.joint_names.index(name)] = np.radians(turn)
         return BodyPose(jnp.asarray(rotations), jnp.zeros(3))
 
+    # the four photos in one square
     half = [
         np.asarray(Image.fromarray(to_uint8(x)).resize((size // 2, size // 2), 1)) / 255
         for x in photos.images[:4]
@@ -155,11 +156,15 @@ def readme_pictures(
     pictures = [
         np.concatenate([np.concatenate(half[:2], axis=1), np.concatenate(half[2:], axis=1)])
     ]
+
+    # the avatar in the A-pose and in new poses
     rest = a_pose_of(person)
     pictures += [drawn(rest, shot), drawn(rest, dataclasses.replace(shot, azimuth=130.0))]
     pictures += [
         drawn(posed(turns), dataclasses.replace(shot, azimuth=30.0)) for turns in POSES.values()
     ]
+
+    # the face
     head = person.rest_joints[person.joint_names.index("head")]
     K = jnp.asarray([[2.6 * size, 0, size / 2], [0, 2.6 * size, size / 2], [0, 0, 1]])
     target = head + jnp.asarray([0, 0.06, 0.0])
@@ -169,6 +174,7 @@ def readme_pictures(
     pictures.append(np.clip(np.asarray(render(animate(person, posed({})), face).rgb), 0, 1))
     strip = np.concatenate([_framed(x, size) for x in pictures], axis=1)
     Image.fromarray(to_uint8(strip)).save(out / "readme.jpg", quality=88)
+
     motion = load_motion()
     frames = images(
         person, *motion_views(person, motion, dataclasses.replace(shot, azimuth=25.0), 40.0), shot
@@ -193,20 +199,20 @@ EXPRESSIONS: dict[str, dict[str, float]] = {
     "frown": {"browDownLeft": 1, "browDownRight": 1, "mouthFrownLeft": 1, "mouthFrownRight": 1},
     "cheekPuff, look left": {"cheekPuff": 1, "eyeLookOutLeft": 1, "eyeLookInRight": 1},
 }  # fmt: skip
-"""Twelve faces: coefficients of ARKit's shapes."""
+"""{face: coefficients of ARKit's shapes}."""
 FACE_CLOSE_UP = 4.6
-"""Focal length over the size of the picture: a head fills it from 1.2 m."""
+"""Focal length over the size of the picture, with which a head fills it from 1.2 m."""
 
 
 @entry
 def expression_sheet(
     run: Run, avatar: Path, out: Path = Path("docs/images/expressions.jpg"), size: int = 224
 ) -> None:
-    """Twelve expressions of an avatar, close up.
+    """Draws twelve expressions of an avatar, close up.
 
     Options:
     avatar: avatar.npz of `humangs demo`
-    out: the picture
+    out: picture to write
     size: side of each face, pixels
     """
     person = with_face(Avatar.load(avatar))
@@ -229,30 +235,30 @@ def expression_sheet(
 
 
 def _framed(image: np.ndarray, size: int) -> np.ndarray:
-    """Cut to the columns that are not white, with a margin."""
+    """Cuts an image to the columns that are not white, with a margin."""
     used = np.flatnonzero((image < 0.98).any(axis=(0, 2)))
     left, right = max(0, used[0] - size // 32), min(image.shape[1], used[-1] + size // 32)
     return image[:, left:right]
 
 
 VIDEO_SIDE = (704, 960)
-"""Pixels of a frame of the rendered video, width and height: the head has 120."""
+"""Width and height of a frame of the rendered video in pixels. The head is 120 pixels high."""
 GESTURES = 54
-"""Frames of the video."""
+"""Number of frames of the video."""
 GESTURE_RATE = 18.0
-"""Frames a second."""
+"""Frames a second of the video."""
 
 
 @entry
 def motion_picture(run: Run, avatar: Path, out: Path = Path("docs/images/motion.gif")) -> None:
-    """Somebody who waves, closes a hand and makes faces in a video, and an avatar of somebody else
-    that moves as `humangs motion` found it there, side by side.
+    """Draws two people side by side: a person in a video who waves, closes a hand and makes faces,
+    and an avatar of another person that moves as `humangs motion` found it in the video.
 
-    The video is rendered from a synthetic person, and looked at like any other.
+    The video is rendered from a synthetic person, and then used like any other video.
 
     Options:
     avatar: avatar.npz of `humangs demo`
-    out: the picture
+    out: picture to write
     """
     person = Avatar.load(avatar)
     with tempfile.TemporaryDirectory() as folder:
@@ -271,7 +277,9 @@ def motion_picture(run: Run, avatar: Path, out: Path = Path("docs/images/motion.
 
 
 def gestures() -> Iterator[np.ndarray]:
-    """Frames of a synthetic person who raises an arm, closes the hand, turns, smiles and speaks."""
+    """Yields frames of a synthetic person who raises an arm, closes the hand, turns, smiles and
+    speaks.
+    """
     body = load_body()
     assert body.expressions is not None
     names = body.expressions.names

@@ -1,7 +1,8 @@
-"""Which programs XLA compiles, or reads from its cache, while something runs: their names, their
-seconds, and which line of the package asked for each.
+"""Notes which programs XLA compiles or reads from its cache while something runs: their names,
+their seconds, and the line of the package that asked for each.
 
-`python -m experiments.programs WORD...` runs a `humangs` command and ends with a line of JSON.
+`python -m experiments.programs WORD...` runs a `humangs` command and prints a line of JSON at the
+end.
 """
 
 import contextlib
@@ -21,7 +22,7 @@ PARTS = {
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "lower",
     "/jax/core/compile/backend_compile_duration": "compile",
 }
-"""JAX's events -> what we call them. Compiling includes reading from the cache on disk."""
+"""{event of JAX: our name for it}. Compiling includes reading from the cache on disk."""
 HIT = "/jax/compilation_cache/cache_hits"
 """JAX's event of a program that the cache on disk had."""
 PACKAGE = "humangs_jax"
@@ -32,15 +33,15 @@ class Program:
     """A program that was compiled, or read from the cache on disk."""
 
     name: str
-    """Of the function, as JAX has it."""
+    """Name of the function, as JAX has it."""
     stage: str
-    """The stage of the command that ran (`core.progress`); empty outside of stages."""
+    """The stage of the command that ran (`core.progress`), empty outside of stages."""
     asked: str
-    """The innermost line of the package that called: file:line."""
+    """The innermost line of the package on the stack, as file:line."""
     begin: float
-    """Seconds since the watch began."""
+    """Seconds from the begin of the watch to that of compiling."""
     seconds: float
-    """The time of compiling or reading."""
+    """Seconds of compiling or reading."""
     beside: bool
     """Whether another thread than the main one compiled it."""
 
@@ -50,18 +51,20 @@ class Watch:
     """What `watched` has seen."""
 
     began: float = dataclasses.field(default_factory=time.perf_counter)
+    """Time at which the watch began, of `time.perf_counter`."""
     programs: list[Program] = dataclasses.field(default_factory=list)
+    """All programs in their order."""
     seconds: dict[str, float] = dataclasses.field(
         default_factory=lambda: dict.fromkeys(PARTS.values(), 0.0)
     )
-    """Of tracing, lowering and compiling together. Traces within traces count twice."""
+    """{part of `PARTS`: seconds of all programs}. Traces within traces count twice."""
     hits: int = 0
-    """Programs that the cache on disk had."""
+    """Number of programs that the cache on disk had."""
     shown: Any = None
     """The `core.progress.Progress` of the command, which has the seconds of its stages."""
 
     def names(self) -> dict[str, int]:
-        """How many programs each name has, the most frequent first."""
+        """Returns {name: number of its programs}, the most frequent first."""
         found: dict[str, int] = {}
         for program in self.programs:
             found[program.name] = found.get(program.name, 0) + 1
@@ -70,7 +73,7 @@ class Watch:
 
 @contextlib.contextmanager
 def watched() -> Generator[Watch]:
-    """Notes every program of the block."""
+    """Yields a watch that notes every program of the block, in all threads."""
     import jax
 
     from humangs_jax.core import progress
@@ -84,6 +87,7 @@ def watched() -> Generator[Watch]:
             return
         with lock:
             watch.seconds[part] += duration_secs
+            # each program is compiled once, and may be traced in several parts
             if part == "compile":
                 watch.shown = progress.current()
                 names = watch.shown.names
@@ -110,7 +114,7 @@ def watched() -> Generator[Watch]:
 
 
 def _asked() -> str:
-    """The innermost line of the package on the stack."""
+    """Returns the innermost line of the package on the stack, as file:line."""
     for frame in reversed(traceback.extract_stack()):
         parts = Path(frame.filename).parts
         if PACKAGE in parts and "site-packages" not in parts:
@@ -120,7 +124,9 @@ def _asked() -> str:
 
 
 def run_command(words: list[str]) -> dict[str, Any]:
-    """Runs a `humangs` command in this process; its exit status, programs, stages and seconds."""
+    """Runs a `humangs` command in this process, and returns its exit status, programs, stages and
+    seconds.
+    """
     from humangs_jax.cli import execute
 
     began = time.perf_counter()

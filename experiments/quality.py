@@ -1,4 +1,4 @@
-"""How well unseen synthetic people are reconstructed, by the number of photos."""
+"""Measures how well unseen synthetic people are reconstructed, by the number of photos."""
 
 import functools
 import itertools
@@ -33,28 +33,32 @@ def evaluation_views(
     views: tuple[int, ...] = (1, 2, 4, 6),
     plot: Path | None = None,
 ) -> None:
-    """Unseen people from 1 to 6 photos against held-out views, in the pose of the photos and in
-    others.
+    """Compares unseen people, reconstructed from 1 to 6 photos, with held-out views in the pose of
+    the photos and in other poses.
 
-    The baseline is the body's mesh, each vertex painted with the mean color of the photos that see
-    it (grey where none does). About 10 s of CPU time a person, and a minute or two of compiling.
+    The baseline is the body's mesh, with each vertex painted in the mean color of the photos that
+    see it, and grey where none does. Takes about 10 s of CPU time a person, and a minute or two of
+    compiling.
 
     Options:
     views: numbers of photos that the network sees; they divide 12
-    plot: PSNR against the number of photos
+    plot: figure to write, with PSNR against the number of photos
     """
     start, views = people.start(), tuple(sorted(set(views)))
     if any(count < 1 or RING % count for count in views):
         raise ValueError(f"--views: expected numbers that divide {RING}, got {views}")
-    subject = functools.lru_cache(1)(lambda seed: start.subject(seed, views))
 
+    @functools.lru_cache(1)
+    def subject(seed):
+        return start.subject(seed, views)
+
+    # scores of a person by task, ours and those of the baseline
     def measure(seed, count):
         truth, inputs = subject(seed).held_out, subject(seed).inputs(count)
         drawn = predict_views(reconstruct(start.variables, start.config, inputs), truth).images
-        ours, baseline = (
-            score_tasks(x, truth, start.lpips)
-            for x in (drawn, draw_painted_body(painted_body(inputs), truth))
-        )
+        painted = draw_painted_body(painted_body(inputs), truth)
+        ours = score_tasks(drawn, truth, start.lpips)
+        baseline = score_tasks(painted, truth, start.lpips)
 
         def compared(task):
             return {
@@ -64,6 +68,7 @@ def evaluation_views(
 
         return {task: ours[task] | compared(task) for task in ours}
 
+    # single people are described for one number of photos
     chosen = 4 if 4 in views else max(views)
     cases = {
         f"{s}, {n} photos": functools.partial(measure, s, n) for s in start.seeds for n in views
@@ -88,10 +93,12 @@ def evaluation_views(
 
 
 def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) -> str:
-    """Scores by number of photos and task, whether more photos help.
+    """Formats scores by number of photos and task, and sentences on whether more photos help.
 
-    by_views: scores by number of photos and seed. chosen: the number of photos of which single
-    people are described.
+    Args:
+        by_views: {number of photos: {seed: scores}}
+        chosen: the number of photos for which single people are described
+        about: the first paragraph
     """
     mean = {n: means(list(rows.values())) for n, rows in by_views.items()}
     tasks = [task for task in TASKS if task in mean[chosen]]
@@ -111,7 +118,9 @@ def views_section(by_views: dict[int, dict[int, Any]], chosen: int, about: str) 
 
 
 def verdict(by_views: dict[int, dict[int, Any]], chosen: int, task: str) -> str:
-    """Whether more photos are ever worse, and how many people beat their vertex-color baseline."""
+    """Describes whether more photos are ever worse, and how many people have better scores than
+    their vertex-color baseline.
+    """
     mean = [
         (n, float(np.mean([row[task]["psnr"] for row in rows.values()])))
         for n, rows in by_views.items()
@@ -121,24 +130,22 @@ def verdict(by_views: dict[int, dict[int, Any]], chosen: int, task: str) -> str:
         for (few, x), (many, y) in itertools.pairwise(mean)
         if y < x
     ]
-    said = (
-        "on average, PSNR falls " + ", ".join(worse)
-        if worse
-        else "more photos are never worse on average"
-    )
+    trend = "more photos are never worse on average"
+    if worse:
+        trend = "on average, PSNR falls " + ", ".join(worse)
     rows = [row[task] for row in by_views[chosen].values()]
     whole, person = (
         sum(row[key] > row[f"baseline_{key}"] for row in rows) for key in ("psnr", "psnr_fg")
     )
     return (
-        f"{TASKS[task].capitalize()}: {said}; with {chosen}, {whole} of {len(rows)} people have a"
+        f"{TASKS[task].capitalize()}: {trend}; with {chosen}, {whole} of {len(rows)} people have a"
         f" higher PSNR than their vertex-color baseline, {person} in the foreground alone."
     )
 
 
 def plot_views(path: Path, mean: dict[int, Any]) -> None:
-    """PSNR of the whole image and of the foreground against the number of photos, ours and the
-    vertex-color baseline.
+    """Draws the PSNR of the whole image and of the foreground against the number of photos, of ours
+    and of the vertex-color baseline.
     """
     with figure(path, 2, legend=0.15) as axes:
         for axis, key, title in zip(

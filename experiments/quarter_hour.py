@@ -1,9 +1,9 @@
-"""A quarter of an hour of an accelerator, spent by a list with a clock.
+"""Spends a quarter of an hour of an accelerator by a list with a clock.
 
-Each stage is a command in a process of its own with a limit of seconds. What a stage has found lies
-on disk when it ends, and the list goes on after it, whether it ended, failed or was cut. The same
-command goes on with the stages that are not done. Compiled programs, and what XLA found out by
-trying, are kept in the folder.
+Each stage is a command in a separate process with a limit of seconds. A stage writes its results to
+disk. The list goes on when a stage has ended, failed or was cut. The same command continues with
+the stages that are not done. Compiled programs, and the settings that XLA found by trying, are kept
+in the folder.
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ from typing import Any
 from experiments.results import REPOSITORY, markdown_table, write_json
 
 GRACE = 15.0
-"""Seconds that a stage has to write what it has, after it was told to end."""
+"""Seconds that a stage has to write its results after it was interrupted."""
 LEAST = 20.0
-"""Seconds: with less left, no stage begins."""
+"""Seconds that must be left for a stage to begin."""
 UNTRIED = "--xla_gpu_autotune_level=0"
-"""XLA takes its default tiles for products, without trying others."""
+"""Flag with which XLA takes its default tiles for products, without trying others."""
 NO_FUSION_TRIALS = "--xla_gpu_experimental_enable_fusion_autotuner=false"
-"""XLA tries no other ways to fuse."""
+"""Flag with which XLA does not try other ways to fuse."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,17 +34,17 @@ class Stage:
     """One line of the list."""
 
     name: str
-    """What it is, in a word or two."""
+    """Its name, of a few words."""
     words: tuple[str, ...]
     """The experiment and its options."""
     seconds: float
-    """When it is cut, at the latest."""
+    """Seconds after which it is cut."""
     flags: str = ""
-    """Of XLA."""
+    """Flags of XLA, empty for none."""
 
 
 def stages(out: Path, small: bool) -> list[Stage]:
-    """The list, the most wanted first. small: for a rehearsal on a CPU."""
+    """Returns the list, the most wanted stage first. `small` is for a rehearsal on a CPU."""
 
     def stage_of(name):
         return ("accelerator", "--stage", name, *(["--small"] * small))
@@ -57,11 +57,15 @@ def stages(out: Path, small: bool) -> list[Stage]:
         return Stage(f"training step, {name}", (*stage_of("step"), *files), 150, flags)
 
     # training and people are tiny in a rehearsal: it is about the list
-    minutes, people, batch = ("1", "1", "1") if small else ("5", "450", "8")
-    train = ("--minutes", minutes, "--people", people, "--batch", batch)
-    refining = ("--people", "2", "--samples", "2", "--steps", "1") if small else ()
-    learned = ("train_refiner", str(out / "refiner"), *refining)
-    systems = ("paper", str(out / "paper"), *(("--quick",) if small else ()))
+    train = ("train_by_clock", str(out / "train"))
+    learned = ("train_refiner", str(out / "refiner"))
+    systems = ("paper", str(out / "paper"))
+    if small:
+        train += ("--minutes", "1", "--people", "1", "--batch", "1")
+        learned += ("--people", "2", "--samples", "2", "--steps", "1")
+        systems += ("--quick",)
+    else:
+        train += ("--minutes", "5", "--people", "450", "--batch", "8")
     return [
         measure("check", 60),
         measure("splatting", 90),
@@ -71,16 +75,17 @@ def stages(out: Path, small: bool) -> list[Stage]:
         measure("reconstruct", 60),
         measure("frames", 30),
         measure("published", 60),
-        Stage("training by the clock", ("train_by_clock", str(out / "train"), *train), 360),
+        Stage("training by the clock", train, 360),
         Stage("learned update", learned, 120),
         Stage("the paper's systems", systems, 120),
     ]
 
 
 def spend(out: Path, seconds: float, small: bool) -> dict[str, dict[str, Any]]:
-    """Runs the list in `out`, and returns what became of each stage: done, cut, failed, or no time.
+    """Runs the list in `out` for this many seconds.
 
-    It is written to OUT/clock.json after each one.
+    Returns {stage: {"became": "done", "cut", "failed" or "no time", "seconds"}}, which is also
+    written to OUT/clock.json after each stage.
     """
     out.mkdir(parents=True, exist_ok=True)
     path, end = out / "clock.json", monotonic() + seconds
@@ -100,7 +105,9 @@ def spend(out: Path, seconds: float, small: bool) -> dict[str, dict[str, Any]]:
 
 
 def ran(stage: Stage, limit: float, environment: dict[str, str], log: Path) -> dict[str, Any]:
-    """Runs one stage; at the limit it hears Ctrl-C, and then is killed."""
+    """Runs one stage. After `limit` seconds it gets an interrupt, and `GRACE` seconds later it is
+    killed.
+    """
     began = monotonic()
     with open(log, "w") as lines:
         process = subprocess.Popen(
@@ -120,7 +127,7 @@ def ran(stage: Stage, limit: float, environment: dict[str, str], log: Path) -> d
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        except BaseException:  # Ctrl-C of this one
+        except BaseException:  # this process is interrupted
             process.kill()
             process.wait()
             raise
@@ -128,7 +135,9 @@ def ran(stage: Stage, limit: float, environment: dict[str, str], log: Path) -> d
 
 
 def environment(out: Path, stage: Stage) -> dict[str, str]:
-    """Of a stage: caches that later stages and calls find again, and its flags."""
+    """Returns the environment of a stage, with its flags and with caches that later stages and
+    calls use again.
+    """
     trials = f"--xla_gpu_per_fusion_autotune_cache_dir={(out / 'trials').resolve()}"
     (out / "trials").mkdir(exist_ok=True)
     flags = (os.environ.get("XLA_FLAGS", ""), trials, stage.flags)
@@ -140,12 +149,12 @@ def environment(out: Path, stage: Stage) -> dict[str, str]:
 
 
 def table_of(found: dict[str, dict[str, Any]]) -> str:
-    """What became of each stage."""
+    """Formats what became of each stage."""
     rows = [[name, each["became"], f"{each['seconds']:.0f}"] for name, each in found.items()]
     return markdown_table(["stage", "became", "s"], rows, "llr")
 
 
 def measured_files(out: Path) -> Sequence[Path]:
-    """What `accelerator --earlier` puts together."""
+    """Returns the files that `accelerator --earlier` puts together."""
     files = [*sorted(out.glob("*.json")), out / "train" / "run.json"]
     return [path for path in files if path.name != "clock.json" and path.exists()]

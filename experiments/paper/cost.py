@@ -1,5 +1,5 @@
-"""The paper's central claim, measured: vertices that are projected into the photos against vertices
-that attend to all tokens.
+"""Measures the paper's central claim: the cost of vertices that are projected into the photos,
+against that of vertices that attend to all tokens.
 """
 
 import functools
@@ -26,20 +26,23 @@ from humangs_jax.network.parts import Encoding, HumanGSInputs
 from humangs_jax.network.weights import expected_variables
 
 PATCH, READ_OPERATIONS = 8, 8
-"""Operations of one bilinear read and its sum over views, per feature: four products, four
-additions.
+"""Side of a patch in pixels, and operations of one bilinear read and its sum over views for each
+feature: four products and four additions.
 """
 AXES = {"views": (1, 2, 4, 8, 16), "vertices": (1000, 3000, 10000, 40000), "size": (128, 256, 512)}
+"""Values of each quantity that is varied; `size` is the side of the photos in pixels."""
 MIDDLE = {"views": 4, "vertices": 10000, "size": 256}
+"""Values of the quantities that are not varied."""
 READERS = {"back-projection": "#1f6f8b", "cross-attention": "#c0392b"}
+"""{reader: its color in the figure}."""
 NETWORKS = {"humangs": 4, "back_projection": 4, "cross_attention": 4, "gst": 1}
-"""Systems that are counted in their published size, and their photos."""
+"""{system that is counted in its published size: its number of photos}."""
 JOINT = {"lhm": 1, "lhm_views": 4, "lhm_plus": 4}
-"""Systems of which the joint attention is counted, and their photos."""
+"""{system of which the joint attention is counted: its number of photos}."""
 POINTS, TOKENS = 40000, 4096 + 1024
-"""Of LHM: points of the body, tokens of the body's photo and of the head's.
+"""Points of the body in LHM, and tokens of the photos of the body and of the head.
 
-LHM++ has its own, which we do not know.
+The numbers of LHM++ differ, and are not known to us.
 """
 
 
@@ -52,29 +55,30 @@ def paper_cost(
     quick: bool = False,
     image: Path | None = None,
 ) -> None:
-    """The paper's central claim: vertices that are projected into the photos against vertices that
-    attend to all tokens.
+    """Measures the paper's central claim: what vertices cost that are projected into the photos,
+    against vertices that attend to all tokens.
 
-    The two readers of `experiments.systems`, alone, on maps of the same width: forward passes over
-    views, vertices and image sizes, in turns. Operations of attention are products of matrices;
-    back-projection has none: its weighted sums of four neighbours count as 8 a vertex, view and
-    feature. All patches are tokens, as in the paper. Then the operations of whole networks in
-    published sizes, counted in programs that are not run. Of LHM and its kin the joint attention of
-    points and tokens alone is counted, without the two pretrained networks that make the tokens and
-    the decoder. 4 CPU minutes.
+    The two readers of `experiments.systems` run alone on maps of the same width. Forward passes
+    over views, vertices and image sizes are timed in turns. The operations of attention are
+    products of matrices. Back-projection has none: its weighted sums of four neighbours count as 8
+    for each vertex, view and feature. All patches are tokens, as in the paper. The operations of
+    whole networks in published sizes are counted in programs that are not run. Of LHM and similar
+    systems only the joint attention of points and tokens is counted, without the decoder and
+    without the two pretrained networks that make the tokens. Takes 4 CPU minutes.
 
     Options:
     width: features of maps, vertices and attention
     repeats: timed iterations
-    networks: count the networks alone; readers: as docs/results has them
-    quick: the smallest sizes alone, no whole networks
-    image: draw them here (.png)
+    networks: count only the networks, and take the readers from docs/results
+    quick: only the smallest sizes, and no whole networks
+    image: figure to write (.png)
     """
     if networks:
         record = json.loads((REPOSITORY / "docs" / "results" / f"{run.table}.json").read_text())
         measured_then = {key: record[key] for key in ("date", "machine", "versions")}
         result = {"readers": measured_then} | record["numbers"] | {"networks": all_networks()}
     else:
+        # both readers, with one quantity varied at a time
         middle = {"views": 1, "vertices": 1000, "size": 64} if quick else MIDDLE
         axes = {name: AXES[name][:2] for name in ("views", "vertices")} if quick else AXES
         cases = [middle | {axis: value} for axis, values in axes.items() for value in values]
@@ -99,7 +103,7 @@ def paper_cost(
 
 
 def plot(path: Path, result: dict[str, Any]) -> None:
-    """CPU time against views, vertices and the side of the photos."""
+    """Draws CPU time against views, vertices and the side of the photos."""
     with figure(path, len(AXES), (11, 3.6)) as all_axes:
         for axes, axis in zip(all_axes, AXES, strict=True):
             others = {key: value for key, value in result["middle"].items() if key != axis}
@@ -116,10 +120,8 @@ def plot(path: Path, result: dict[str, Any]) -> None:
                 )
             axes.set_xticks(values, [str(value) for value in values])
             axes.minorticks_off()
-            title = ", ".join(
-                f"{value} px" if key == "size" else f"{value} {key}"
-                for key, value in others.items()
-            )
+            units = {"size": "px"}
+            title = ", ".join(f"{value} {units.get(key, key)}" for key, value in others.items())
             axes.set(xlabel={"size": "side of the photos, pixels"}.get(axis, axis))
             axes.set_title(title, fontsize=9)
         all_axes[0].set_ylabel("CPU ms")
@@ -127,6 +129,7 @@ def plot(path: Path, result: dict[str, Any]) -> None:
 
 
 def all_networks() -> dict[str, dict[str, float]]:
+    """Returns {system: what it costs} of whole networks and of joint attentions."""
     whole = {name: network_flops(name, photos) for name, photos in NETWORKS.items()}
     return whole | {name: joint_flops(name, photos) for name, photos in JOINT.items()}
 
@@ -134,7 +137,8 @@ def all_networks() -> dict[str, dict[str, float]]:
 def compare(
     width: int, repeats: int, views: int, vertices: int, size: int
 ) -> dict[str, dict[str, float]]:
-    """CPU ms, operations and temporary MiB of both readers on the same maps."""
+    """Returns the CPU ms, operations and temporary MiB of both readers on the same maps."""
+    # a program for each reader, with weights that are all the same
     inputs, encoding = subject(width, views, vertices, size)
     runs, found = {}, {}
     for name, config in configurations(width, size).items():
@@ -154,22 +158,26 @@ def compare(
             "operations": costs_of(traced).flops + sums,
             "temporary_mb": temporary_mb(program),
         }
-        runs[name] = lambda p=program, v=variables: jax.block_until_ready(p(v, encoding, inputs))
+
+        def timed(program=program, variables=variables):
+            return jax.block_until_ready(program(variables, encoding, inputs))
+
+        runs[name] = timed
     for name, (wall, cpu) in medians(runs, repeats).items():
         found[name] |= {"ms": float(wall), "cpu_ms": float(cpu)}
     return found
 
 
 def configurations(width: int, size: int) -> dict[str, Any]:
-    """The networks whose readers are compared."""
+    """Returns {reader: configuration of a network that has it}."""
     config = back_projection("bench").with_conventions(image_size=size, tokens="all")
     reader = CrossAttentionReader(width, layers=1, head_width=32)
     return {"back-projection": config, "cross-attention": config.with_parts(reader=reader)}
 
 
 def subject(width: int, views: int, vertices: int, size: int) -> tuple[Any, Any]:
-    """(inputs, encoding): points on a cylinder of the size of a person, cameras around it, maps of
-    noise.
+    """Returns the inputs and the encoding of a subject: points on a cylinder of the size of a
+    person, cameras around it, and maps of noise.
     """
     rng = np.random.default_rng(0)
     angles, heights = rng.uniform(-np.pi, np.pi, vertices), rng.uniform(-0.9, 0.9, vertices)
@@ -197,8 +205,8 @@ def subject(width: int, views: int, vertices: int, size: int) -> tuple[Any, Any]
 
 
 def network_flops(name: str, photos: int) -> dict[str, float]:
-    """Operations of a whole network in its published size, counted in the program before its
-    compilation.
+    """Returns what a whole network costs in its published size, counted before its program is
+    compiled.
     """
     config = SYSTEMS[name]("published").with_conventions(tokens="all").with_runtime(dtype="float32")
     vertices = len(gaussian_body(load_body(), config).template)
@@ -211,8 +219,8 @@ def network_flops(name: str, photos: int) -> dict[str, float]:
 
 
 def joint_flops(name: str, photos: int) -> dict[str, float]:
-    """Operations of the attention of an LHM-style system in its published size, with LHM's points
-    and tokens.
+    """Returns what the joint attention of a system like LHM costs in its published size, with LHM's
+    points and tokens.
     """
     config = SYSTEMS[name]("published")
     reader, grid = config.architecture.reader, jnp.zeros((photos, TOKENS, 1))
@@ -221,18 +229,17 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
     )
 
     def arguments(points: Any, tokens: Any) -> tuple[Any, ...]:
-        """Photos whose pixels are the tokens."""
-        colors, posed = (
-            jnp.zeros((*grid.shape, 3)),
-            jnp.broadcast_to(points, (photos, *points.shape)),
-        )
+        """Returns the reader's arguments, with photos whose pixels are the tokens."""
+        colors = jnp.zeros((*grid.shape, 3))
+        posed = jnp.broadcast_to(points, (photos, *points.shape))
         inputs = HumanGSInputs(colors, camera, posed, points, colors, grid, grid > 0)
         return Encoding(tokens, None, jnp.zeros((), jnp.int32)), inputs, config.forward_context()
 
     def forward(v, *given):
         return reader.apply(v, *arguments(*given))
 
-    tokens = jax.ShapeDtypeStruct((*grid.shape, getattr(reader, "width")), jnp.float32)  # noqa: B009 (of a TwoStreamReader)
+    width = getattr(reader, "width")  # noqa: B009 (of a TwoStreamReader)
+    tokens = jax.ShapeDtypeStruct((*grid.shape, width), jnp.float32)
     points = jax.ShapeDtypeStruct((POINTS, 3), jnp.float32)
 
     def make(*given):
@@ -245,7 +252,7 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
 def counted(
     photos: int, vertices: int, forward: Any, variables: Any, *given: Any
 ) -> dict[str, float]:
-    """What a program costs that is not run."""
+    """Returns what a program costs, which is traced and not run."""
     parameters = sum(x.size for x in jax.tree.leaves(variables["params"]))
     operations = costs_of(jax.jit(forward).trace(variables, *given)).flops
     return {
@@ -257,17 +264,10 @@ def counted(
 
 
 def text_of(result: dict[str, Any]) -> str:
+    """Formats the tables of the readers and of the networks."""
     a, b = READERS
-    header = [
-        "views",
-        "vertices",
-        "photo",
-        f"{a}, CPU ms",
-        f"{b}, CPU ms",
-        "ratio",
-        f"{a}, M operations",
-    ]
-    header += [f"{b}, M operations", "ratio", f"{a}, MiB", f"{b}, MiB"]
+    header = ["views", "vertices", "photo", f"{a}, CPU ms", f"{b}, CPU ms", "ratio"]
+    header += [f"{a}, M operations", f"{b}, M operations", "ratio", f"{a}, MiB", f"{b}, MiB"]
     rows = []
     for row in result["rows"]:
         times, operations, memory = (
@@ -280,29 +280,7 @@ def text_of(result: dict[str, Any]) -> str:
         f"Readers of width {result['width']}.",
         markdown_table(header, rows, "r" * len(header)),
     ]
-    if networks := result["networks"]:
-        ours = networks["humangs"]["operations"]
-        lines = []
-        for name, x in networks.items():
-            title = f"{name}, joint attention alone" if name in JOINT else name
-            cells = [
-                f"{x['parameters'] / 1e6:.0f}",
-                f"{x['operations'] / 1e12:.2f}",
-                significant(x["operations"] / ours),
-            ]
-            lines.append([title, x["photos"], x["vertices"], *cells])
-        printed = {name: ANIMATION[name][3] or 0.0 for name in (OURS, "LHM (single view)")}
-        for name, x in printed.items():
-            lines.append(
-                [
-                    f"{name}, printed seconds",
-                    "",
-                    "",
-                    "",
-                    significant(x),
-                    significant(x / printed[OURS]),
-                ]
-            )
+    if result["networks"]:
         texts += [
             (
                 "Networks in published sizes, all patches tokens: operations counted, not run."
@@ -310,16 +288,26 @@ def text_of(result: dict[str, Any]) -> str:
                 " networks that make the tokens. The last rows are the paper's modelling times,"
                 f" its {FASTER_MODELLING} x."
             ),
-            markdown_table(
-                [
-                    "network",
-                    "photos",
-                    "vertices or points",
-                    "M parameters",
-                    "TFLOP",
-                    "over HumanGS",
-                ],
-                lines,
-            ),
+            networks_table(result["networks"]),
         ]
     return "\n\n".join(texts)
+
+
+def networks_table(networks: dict[str, dict[str, float]]) -> str:
+    """Formats a row for each network, and rows of the seconds that the paper prints."""
+    ours = networks["humangs"]["operations"]
+    lines = []
+    for name, x in networks.items():
+        title = f"{name}, joint attention alone" if name in JOINT else name
+        cells = [
+            f"{x['parameters'] / 1e6:.0f}",
+            f"{x['operations'] / 1e12:.2f}",
+            significant(x["operations"] / ours),
+        ]
+        lines.append([title, x["photos"], x["vertices"], *cells])
+    printed = {name: ANIMATION[name][3] or 0.0 for name in (OURS, "LHM (single view)")}
+    for name, x in printed.items():
+        shown = [significant(x), significant(x / printed[OURS])]
+        lines.append([f"{name}, printed seconds", "", "", "", *shown])
+    header = ["network", "photos", "vertices or points", "M parameters", "TFLOP", "over HumanGS"]
+    return markdown_table(header, lines)

@@ -1,7 +1,7 @@
-"""Plain people, which small networks learn to read on two cores: one cut of clothes in plain dyes,
-one light, eight poses.
+"""Makes plain people, which small networks learn to reconstruct on two cores.
 
-Bodies, skin, dyes and cameras differ. Each person is seen in two of the poses.
+All people have clothes of one cut in plain dyes, one light and eight poses. Bodies, skin, dyes and
+cameras differ. Each person is seen in two of the poses.
 """
 
 import dataclasses
@@ -29,11 +29,13 @@ from humangs_jax.synthetic.writer import HELD_OUT, View, capture_views, stand
 from humangs_jax.training.sources import SourceFactory
 
 SIZE, POSES = 32, 8
-"""Pixels a side; poses that all people share."""
+"""Side of the photos in pixels, and number of poses, which all people share."""
 CLOTHES_STREAM, POSE_STREAM, CAMERA_STREAM, COLOR_STREAM = 30, 31, 32, 33
+"""Random streams of a seed."""
 LIGHT_SEED = 5
+"""Seed of the light."""
 NEARER = 0.6
-"""Distance of the cameras of near people over that of the others: parts of the person leave the
+"""Distance of the cameras of near people as a share of the usual one. Parts of the person leave the
 frame.
 """
 CLOTHES = {
@@ -44,23 +46,17 @@ CLOTHES = {
     ),
     "flats": ({"height": 0.07, "sole": 0.015, "over": 0.0}, set()),
 }
-"""Sizes and details of the garments, see `people.outfits`."""
+"""{garment: (its sizes, its details)}, see `synthetic/outfits.py`."""
 
 
 def plain(seed: int, body: BodyModel) -> Person:
-    """The person of a seed in plain clothes, with short hair, in the one light."""
+    """Returns the person of a seed in plain clothes, with short hair, in the one light."""
     rng, person = np.random.default_rng([seed, CLOTHES_STREAM]), describe(seed, body)
     garments = []
     for kind, (sizes, details) in CLOTHES.items():
         color = random_color(rng)
-        garments.append(
-            Garment(
-                kind,
-                Fabric("plain", color, color, int(rng.integers(1 << 31))),
-                sizes,
-                frozenset(details),
-            )
-        )
+        fabric = Fabric("plain", color, color, int(rng.integers(1 << 31)))
+        garments.append(Garment(kind, fabric, sizes, frozenset(details)))
     haircut = dataclasses.replace(person.haircut, cut="buzz", beard="none")
     lights = sample_lights(np.random.default_rng(LIGHT_SEED))
     return dataclasses.replace(person, garments=tuple(garments), haircut=haircut, lights=lights)
@@ -75,26 +71,29 @@ def write_plain(
     size: int = SIZE,
     near: bool = False,
 ) -> Path:
-    """People of a split as captures of two poses, `views` photos of each; folders that are there
-    are kept. Returns `out`.
+    """Writes people of a split as captures, and returns `out`. Existing folders are kept.
 
-    held_out: where it is not 0 the capture has the first pose alone, and held_out/ has that many
-    views of either.
+    Args:
+        out: folder of the captures
+        split: seeds of the people
+        count: number of people
+        views: photos of each of the two poses
+        held_out: if not 0, the capture has only the first pose, and held_out/ has this many views
+            of each pose
+        size: side of the photos in pixels
+        near: whether the cameras are nearer than usual
     """
     body = load_body()
     for seed in bar(seeds_of(split, 0, count), desc=out.name, unit="person"):
         folder = out / f"{seed:07d}"
         if (folder / "capture.json").is_file():
             continue
-        subject, rng = (
-            make_subject(seed, body, plain(seed, body)),
-            np.random.default_rng([seed, CAMERA_STREAM]),
-        )
+        # two poses of the person
+        subject = make_subject(seed, body, plain(seed, body))
+        rng = np.random.default_rng([seed, CAMERA_STREAM])
         chosen = rng.choice(POSES, 2, replace=False)
         generators = [np.random.default_rng([POSE_STREAM, int(pose)]) for pose in chosen]
-        posed = [
-            stand(subject, sample_rotations(generator, subject.build)) for generator in generators
-        ]
+        posed = [stand(subject, sample_rotations(each, subject.build)) for each in generators]
         seen = _views(rng, posed[:1] if held_out else posed, views, size, near)
         unseen = _views(rng, posed, held_out, size, near)
 
@@ -110,8 +109,11 @@ def write_plain(
 def _views(
     rng: np.random.Generator, posed: list[PosedSubject], count: int, size: int, near: bool
 ) -> list[View]:
+    """Returns `count` views of each pose, from cameras all around."""
+    if not count:
+        return []
     views = []
-    for frame, one in enumerate(posed if count else ()):
+    for frame, one in enumerate(posed):
         cameras = cameras_around(rng, one.vertices, spread_azimuths(rng, count), size)
         if near:
             middle = 0.5 * (one.vertices.min(0) + one.vertices.max(0))
@@ -121,6 +123,9 @@ def _views(
 
 
 def _closer(cameras: Camera, middle: np.ndarray) -> Camera:
+    """Moves cameras along their rays to the middle (3,) of the person, to `NEARER` of the
+    distance.
+    """
     pose = np.array(cameras.cam_from_world)
     at = pose[:, :3, :3] @ middle + pose[:, :3, 3]
     pose[:, :3, 3] -= (1 - NEARER) * at
@@ -128,27 +133,25 @@ def _closer(cameras: Camera, middle: np.ndarray) -> Camera:
 
 
 class OnePose(CaptureFolder):
-    """A capture of which only the views of the first pose are used, for systems that show no
-    other.
+    """A capture of which only the views of the first pose are used, for systems that cannot show
+    another pose.
     """
 
     def summary(self) -> StoredSubject:
+        """Returns what is known of the views of the first pose."""
         found = super().summary()
         first = found.frames == found.frames[0]
-        return found._replace(
-            **{
-                name: getattr(found, name)[first]
-                for name in ("K", "cam_from_world", "frames", "azimuths")
-            }
-        )
+        names = ("K", "cam_from_world", "frames", "azimuths")
+        return found._replace(**{name: getattr(found, name)[first] for name in names})
 
 
 class Recolored(CaptureSource):
-    """Examples have their color channels exchanged, the same way in all images: six times the
+    """A source whose examples have their color channels in random order, which makes six times the
     dyes.
     """
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
+        """Returns an example with the same order of the channels in all images."""
         example = super().example(seed, index, input_count)
         order = np.random.default_rng([COLOR_STREAM, seed, index]).permutation(3)
 
@@ -159,12 +162,16 @@ class Recolored(CaptureSource):
 
 
 def on_disk(folder: Path, one_pose: bool = False, recolored: bool = False) -> SourceFactory:
-    """The people of a folder as a run's source. one_pose: of the first pose alone."""
-    body, kind, source = (
-        load_body(),
-        OnePose if one_pose else CaptureFolder,
-        Recolored if recolored else CaptureSource,
-    )
+    """Returns a function from a run's configuration to the source of the people of a folder.
+
+    Args:
+        folder: folder of captures
+        one_pose: whether only views of the first pose are used
+        recolored: whether examples have their color channels in random order
+    """
+    body = load_body()
+    kind = OnePose if one_pose else CaptureFolder
+    source = Recolored if recolored else CaptureSource
     cache = PeopleCache([kind(path, body) for path in find_captures(folder)])
     return lambda config: source(
         cache, config.views, config.model.image_size, config.target_size, config.loss.depth > 0

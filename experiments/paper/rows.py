@@ -1,4 +1,4 @@
-"""Rows of the paper's tables: the printed ones, and weights measured on the people of a folder or
+"""Has the printed rows of the paper's tables, and measures rows of weights on people of a folder or
 data set.
 """
 
@@ -95,17 +95,22 @@ FASTER_MODELLING = 15
 """Times that HumanGS models faster than LHM: 4.59 s against 0.29."""
 
 AT_ONCE = 200
-"""Views that are in memory together."""
+"""Largest number of views that are in memory together."""
 Views = dict[str, dict[str, list[int]]]
-"""By person: "context", the views that are inputs, and "target"."""
+"""{person: {"context": the views that are inputs, "target": the views that are compared}}."""
 
 
 def views_of(people: Path, photos: int, body: Path | None, varying: bool) -> Views | None:
-    """Inputs and targets of people who have no held_out/; None: they have.
+    """Chooses inputs and targets of people who have no held_out/. Returns None if they have it.
 
-    varying: each input shows another pose and side, and targets poses that no input shows, where
-    there are as many.
+    Args:
+        people: folder or scene list
+        photos: number of inputs
+        body: body model of a data set
+        varying: whether each input shows another pose and side, and targets show poses that no
+            input shows, as far as there are so many poses
     """
+    # the frames and cameras of each person
     names, found = find_people(people, None, {}, body).names, {}
     if any(people.glob("*/capture.json")) or (people / "capture.json").is_file():
         folders = find_captures(people)
@@ -113,30 +118,31 @@ def views_of(people: Path, photos: int, body: Path | None, varying: bool) -> Vie
             return None
         given = [(x.frames, x.cameras.cam_from_world) for x in map(load_capture, folders)]
     else:
-        given = [
-            (x.subject.frames, x.subject.cam_from_world)
-            for x in open_people(people, FileBody.load(body))
-        ]
+        opened = [each.subject for each in open_people(people, FileBody.load(body))]
+        given = [(subject.frames, subject.cam_from_world) for subject in opened]
+
     for name, (frames, poses) in zip(names, given, strict=True):
-        context, target = varied(np.asarray(frames), photos) if varying else ([], [])
+        frames, poses = np.asarray(frames), np.asarray(poses)
+        context, target = [], []
+        if varying:
+            context, target = varied(frames, photos)
         if not target:
-            context, target = choose_views(
-                name, np.asarray(frames), np.asarray(poses), Choice(photos)
-            )
+            context, target = choose_views(name, frames, poses, Choice(photos))
         found[name] = {"context": context, "target": target}
     return found
 
 
 def varied(frames: np.ndarray, photos: int) -> tuple[list[int], list[int]]:
-    """Inputs of as many frames as there are, in turns, each by another camera; targets of all
-    others. Nothing of one frame.
+    """Chooses inputs that show different frames, each by another camera, and as targets all views
+    of the other frames.
+
+    Frames are taken in turns where there are fewer than photos. Both lists are empty if there is
+    only one frame.
     """
     poses = np.unique(frames)
-    seen = (
-        poses[[i * len(poses) // photos for i in range(photos)]]
-        if len(poses) > photos
-        else poses[:-1]
-    )
+    seen = poses[:-1]
+    if len(poses) > photos:
+        seen = poses[[i * len(poses) // photos for i in range(photos)]]
     if not len(seen):
         return [], []
     context: list[int] = []
@@ -148,23 +154,23 @@ def varied(frames: np.ndarray, photos: int) -> tuple[list[int], list[int]]:
 
 
 def cases(people: Path, photos: int, body: Path | None, views: Views | None) -> Iterator[Case]:
-    """Of people, a person with many targets in parts."""
+    """Yields the cases of people. A person with more than `AT_ONCE` targets comes in parts."""
+    # the people read `chosen` whenever a case is loaded
     chosen = None if views is None else dict(views)
-    found = find_people(people, photos, chosen, body)  # reads `chosen` whenever a case is loaded
+    found = find_people(people, photos, chosen, body)
     for i, name in enumerate(found.names):
         if views is None or chosen is None:
             yield found.load(i)
         elif name in views:
-            for start in range(0, len(views[name]["target"]), AT_ONCE):
-                chosen[name] = views[name] | {
-                    "target": views[name]["target"][start : start + AT_ONCE]
-                }
+            targets = views[name]["target"]
+            for start in range(0, len(targets), AT_ONCE):
+                chosen[name] = views[name] | {"target": targets[start : start + AT_ONCE]}
                 yield found.load(i)
 
 
 def trained(runs: Path | None, given: tuple[str, ...] = ()) -> dict[str, tuple[Any, Any]]:
-    """(variables, configuration) by name: the variants that are trained, weights NAME=FILE, and the
-    shipped ones.
+    """Returns {name: (variables, configuration)} of the variants that are trained in `runs`, of
+    weights NAME=FILE, and of the shipped weights.
     """
     found = {}
     if runs is not None:
@@ -186,11 +192,11 @@ def measured(
     networks: Any,
     views: Views | None = None,
 ) -> dict[str, Any] | None:
-    """Scores of the views in the pose of the photos and in others, and the seconds to model and to
-    draw a frame.
+    """Returns the mean scores of views in the pose of the photos and in other poses, and the
+    seconds to model a person and to draw a frame.
 
-    None if the system takes no such number of photos. The first person is run twice, and only the
-    second run is timed: the first one compiles.
+    Returns None if the system does not take this number of photos. The first person is run twice,
+    and only the second run is timed, because the first one compiles.
     """
     config, rows = weights[1], []
     if takes_one(config) and photos > 1:
@@ -210,38 +216,45 @@ def measured(
         def frames(capture):
             return set(np.asarray(capture.frames).tolist())
 
-        seen = {pose_of(case.inputs, i) for i in frames(case.inputs)} if case.inputs else set()
+        seen = set()
+        if case.inputs:
+            seen = {pose_of(case.inputs, i) for i in frames(case.inputs)}
         same = {i: pose_of(case.truth, i) in seen for i in frames(case.truth)}
-        rows += [
-            (same[row.frame], row) for row in evaluate([case], method=method, lpips=networks).rows
-        ]
+        scored = evaluate([case], method=method, lpips=networks).rows
+        rows += [(same[row.frame], row) for row in scored]
+
+    # means by pose, and by person within
     means: dict[str, Any] = {"photos": photos}
     for task, first in (("reconstruction", True), ("animation", False)):
         own = list(person_means([row for same, row in rows if same == first]).values())
-        means[task] = mean_scores(own) if own and (first or animatable(config)) else None
-    per_target = config.architecture.driver is not None
-    means["model_s"] = None if per_target else sum(seconds["model"]) / len(seconds["model"])
+        means[task] = None
+        if own and (first or animatable(config)):
+            means[task] = mean_scores(own)
+    # a driver runs the whole network for each target
+    means["model_s"] = None
+    if config.architecture.driver is None:
+        means["model_s"] = sum(seconds["model"]) / len(seconds["model"])
     means["frame_s"] = sum(seconds["frame"]) / len(seconds["frame"])
     return means
 
 
 def pose_of(capture: Any, frame: int) -> bytes:
+    """Returns the rounded numbers of the pose of a frame, by which equal poses are found."""
     return b"".join(
         np.asarray(x, np.float32).round(5).tobytes() for x in jax.tree.leaves(capture.pose(frame))
     )
 
 
 def triple(scores: Any) -> str:
-    """PSNR / SSIM / LPIPS of a measured row or of a printed one; a dash where it is missing."""
+    """Formats PSNR / SSIM / LPIPS of a measured row or of a printed one, with a dash for what is
+    missing.
+    """
     if scores is None:
         return "-"
-    values = (
-        scores
-        if isinstance(scores, tuple)
-        else (scores["psnr"], scores["ssim"], scores.get("lpips_vgg"))
-    )
-    texts = [
-        f"{value:.{digits}f}" if value is not None else "-"
-        for value, digits in zip(values, (2, 3, 3), strict=True)
-    ]
+    values = scores
+    if not isinstance(scores, tuple):
+        values = (scores["psnr"], scores["ssim"], scores.get("lpips_vgg"))
+    texts = []
+    for value, digits in zip(values, (2, 3, 3), strict=True):
+        texts.append("-" if value is None else f"{value:.{digits}f}")
     return " / ".join(texts)

@@ -1,8 +1,9 @@
-"""The paper's tables with our rows beside the printed ones, on real data or synthetic people.
+"""Makes the paper's tables with our rows beside the printed ones, on real data or synthetic people.
 
-PSNR / SSIM / LPIPS by the protocol of the paper. Printed rows say so and are of the paper's data
-and training: they are no measure of ours. Rows are weights of any run or checkpoint, variants of
-the bench that are trained, and the shipped weights; those that take one photo get the first.
+The numbers are PSNR / SSIM / LPIPS by the protocol of the paper. Printed rows are marked. They come
+from the paper's data and training, so our rows cannot be compared with them. Our rows are weights
+of any run or checkpoint, trained variants of the bench, and the shipped weights. A network that
+takes one photo gets the first one.
 """
 
 import dataclasses
@@ -40,8 +41,8 @@ from humangs_jax.training.sources import people_on_disk
 COUNTS = (1, 2, 4, 6)
 K_VARIANTS = ("1 Gaussian a vertex", REFERENCE)
 Measure = Callable[..., Any]
-"""(name, people, photos, whether these show other poses) -> what `rows.measured` gives, or None;
-each is measured once.
+"""Function (name, people, photos, whether the photos show other poses) -> what `rows.measured`
+returns, or None. Each combination is measured once.
 """
 
 
@@ -56,10 +57,11 @@ class Compared:
     runs: the OUT of `paper`, whose trained variants are rows, too
     other: people of other kinds
     near: people seen by nearer cameras
-    train: folder of a run on the data set --train-on, which comes first, or goes on there: a row
+    train: folder of a run on the data set --train-on, which is trained first, or continued; it is
+        a row
     train_on: the people of that run
-    config: of that run, a preset or a JSON file
-    vgg19: weights of its perceptual loss
+    config: configuration of that run, a preset or a JSON file
+    vgg19: weights of the perceptual loss of that run
     """
 
     data: Path | None = None
@@ -77,26 +79,29 @@ class Compared:
 
 @entry
 def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ()) -> None:
-    """The paper's tables with our rows beside the printed ones, on real data or synthetic people.
+    """Makes the paper's tables with our rows beside the printed ones, on real data or synthetic
+    people.
 
-    animation: table 1, inputs of varying poses, novel poses and views; reconstruction: table 2,
-    views in the pose of the photos, and in others; domains: table 3, people like those of training
-    and of other kinds; views: 1, 2, 4 and 6 photos, cameras at the distance of training and nearer;
-    gaussians: 1 against 1 + 4 Gaussians a vertex, on all of these people.
+    "animation" is table 1, with inputs of varying poses, and novel poses and views.
+    "reconstruction" is table 2, with views in the pose of the photos and in others. "domains" is
+    table 3, with people like those of training and of other kinds. "views" has 1, 2, 4 and 6
+    photos, from cameras at the distance of training and nearer. "gaussians" compares 1 with 1 + 4
+    Gaussians a vertex, on all of these people.
 
     Options:
     only: which tables
     """
-    if unknown := set(only) - set(TABLES):
+    unknown = set(only) - set(TABLES)
+    if unknown:
         raise ValueError(f"--only {unknown.pop()}: expected some of {', '.join(TABLES)}")
     if options.data is None:
         raise ValueError("--data is needed: the people that the weights are measured on")
     enable_compile_cache()
-    given = options.weights + (train_first(options) if options.train else ())
-    systems, lpips = (
-        trained(options.runs, given),
-        load_loss_networks(lpips_net="vgg", installed=True).lpips,
-    )
+    given = options.weights
+    if options.train:
+        given += train_first(options)
+    systems = trained(options.runs, given)
+    lpips = load_loss_networks(lpips_net="vgg", installed=True).lpips
     settings, numbers = settings_of(options, given), {}
 
     def measure(
@@ -104,38 +109,49 @@ def tables(run: Run, options: Compared = Compared(), only: tuple[str, ...] = ())
     ) -> dict[str, Any] | None:
         if people is None or name not in systems:
             return None
-        photos = 1 if takes_one(systems[name][1]) and photos == PHOTOS else photos
-        key = f"{name}, {title(people)}, {photos}{', varying poses' if varying else ''}"
-        if key not in numbers:
-            fixed = options.indices if people == options.data and photos == PHOTOS else None
-            beside = people.with_name(f"evaluation_{photos}.json")
-            if not fixed and not varying and people.suffix == ".json" and beside.is_file():
-                fixed = beside
-            views = (
-                read_evaluation(fixed) if fixed else views_of(people, photos, options.body, varying)
-            )
-            networks = () if lpips is None else (lpips,)
-            one = functools.partial(
-                measured, systems[name], people, photos, options.body, networks, views
-            )
-            numbers.update(run.rows({key: one}, settings))
-            # programs map memory, and Linux ends a process with too many mappings
-            jax.clear_caches()
+        if takes_one(systems[name][1]) and photos == PHOTOS:
+            photos = 1
+        key = f"{name}, {title(people)}, {photos}"
+        if varying:
+            key += ", varying poses"
+        if key in numbers:
+            return numbers[key]
+
+        # views of a given file, of a file beside the scene list, or chosen here
+        fixed, beside = None, people.with_name(f"evaluation_{photos}.json")
+        if people == options.data and photos == PHOTOS:
+            fixed = options.indices
+        if not fixed and not varying and people.suffix == ".json" and beside.is_file():
+            fixed = beside
+        if fixed:
+            views = read_evaluation(fixed)
+        else:
+            views = views_of(people, photos, options.body, varying)
+        networks = () if lpips is None else (lpips,)
+        one = functools.partial(
+            measured, systems[name], people, photos, options.body, networks, views
+        )
+        numbers.update(run.rows({key: one}, settings))
+        # programs map memory, and Linux ends a process with too many mappings
+        jax.clear_caches()
         return numbers[key]
 
+    # rows of the networks that are systems, and not variants of the reference
     left_out = {name for name, variant in variants().items() if variant.about}
     names = [name for name in systems if name not in left_out]
     texts = [f"**{name}**\n\n{TABLES[name](names, measure, options)}" for name in only or TABLES]
-    rows = {
-        key: row and {name: shown(x) for name, x in row.items()} for key, row in numbers.items()
-    }
+    rows: dict[str, Any] = dict.fromkeys(numbers)
+    for key, row in numbers.items():
+        if row is not None:
+            rows[key] = {name: shown(x) for name, x in row.items()}
     run.show("\n\n".join(texts), {"settings": settings, "rows": rows})
 
 
 def train_first(options: Compared) -> tuple[str, ...]:
-    """Train the configuration, or go on there; its row.
+    """Trains the configuration of the options, or continues its run, and returns its weights as
+    (NAME=FILE,).
 
-    Raises: ValueError without people or VGG-19 where the loss needs it.
+    Raises: ValueError without people, or without VGG-19 where the loss needs it.
     """
     config, out, people = read_config(options.config), options.train, options.train_on
     if people is None or out is None:
@@ -157,24 +173,26 @@ def train_first(options: Compared) -> tuple[str, ...]:
 
 
 def title(people: Path) -> str:
-    """The name of people: that of their folder, also of a scene list."""
+    """Returns the name of people: that of their folder, or of the folder of a scene list."""
     return people.parent.name if people.suffix == ".json" else people.name
 
 
 def settings_of(options: Compared, given: Collection[str]) -> dict[str, Any]:
-    """What decides the numbers: the weights and the people.
+    """Returns what the numbers depend on: the weights and the people.
 
-    Raises: ValueError for people of one name, by which rows are kept.
+    Raises: ValueError if two folders of people have one name, because rows are kept by name.
     """
     names = sorted(title(path) for path in {options.data, options.near, *options.other} if path)
     if len(set(names)) < len(names):
         raise ValueError(
             f"people in folders of one name: {', '.join(names)}: expected a name for each"
         )
+    weights = {}
+    for text in given:
+        name, _, file = text.partition("=")
+        weights[name] = file_digest(Path(file))
     return {
-        "weights": {
-            name: file_digest(Path(file)) for name, _, file in (x.partition("=") for x in given)
-        },
+        "weights": weights,
         "runs": file_digest(options.runs / "results.json") if options.runs else None,
         "indices": file_digest(options.indices) if options.indices else None,
         "people": names,
@@ -182,12 +200,10 @@ def settings_of(options: Compared, given: Collection[str]) -> dict[str, Any]:
 
 
 def shown(value: Any) -> Any:
-    """Of the scores, those that the tables have."""
-    return (
-        [value[name] for name in ("psnr", "ssim", "lpips_vgg")]
-        if isinstance(value, dict)
-        else value
-    )
+    """Returns the scores that the tables have, or a value that is no scores unchanged."""
+    if isinstance(value, dict):
+        return [value[name] for name in ("psnr", "ssim", "lpips_vgg")]
+    return value
 
 
 # The tables: (names of our rows, measure, options) -> Markdown
@@ -200,11 +216,17 @@ def ours(
     columns: Sequence[tuple[Path | None, int, str]],
     cameras: str = "",
 ) -> list[list[str]]:
-    """Our rows: a name, its number of photos (or cameras), and for each column (people, photos,
-    task) the scores.
+    """Returns our rows: a name, its number of photos, and the scores of each column.
 
-    Those without a score for the first people are left out. cameras: then systems that take one
-    photo are shown with one alone.
+    Networks without a score in the first column are left out.
+
+    Args:
+        names: the networks
+        measure: see `Measure`
+        columns: (people, photos, task) of each column; the task "varying" is animation from photos
+            of other poses
+        cameras: text to show instead of the number of photos; then a network that takes one photo
+            has scores only where the column has one
     """
     rows = []
     for name in names:
@@ -214,17 +236,20 @@ def ours(
         ]
         if not found[0]:
             continue
+        # a column without a measured row, or with one of another number of photos, has a dash
         cells, count = [], found[0]["photos"]
         for row, (_, photos, task) in zip(found, columns, strict=True):
-            known = row and (not cameras or row["photos"] == photos)
-            cells.append(triple(row["animation" if task == "varying" else task]) if known else "-")
+            scores = None
+            if row and (not cameras or row["photos"] == photos):
+                scores = row["animation" if task == "varying" else task]
+            cells.append(triple(scores))
         given = "1 photo" if count == 1 else f"{count} photos"
         rows.append([name, cameras or given, *cells])
     return rows
 
 
 def animation(names: list[str], measure: Measure, options: Any) -> str:
-    """Table 1."""
+    """Makes table 1: animation from photos of varying poses."""
 
     def seconds(value):
         return "-" if value is None else significant(value)
@@ -239,7 +264,7 @@ def animation(names: list[str], measure: Measure, options: Any) -> str:
 
 
 def reconstruction(names: list[str], measure: Measure, options: Any) -> str:
-    """Table 2."""
+    """Makes table 2: reconstruction, and reconstruction with animation."""
     rows = [[name, PAPER, *map(triple, x)] for name, x in RECONSTRUCTION.items()]
     rows += ours(
         names, measure, [(options.data, PHOTOS, task) for task in ("reconstruction", "animation")]
@@ -250,7 +275,7 @@ def reconstruction(names: list[str], measure: Measure, options: Any) -> str:
 
 
 def domains(names: list[str], measure: Measure, options: Any) -> str:
-    """Table 3."""
+    """Makes table 3: people like those of training, and of other kinds."""
     others = options.other or [None]
     rows = [
         [name, PAPER, *map(triple, x), *[""] * (len(others) - 1)] for name, x in DOMAINS.items()
@@ -263,7 +288,7 @@ def domains(names: list[str], measure: Measure, options: Any) -> str:
 
 
 def views(names: list[str], measure: Measure, options: Any) -> str:
-    """Numbers of photos."""
+    """Makes the table of numbers of photos, by the distance of the cameras."""
     rows = [[name, f"{PAPER}, near", *map(triple, x)] for name, x in VIEWS.items()]
     for cameras, people in (("standard", options.data), ("near", options.near)):
         rows += ours(
@@ -273,7 +298,7 @@ def views(names: list[str], measure: Measure, options: Any) -> str:
 
 
 def gaussians(names: list[str], measure: Measure, options: Any) -> str:
-    """Gaussians a vertex, on as many sets as there are: those of training, near ones, others."""
+    """Makes the table of Gaussians a vertex, on all sets of people that are given."""
     sets = [people for people in (options.data, options.near, *options.other) if people]
     kinds = enumerate(("1", "1 tight + 4 free"))
     rows = [

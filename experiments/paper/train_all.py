@@ -1,5 +1,6 @@
 """Trains the variants of the bench one after the other, and scores them."""
 
+import functools
 import itertools
 import sys
 from collections.abc import Mapping
@@ -47,6 +48,9 @@ from humangs_jax.io.reading import read_json
 from humangs_jax.network.weights import load_weights
 
 VALIDATED, VIEWS, HELD_OUT_VIEWS, TRAIN_VIEWS = 8, 12, 4, 8
+"""Number of validation people, and views of a person: inputs, held-out views of each pose, and
+views for training of each pose.
+"""
 
 
 @entry
@@ -56,10 +60,11 @@ def paper(
     """Trains the paper's systems and ablations one after the other at 32 pixels, until each meets
     its criterion.
 
-    What the rounds of a run are, and when it counts as trained: `bench.py`. What is done stays in
-    OUT: the same command goes on there, also after a kill, from the last checkpoint. The reference
-    comes first, then a seed of each system, more seeds of the reference, the ablations, more seeds
-    of all. CPU seconds are of calls that were not killed; operations are of all steps.
+    `bench.py` describes the rounds of a run, and when it counts as trained. What is done stays in
+    OUT. The same command continues there from the last checkpoint, also after a kill. The reference
+    comes first, then a seed of each system, more seeds of the reference, the ablations, and more
+    seeds of all. CPU seconds are those of calls that were not killed. Operations are those of all
+    steps.
 
     Options:
     out: folder of the people, the runs and results.json
@@ -67,45 +72,57 @@ def paper(
     train: --no-train shows what is done
     quick: 4 people, rounds of 4 steps, two variants
     """
-    round_steps, people, test_people, seeds = (4, 4, 2, 1) if quick else (ROUND, 192, 32, SEEDS)
-    known, only = variants(), only or ((REFERENCE, "lvsm") if quick else ())
-    if unknown := [name for name in only if name not in known]:
+    round_steps, people, test_people, seeds = ROUND, 192, 32, SEEDS
+    if quick:
+        round_steps, people, test_people, seeds = 4, 4, 2, 1
+        only = only or (REFERENCE, "lvsm")
+    known = variants()
+    unknown = [name for name in only if name not in known]
+    if unknown:
         raise ValueError(f"--only {unknown[0]!r}: expected names of {', '.join(known)}")
     settings = {"round_steps": round_steps, "people": people, "test_people": test_people}
     path, place = out / "results.json", out / "people"
     report = kept(path, settings)
+
     if train:
         enable_compile_cache(out / "cache")
-        write_plain(
-            place / "validation", "validation", min(VALIDATED, test_people), VIEWS, HELD_OUT_VIEWS
-        )
-        write_plain(place / "test", "test", test_people, VIEWS, HELD_OUT_VIEWS)
-        write_plain(place / "near", "test", test_people, VIEWS, HELD_OUT_VIEWS, near=True)
-        write_plain(
-            place / "train", "train", people, TRAIN_VIEWS, size=2 * SIZE
-        )  # the loader averages
+        write_people(place, people, test_people)
+        # the baseline, which is the criterion of all runs
         if not report["painted"]:
             seen = tested(painted, place / "validation", PHOTOS)["reconstruction"]["psnr_fg"]
             test = {str(PHOTOS): tested(painted, place / "test", PHOTOS)}
             report["painted"] = {"validation": float(np.mean(seen)), "test": test}
             write_json(path, report)
-        for name, seed in (x for x in queue(seeds) if x[0] in (only or known)):
+        for name, seed in queue(seeds):
+            if only and name not in only:
+                continue
             if not finish(name, seed, out, report):
                 print(
                     f"interrupted in {name!r}, seed {seed}: the same command goes on there",
                     file=sys.stderr,
                 )
                 break
+
     if report["runs"]:
-        run.show(
-            table(report),
-            report | {"differences": differences(report), "ablations": ablations(report)},
-        )
+        numbers = {"differences": differences(report), "ablations": ablations(report)}
+        run.show(table(report), report | numbers)
+
+
+def write_people(place: Path, people: int, test_people: int) -> None:
+    """Writes the people of training, validation and test into a folder, where they are missing."""
+    write = functools.partial(write_plain, views=VIEWS, held_out=HELD_OUT_VIEWS)
+    write(place / "validation", "validation", min(VALIDATED, test_people))
+    write(place / "test", "test", test_people)
+    write(place / "near", "test", test_people, near=True)
+    # twice the size, which the loader averages
+    write_plain(place / "train", "train", people, TRAIN_VIEWS, size=2 * SIZE)
 
 
 def queue(seeds: int) -> list[tuple[str, int]]:
-    """Runs, the most wanted ones first: of systems a seed before a second one of any; what was
-    added later is last.
+    """Returns all runs (name, seed), the most wanted ones first.
+
+    Each system has a first seed before any variant has a second one. Systems that were added later
+    come last.
     """
     systems = [name for name, variant in variants().items() if not variant.about]
     others = [name for name, variant in variants().items() if variant.about]
@@ -117,13 +134,15 @@ def queue(seeds: int) -> list[tuple[str, int]]:
 
 
 def finish(name: str, seed: int, out: Path, report: dict[str, Any]) -> bool:
-    """Bring a run to its end and score it; the report is written after each round.
+    """Trains a run to its end and scores it. The report is written after each round.
 
-    False if it was interrupted.
+    Returns False if the run was interrupted.
     """
     variant, place = variants()[name], out / folder_of(name) / str(seed)
     rows = report["runs"].setdefault(name, {})
-    while "scores" not in (row := rows.get(str(seed), {})):
+    row = rows.get(str(seed), {})
+    while "scores" not in row:
+        # a round at a time, then the test scores
         if not row.get("done"):
             least, steps = report["painted"]["validation"], report["settings"]["round_steps"]
             row = train_run(variant, seed, place, out / "people", row, least, steps)
@@ -149,9 +168,9 @@ def finish(name: str, seed: int, out: Path, report: dict[str, Any]) -> bool:
 
 
 def kept(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The report in a file, an empty one without a file.
+    """Reads the report in a file, or returns an empty one without a file.
 
-    Raises: ValueError if it has other settings.
+    Raises: ValueError if the report has other settings.
     """
     if not path.is_file():
         return {"settings": dict(settings), "painted": {}, "runs": {}}
@@ -164,67 +183,38 @@ def kept(path: Path, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """A row a variant, with its difference to the reference; those that have not met the criterion
-    say how far they came.
+    """Formats a row for each variant with its difference to the reference, tables by number of
+    photos, and the ablations.
+
+    A variant that has not met the criterion shows how far it came instead of scores.
     """
-    runs, least, lines, counted, changes = (
-        report["runs"],
-        report["painted"]["validation"],
-        [],
-        [],
-        differences(report),
-    )
-    for name, own in ((name, own) for name, own in runs.items() if own):
-        rows, steps = finished(runs, name), max(x["steps"] for x in own.values())
-        spent = {"operations": 1e12, "cpu_seconds": 60}
-        compute = [f"{sum(x[key] for x in own.values()) / unit:.2g}" for key, unit in spent.items()]
-        last = next(iter(own.values()))
-        if not rows or not is_trained(rows[0], least):
-            said = f"{state_of(report, name)}, {last['validation']:.2f} dB in validation"
-            lines.append(
-                [name, last["photos"], 0, *["-"] * (len(SCORES) + 1), said, steps, *compute]
-            )
+    runs, least, changes = report["runs"], report["painted"]["validation"], differences(report)
+    lines, counted = [], []
+    for name, own in runs.items():
+        if not own:
             continue
-        means = {key: np.mean([headline(x)["reconstruction"][key] for x in rows]) for key in SCORES}
-        moved = "-"
-        if "animation" in headline(rows[0]):
-            moved = f"{np.mean([headline(x)['animation']['psnr_fg'] for x in rows]):.2f}"
-        lines.append(
-            [
-                name,
-                last["photos"],
-                len(rows),
-                *cells(means, SCORES),
-                moved,
-                str(changes.get(name, "")),
-                steps,
-                *compute,
-            ]
-        )
-        for kind in (COUNTS, NEAR):
-            if set(kind) <= set(rows[0]["scores"]):
-                means = [
-                    np.mean([x["scores"][test]["reconstruction"]["psnr_fg"] for x in rows])
-                    for test in kind
-                ]
-                counted.append(
-                    [name, "near" if kind == NEAR else "standard", *(f"{x:.2f}" for x in means)]
-                )
+        rows, last = finished(runs, name), next(iter(own.values()))
+        if rows and is_trained(rows[0], least):
+            scores = [len(rows), *mean_cells(rows), str(changes.get(name, ""))]
+            counted += photo_rows(name, rows)
+        else:
+            state = f"{state_of(report, name)}, {last['validation']:.2f} dB in validation"
+            scores = [0, *["-"] * (len(SCORES) + 1), state]
+        lines.append([name, last["photos"], *scores, *spent(own)])
+
+    # the baseline has the last row
     base = report["painted"]["test"][str(PHOTOS)]
     means, moved = ({key: np.mean(x) for key, x in base[task].items()} for task in TASKS)
     lines.append(
         [PAINTED, PHOTOS, "", *cells(means, SCORES), f"{moved['psnr_fg']:.2f}", "", "", "", ""]
     )
-    header = [
-        "variant",
-        "photos",
-        "seeds",
-        *(heading for heading, _ in SCORES.values()),
-        "another pose, foreground",
-    ]
-    header += [f"foreground against `{REFERENCE}`, dB", "steps", "TFLOP", "CPU minutes"]
+    header = ["variant", "photos", "seeds", *(heading for heading, _ in SCORES.values())]
+    header += ["another pose, foreground", f"foreground against `{REFERENCE}`, dB"]
+    header += ["steps", "TFLOP", "CPU minutes"]
+
+    # what the table shows, then the other tables
     settings = report["settings"]
-    said = (
+    about = (
         f"{settings['test_people']} test people. A run has rounds of {settings['round_steps']}"
         " steps, then a quarter as many "
         f"with the perceptual loss. Rounds end {MARGIN:g} dB of foreground PSNR above the"
@@ -233,31 +223,65 @@ def table(report: Mapping[str, Any]) -> str:
         " the perceptual loss has "
         "taken it below the baseline. Intervals: 95 %, over people and seeds."
     )
-    texts = [markdown_table(header, lines), said]
+    texts = [markdown_table(header, lines), about]
     if counted:
-        texts.append(
-            markdown_table(
-                ["foreground PSNR, dB, by photos", "cameras", *COUNTS], counted, "llrrrr"
-            )
-        )
+        heads = ["foreground PSNR, dB, by photos", "cameras", *COUNTS]
+        texts.append(markdown_table(heads, counted, "llrrrr"))
     for part, (heads, rows) in ablations(report).items():
         texts += [f"{part}; a gain is positive:", markdown_table(heads, rows, "lllrrrr")]
     return "\n\n".join(texts)
 
 
+def spent(runs: Mapping[str, Any]) -> list[Any]:
+    """Returns the cells of what the runs of a variant have spent: most steps, TFLOP and CPU
+    minutes.
+    """
+    units = {"operations": 1e12, "cpu_seconds": 60}
+    sums = [sum(run[key] for run in runs.values()) / unit for key, unit in units.items()]
+    return [max(run["steps"] for run in runs.values()), *(f"{value:.2g}" for value in sums)]
+
+
+def mean_cells(rows: list[dict[str, Any]]) -> list[str]:
+    """Returns the cells of mean scores over the seeds of a variant, and of its foreground in
+    another pose.
+    """
+    found = [headline(row) for row in rows]
+    means = {key: np.mean([each["reconstruction"][key] for each in found]) for key in SCORES}
+    moved = "-"
+    if "animation" in found[0]:
+        moved = f"{np.mean([each['animation']['psnr_fg'] for each in found]):.2f}"
+    return [*cells(means, SCORES), moved]
+
+
+def photo_rows(name: str, rows: list[dict[str, Any]]) -> list[list[str]]:
+    """Returns rows of foreground PSNRs by number of photos, for the cameras that a variant was
+    tested with.
+    """
+    found = []
+    for cameras, tests in {"standard": COUNTS, "near": NEAR}.items():
+        if not set(tests) <= set(rows[0]["scores"]):
+            continue
+        line = [name, cameras]
+        for test in tests:
+            scores = [row["scores"][test]["reconstruction"]["psnr_fg"] for row in rows]
+            line.append(f"{np.mean(scores):.2f}")
+        found.append(line)
+    return found
+
+
 def differences(report: Mapping[str, Any]) -> dict[str, Difference]:
-    """To the reference, of the foreground in the pose of the photos, each trained variant with its
-    own number of photos.
+    """Returns {trained variant: its difference to the reference}, of the foreground in the pose of
+    the photos, with the number of photos that each was trained with.
     """
     runs, ready = report["runs"], trained_names(report)
-    with_photos = {
-        name: (name, finished(runs, name)[0]["photos"]) for name in ready if name != REFERENCE
-    }
-    return {
-        name: difference(runs, own, (REFERENCE, PHOTOS))
-        for name, own in with_photos.items()
-        if REFERENCE in ready
-    }
+    if REFERENCE not in ready:
+        return {}
+    found = {}
+    for name in ready:
+        if name != REFERENCE:
+            photos = finished(runs, name)[0]["photos"]
+            found[name] = difference(runs, (name, photos), (REFERENCE, PHOTOS))
+    return found
 
 
 ABLATIONS = {
@@ -266,12 +290,13 @@ ABLATIONS = {
     "1 tight + 4 free Gaussians a vertex instead of 1": "1 Gaussian a vertex",
     "Photos, over the number before": REFERENCE,
 }
-"""The paper's, and the variant without the part; that of photos compares the reference with itself.
+"""{ablation of the paper: the variant without the part}. That of photos compares the reference with
+itself.
 """
 
 
 def ablations(report: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list[str]]]]:
-    """Heading and rows of each ablation: what a part gains, by cameras, poses and numbers of
+    """Returns {ablation: (header, rows)} of what a part gains, by cameras, poses and numbers of
     photos.
     """
     runs, ready, found = report["runs"], trained_names(report), {}
@@ -282,19 +307,19 @@ def ablations(report: Mapping[str, Any]) -> dict[str, tuple[list[str], list[list
     for part, other in ABLATIONS.items():
         lines = []
         for kind, task, score in itertools.product((COUNTS, NEAR), TASKS, ("psnr", "lpips_alex")):
+            # a smaller LPIPS is a gain
             sign, digits = (1, 2) if score == "psnr" else (-1, 4)
-            before = kind if other != REFERENCE else ("", *kind)
+            before = ("", *kind) if other == REFERENCE else kind
             gains = []
             for a, b in zip(kind, before, strict=False):
-                known = scored(REFERENCE, a, task) and scored(other, b, task)
-                gain = difference(runs, (REFERENCE, a), (other, b), task, score) if known else None
-                gains.append(
-                    "-" if gain is None else gain._replace(mean=sign * gain.mean).text(digits)
-                )
+                if not scored(REFERENCE, a, task) or not scored(other, b, task):
+                    gains.append("-")
+                    continue
+                gain = difference(runs, (REFERENCE, a), (other, b), task, score)
+                gains.append(gain._replace(mean=sign * gain.mean).text(digits))
             if set(gains) != {"-"}:
-                lines.append(
-                    ["near" if kind == NEAR else "standard", TASKS[task], SCORES[score][0], *gains]
-                )
+                cameras = "near" if kind == NEAR else "standard"
+                lines.append([cameras, TASKS[task], SCORES[score][0], *gains])
         if lines:
             found[part] = (["cameras", "shown", "gain", *COUNTS], lines)
     return found
