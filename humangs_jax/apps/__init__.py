@@ -1,3 +1,1 @@
-"""Applications: demonstration, presets and budgets, checks of captures, photos without a
-calibration.
-"""
+"""Demonstration, presets and budgets, checks of captures, photos without a calibration."""

@@ -1,3 +1,3 @@
-"""Avatars: reconstruction, animation, light, frames, layers and videos. `export` has the table of
+"""Reconstruction, animation, light, frames, layers and videos of avatars. `export` has the table of
 formats.
 """

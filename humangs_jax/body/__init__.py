@@ -1,3 +1,3 @@
-"""The body: `BodyModel`, `shape_body`, `pose_body`, skinning, landmarks, the reader of SMPL-X, and
-the CC0 default body.
+"""`BodyModel`, `shape_body`, `pose_body`, skinning, landmarks, the reader of SMPL-X, and the CC0
+default body.
 """

@@ -1,12 +1,13 @@
-"""The `humangs` program: a dataclass for each command. Its fields are options, `run` does the work.
+"""The `humangs` program. Each command is a dataclass: its fields are options, and `run` does the
+work.
 
 Modules here import nothing heavy, so that `--help` is fast. A command imports what it needs when it
-runs, after its options and the places that it writes to were checked. All commands take --quiet,
---verbose and --version.
+runs, after its options and output places were checked. All commands take --quiet, --verbose and
+--version.
 
-Exit codes: 0; 1 for bad data (a capture, a file that cannot be read); 2 for bad usage (an option, a
-place that cannot be written to); 130 after Ctrl-C; 141 where the reader of a pipe has gone. Errors
-are one line on stderr, with nothing half-written.
+Exit codes: 0 for success; 1 for bad data (a capture, a file that cannot be read); 2 for bad usage
+(an option, a place that cannot be written to); 130 after Ctrl-C; 141 if the reader of a pipe has
+closed it. Errors are one line on stderr, and no file is left half-written.
 """
 
 import difflib
@@ -19,24 +20,26 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 from humangs_jax import __version__
 
 BAD_DATA = 1
-"""Exit status where files or data are wrong."""
+"""Exit status if files or data are wrong."""
 BAD_USAGE = 2
-"""Exit status where the command line is wrong."""
+"""Exit status if the command line is wrong."""
 INTERRUPTED = 130
-"""Exit status after Ctrl-C: 128 and the number of the signal, as in shells."""
+"""Exit status after Ctrl-C, which is 128 plus the number of the signal, as in shells."""
 BROKEN_PIPE = 141
-"""Exit status where the reader of the output has closed it: 128 and the number of the signal."""
+"""Exit status if the reader of the output has closed it, which is 128 plus the number of the
+signal.
+"""
 
 
 @runtime_checkable
 class Command(Protocol):
     """A subcommand with its options.
 
-    The first line of its docstring is its line in `humangs --help`.
+    The first paragraph of its docstring is its line in `humangs --help`.
     """
 
     examples: ClassVar[tuple[str, ...]]
-    """Examples of command lines, which end --help."""
+    """Examples of command lines, shown at the end of --help."""
 
     def run(self) -> None:
         """Does the work of the command. Raises: ValueError or OSError for wrong input."""
@@ -72,7 +75,7 @@ GROUPS = {
         "convert": "training.Convert",
     },
 }
-"""Commands by purpose, with the module and class of each, which are imported when needed."""
+"""Commands by purpose, each with its module and class, which are imported when they are needed."""
 COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items()}
 EVERYWHERE = """Options of every command:
   --help       its options, with examples
@@ -83,7 +86,7 @@ Completion for bash, zsh or tcsh: humangs --tyro-print-completion SHELL"""
 
 
 def main() -> None:
-    """Runs the console script. Slow imports happen after Ctrl-C is handled."""
+    """Runs the console script. Slow imports happen only after Ctrl-C is handled."""
     try:
         _prepare("--verbose" in sys.argv)
         code = execute(sys.argv[1:])
@@ -98,7 +101,8 @@ def main() -> None:
 
 
 def execute(arguments: Sequence[str]) -> int:
-    """Runs a command line in this process and returns the exit code.
+    """Runs a command line in this process and returns the exit code. arguments: words after
+    `humangs`.
 
     Raises: SystemExit for --help.
     """
@@ -144,7 +148,9 @@ def execute(arguments: Sequence[str]) -> int:
 
 
 def _prepare(verbose: bool) -> None:
-    """Sets up Ctrl-C, logs, memory and caches of the process, before JAX is imported."""
+    """Sets up Ctrl-C, logs, memory and caches of the process. Call it before JAX is imported.
+    verbose: whether logs of libraries are shown.
+    """
     from humangs_jax.cli.screen import end_within_seconds, silence
 
     end_within_seconds()
@@ -159,7 +165,9 @@ RENAMED = {
     "fit": {"--bare": "--tight-clothes", "--refine": "--to-masks"},
     "refine": {"--limit": "--refine"},
 }
-"""For each command, old names of options and the new ones, which errors about old names show."""
+"""For each command, old names of options with the new names. An error about an old name shows the
+new one.
+"""
 
 
 def _parsed(arguments: list[str]) -> Command:
@@ -220,7 +228,7 @@ def summary(command: type[Any]) -> str:
 
 
 def overview() -> str:
-    """Returns what `humangs --help` prints: all commands by purpose, a line for each."""
+    """Returns the text of `humangs --help`: all commands by purpose, one line each."""
     lines = ["usage: humangs COMMAND [OPTIONS]", ""]
     lines.append("Animatable 3D Gaussian humans from a few photos with body poses.")
     for group, commands in GROUPS.items():
@@ -235,9 +243,8 @@ def _command(name: str) -> type[Any]:
 
 
 def _failed(error: Exception, verbose: bool) -> int:
-    """Shows an error in one line, and returns the exit code.
-
-    An argument of the library that the error names is shown as an option.
+    """Shows an error in one line, and returns the exit code. If the error names an argument of the
+    library, the option of that name is shown. verbose: whether the traceback is shown, too.
     """
     from humangs_jax.cli import screen
     from humangs_jax.cli.options import UsageError, option_of

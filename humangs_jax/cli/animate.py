@@ -39,14 +39,14 @@ _FINITE = at_least(-LARGEST)
 _VIDEO = OutputPath(VIDEOS.suffixes, folder=True)
 """Annotation of an option for a video, or for a folder of images."""
 _FROM_THE_SIDE = FrameSettings(azimuth=20.0)
-"""Settings of the frames of `humangs animate` by default."""
+"""Default settings of the frames of `humangs animate`."""
 _SPLATS = {
     suffix: each
     for each in (*EXPORTS.values(), *READ_ONLY.values())
     if not each.mesh
     for suffix in each.suffixes
 }
-"""Files of Gaussians, and the axis that points up in them."""
+"""Formats of files of Gaussians, by suffix."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -419,7 +419,7 @@ def _drawn_by(shot: FrameSettings, preset: Preset | None, config: Path | None) -
 def _pruned(
     avatar: "Avatar", poses: "BodyPose", cameras: "Camera", shot: FrameSettings
 ) -> "Avatar":
-    """Removes Gaussians that are in no image, if --prune is given, and prints their number."""
+    """Removes Gaussians that no image shows, if --prune is given, and prints their number."""
     from humangs_jax.avatar.frames import splatting_of, without_unseen
 
     if not shot.prune:
@@ -453,7 +453,7 @@ def _counted(count: int, word: str) -> str:
 
 
 def _size(path: Path, camera: "Camera") -> str:
-    """Returns the size of the images in the file as text.
+    """Returns the size of the images in a file, as text such as "512 x 512".
 
     A video may have one row or column more than the images that are drawn.
     """

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 class Demo:
     """Try everything on the shipped person.
 
-    Reconstructs, refines, renders held-out views, animates, and writes the avatar; all at the end.
+    Reconstructs and refines an avatar, renders held-out views, animates, and writes all files at
+    the end.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -75,8 +76,8 @@ class Reconstruct:
     """Reconstruct avatars from capture folders.
 
     A capture is photos, cameras and body poses. Several captures, or a folder of them, become
-    OUT/NAME.npz. Avatars that exist are kept, so that the same command goes on after an
-    interruption. If the capture of one was changed since, it is named and nothing is made. A
+    OUT/NAME.npz. Avatars that exist are kept, so after an interruption the same command goes on. If
+    a capture was changed since its avatar was made, the avatar is named and nothing is made. A
     capture that fails does not stop the others. docs: capture_format.
     """
 
@@ -85,27 +86,25 @@ class Reconstruct:
         "humangs reconstruct people --out avatars --shard 0/8",
     )
     captures: Positional[tuple[Path, ...]]
-    """Folders with capture.json, or with such folders in them; "demo_capture" is the shipped
-    one.
-    """
+    """Folders with capture.json, or folders of such folders. "demo_capture" is the shipped one."""
     out: Path | None = None
-    """The avatar file to write or replace, default: avatar.npz; of several captures a folder,
-    default: avatars.
+    """The avatar file to write or replace (default: avatar.npz), or for several captures a folder
+    (default: avatars).
     """
     views: Annotated[int | Literal["auto"] | None, at_least(1)] = None
-    """How many photos to use: those that together show most of the body; auto: those that add
+    """How many photos to use: those that together show most of the body. auto: photos that add
     something. Default: all.
     """
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
     tokens: Literal["as_trained", "all", "foreground"] = "as_trained"
-    """The patches that the network reads: all, or several times faster those that show the
-    person (docs: performance).
+    """The patches that the network reads: all, or only those that show the person, which is several
+    times faster (docs: performance).
     """
     dtype: Literal["as_trained", "float32", "bfloat16", "float16"] = "as_trained"
-    """Number type of the encoder's matrix products; the 16-bit ones are faster on GPU and TPU."""
+    """Number type of the encoder's matrix products. 16-bit types are faster on GPU and TPU."""
     refine: str | None = None
-    """Fit the avatar to its photos for so long: 15s (or 15), 100steps, or 0.
+    """How long to fit the avatar to its photos: 15s (or 15), 100steps, or 0.
 
     Default, with masks: iterations and the head.
     """
@@ -116,7 +115,7 @@ class Reconstruct:
     config: Path | None = None
     """As --preset, from a file of `humangs tune`."""
     batch: Annotated[int | None, at_least(1)] = None
-    """Captures that the network reads at once. Default: 8."""
+    """Number of captures that the network reads at once. Default: 8."""
     shard: str = "0/1"
     """I/N: the I-th of N parts of the captures, counted from 0, for job arrays."""
     fit_masks: Annotated[
@@ -222,7 +221,7 @@ class Reconstruct:
     def _unmade(
         self, out: Path, captures: dict[str, Path], part: int, parts: int
     ) -> dict[str, Path]:
-        """Returns those captures of one part of a set that have no avatar yet.
+        """Returns the captures of one part of a set that have no avatar yet.
 
         part, parts: index of the part, and number of parts.
 
@@ -276,8 +275,8 @@ class Reconstruct:
 class Refine:
     """Fit an avatar to the photos of a capture.
 
-    By learned-optimizer iterations, then gradient descent. Ctrl-C ends it early; the best avatar
-    until then is written.
+    First by iterations of the learned optimizer, then by gradient descent. Ctrl-C ends it early,
+    and the best avatar so far is written.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -287,15 +286,17 @@ class Refine:
     avatar: Positional[Path]
     """File written by `humangs reconstruct` from these photos."""
     capture: Positional[Path]
-    """Folder with capture.json: may have more or larger photos than the network saw."""
+    """Folder with capture.json. It may have more or larger photos than the network saw."""
     out: Annotated[Path, AVATAR] = Path("refined.npz")
     """The avatar file to write or replace."""
     refine: str = "15s"
-    """How long after compiling: 15s (or 15), 100steps, or 0steps for the iterations alone."""
+    """How long to refine, without compilation: 15s (or 15), 100steps, or 0steps for iterations
+    only.
+    """
     iterations: Annotated[int, Range(0, 16)] = ITERATIONS
-    """Learned-optimizer iterations before the steps."""
+    """Iterations of the learned optimizer before the steps."""
     image_size: Side | None = None
-    """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
+    """Reduce photos whose longer side exceeds this, pixels. Default: no photo is reduced."""
     fit_masks: Annotated[
         bool, off("move masks that are too large or too small to the edges in the photos")
     ] = True
@@ -320,7 +321,8 @@ class Refine:
 
 
 def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
-    """Returns the capture folders by name: those given, and those inside of other given folders.
+    """Returns the capture folders by name: given folders that are captures, and captures inside of
+    other given folders.
 
     Raises: UsageError if two of them have the same name.
     """
@@ -342,7 +344,7 @@ def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
 
 
 def _check_source(avatar: Path, capture: Path) -> None:
-    """Checks that an avatar was made from what its capture has now.
+    """Checks that an avatar was made from the present content of its capture.
 
     Raises: CaptureError, which names both, if it was not.
     """
@@ -363,8 +365,9 @@ def _read_capture(
 ) -> "PreparedCapture":
     """Reads the views of a capture that show the person, and warns about what looks wrong.
 
-    check: whether photos, cameras and poses are checked. views: as --views of `reconstruct`. None:
-    all views that show the person.
+    check: whether to check photos, cameras and poses. fit_masks: whether to move masks to the edges
+    in the photos, and to look for what is in front of the person. views: as --views of
+    `reconstruct`. None: all views that show the person.
 
     Raises: ValueError if no view shows the person.
     """
@@ -413,8 +416,8 @@ def _refine_and_save(
 ) -> None:
     """Refines an avatar with a progress bar, and writes it.
 
-    how: None for no refinement. unfinished: whether the avatar is written if its refinement was
-    interrupted. made_from: checksum of the capture that is written into the file.
+    how: None for no refinement. unfinished: whether the avatar is written even if its refinement
+    was interrupted. made_from: checksum of the capture, which is recorded in the file.
 
     Raises: KeyboardInterrupt, at the end, if the refinement was interrupted.
     """
@@ -444,9 +447,9 @@ def _save(avatar: "Avatar", out: Path, how: str, made_from: str | None) -> None:
 class Tune:
     """Find the best preset within a budget of time or memory.
 
-    The presets are timed on this machine with this person, without compilation. The result is for
-    --config of `reconstruct`, `animate`, `render`. The exit code is 1, and nothing is written, if
-    no preset is within the budget. docs: tradeoff.
+    Presets are timed on this machine with this person, without compilation. The result is for
+    --config of `reconstruct`, `animate` and `render`. If no preset is within the budget, nothing is
+    written and the exit code is 1. docs: tradeoff.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -458,11 +461,11 @@ class Tune:
     out: Annotated[Path, OutputPath((".json",))] = Path("tuned.json")
     """The settings to write."""
     reconstruct_ms: float | None = None
-    """The most that making the avatar may take, with refinement, milliseconds."""
+    """Longest time to make the avatar, with refinement, milliseconds."""
     frame_ms: float | None = None
-    """The most that a frame may take, milliseconds; 33 is 30 frames per second."""
+    """Longest time of a frame, milliseconds. 33 is 30 frames per second."""
     memory_mb: float | None = None
-    """The most memory that this may add to the process, MiB."""
+    """Most memory that this may add to the process, MiB."""
     size: Side = 512
     """Side of the frames in pixels."""
     weights: Path | None = None

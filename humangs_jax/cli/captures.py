@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
-    """Warns about photos without the person, and about what was repaired."""
+    """Warns about what is doubtful in the photos of a person, see `apps.detect.remarks`."""
     from humangs_jax.apps.detect import remarks
 
     for line in remarks(photos, person):
@@ -36,8 +36,9 @@ def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
 def found_here(capture: Path, person: int | None) -> Path:
     """Returns the file of keypoints in a capture folder.
 
-    Keypoints and masks that the folder lacks are found in its photos and written there. person: the
-    number on the sheet, if several people are in the photos; keypoints are then found again.
+    If the folder lacks keypoints or masks, they are found in its photos and written there. person:
+    number of the person on the sheet, if the photos show several people. Keypoints are then found
+    again.
     """
     from humangs_jax.apps import detect
     from humangs_jax.data.photos import capture_folder, load_photos
@@ -77,9 +78,9 @@ class Detect:
     out: Annotated[Path, OutputPath()]
     """Folder for keypoints.json, masks/ and people.png (the sheet)."""
     person: Annotated[int | None, at_least(0)] = None
-    """Which person, by the number on people.png. Default: the one who is largest."""
+    """Number of the person on people.png. Default: the largest person."""
     overwrite: bool = False
-    """Replace keypoints.json, people.png and masks of other programs, too."""
+    """Also replace keypoints.json, people.png and masks of other programs."""
 
     def run(self) -> None:
         with stage("starting"):
@@ -105,14 +106,14 @@ class Detect:
 
 
 SIZES = (128, 256, 512)
-"""Sides of photos, in pixels, that `humangs synth` can write; training reads these."""
+"""Sides of photos that `humangs synth` can write, pixels. Training reads these sizes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ImportCameras:
     """Make a capture folder from photos and calibrated cameras.
 
-    Then `humangs fit` finds the body. Conventions of every format: docs: cameras.
+    Afterwards `humangs fit` finds the body. Conventions of every format: docs: cameras.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -120,37 +121,37 @@ class ImportCameras:
         "humangs import cameras sparse/0 --images photos --scale 0.01 --up=-y --out me",
     )
     what: Positional[Literal["cameras"]]
-    """"cameras"."""
+    """The word "cameras"."""
     source: Annotated[
         Positional[Path], arg(help=f"File or folder with the calibration: {CAMERAS.listed()}.")
     ]
     images: Path
-    """Folder of the photos, or of a video of each camera (CAMERA.mp4; all begin at the same
-    moment).
+    """Folder of the photos, or of one video per camera (CAMERA.mp4), all of which begin at the same
+    moment.
     """
     out: Path
     """The capture folder to write."""
     masks: Path | None = None
     """Folder of masks, named like the photos."""
     others: Path | None = None
-    """Folder of masks of other people and of things in front of the person, named like the photos
-    that show some.
+    """Folder of masks of other people and of things in front of the person, named like the photos.
+    Photos that show none need no mask.
     """
     scale: float | None = None
     """Metres per unit of the source. Default: 1."""
     up: str | None = None
     """Axis of the source's world that points up, like --up=+z or --up=-y. Default: the format's."""
     pixel_centers: Literal["integer", "half"] | None = None
-    """Where the source has the centre of the first pixel: at 0 (integer) or 0.5 (half).
+    """Position of the first pixel's centre in the source: 0 (integer) or 0.5 (half).
 
     Default: the format's.
     """
     every: int = 1
     """Frame step of videos: 10 takes frames 0, 10, 20 and so on."""
     max_frames: int | None = None
-    """Take at most that many frames of the videos."""
+    """Take at most this many frames of the videos."""
     overwrite: bool = False
-    """Replace the capture folder."""
+    """Replace an existing capture folder."""
 
     def run(self) -> None:
         inputs = (self.source, self.images, self.masks, self.others)
@@ -191,7 +192,7 @@ class Synth:
     subjects: Annotated[int, at_least(1)] = 8
     """Number of people."""
     split: Literal["train", "validation", "test", "demo"] = "train"
-    """The seeds of the splits never overlap."""
+    """Which set of seeds to use. The seeds of different sets never overlap."""
     first: Annotated[int, at_least(0)] = 0
     """Number of the first subject within the split."""
     size: int = 512
@@ -199,20 +200,23 @@ class Synth:
     views: Annotated[int | None, at_least(1)] = None
     """Photos of each pose, around the person, 1.8 to 2.2 bounding radii away. Default: 60."""
     close_views: Annotated[int | None, at_least(0)] = None
-    """Further photos of each pose, 0.8 to 1.7 radii away, of parts of the person.
+    """Number of further photos of each pose that show parts of the person, from 0.8 to 1.7 radii
+    away.
 
     Default: 12, or 0 with --views.
     """
     poses: Annotated[int, at_least(1)] = 1
     """Poses per subject."""
     sequences: bool = False
-    """The poses are frames of a walk, a turn or a reach, which is written as motion.npz."""
+    """Take the poses from a motion: a walk, a turn or a reach, which is written as motion.npz."""
     motion_frames: Annotated[int, at_least(1)] = 60
-    """Length of that motion, 30 frames per second."""
+    """Number of frames of that motion, 30 per second."""
     for_training: bool = False
-    """Short for 2 poses x 12 views at 256 pixels and no others, enough for `humangs train`."""
+    """Short for 2 poses x 12 views at 256 pixels and no close views, which is enough for `humangs
+    train`.
+    """
     held_out: Annotated[int, at_least(0)] = 0
-    """Views of the first pose from other cameras, in the sub-folder held_out/."""
+    """Number of views of the first pose from other cameras, in the sub-folder held_out/."""
     scans: bool = False
     """Also write scan/: the first pose as a textured mesh, OBJ and GLB."""
     workers: Workers = None

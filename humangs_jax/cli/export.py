@@ -1,4 +1,4 @@
-"""`humangs export`: files of an avatar for other programs."""
+"""`humangs export`: writes files of an avatar for other programs."""
 
 import dataclasses
 from pathlib import Path
@@ -23,7 +23,8 @@ _DOWN = alternatives(EXPORTS.where(lambda each: each.up == "-y").suffixes)
 class Export:
     """Export Gaussians, a textured mesh, or an HTML viewer.
 
-    In the T-pose, in one frame of a motion, or in many. Programs and formats: docs: export.
+    The avatar is in T-pose, or in one or many frames of a motion. Programs and formats: docs:
+    export.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -44,16 +45,18 @@ class Export:
     html: Annotated[Path | None, OutputPath((".html",))] = None
     """The HTML viewer to write: one file that needs no network (docs: viewer)."""
     mesh: bool = False
-    """Write the body, not the Gaussians: a .glb then holds its skin, and --motion as animation."""
+    """Write the body instead of the Gaussians. A .glb then has its skin, and --motion as
+    animation.
+    """
     motion: Path | None = None
     """The motion that the viewer plays (default: the shipped walk) or that poses --out (default:
     T-pose). docs: motions.
     """
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
     frame: int | None = None
-    """Which frame of the motion, from 0. Default: the first."""
+    """Number of the frame of the motion, from 0. Default: the first."""
     frames: str | None = None
-    """Many frames: a:b:step as in Python, ":" for all.
+    """Several frames: a:b:step as in Python, ":" for all.
 
     X.ply becomes X_0000.ply, X_0005.ply and so on.
     """
@@ -67,9 +70,9 @@ class Export:
         ),
     ] = None
     rest: bool = False
-    """Add the 45 zero f_rest fields of 3DGS that some importers (Unity) require."""
+    """Add the 45 f_rest fields of 3DGS, all zero, which some importers (Unity) require."""
     spz_version: Literal[3, 4] | None = None
-    """Version of a .spz. Default: 3, which more programs read."""
+    """Version of a .spz file. Default: 3, which more programs read."""
 
     def run(self) -> None:
         out = self.out
@@ -99,7 +102,10 @@ class Export:
             suggest("humangs animate", self.avatar, *played, "--out video.mp4")
 
     def _check(self, out: Path | None) -> None:
-        """Refuses options that do not go together, before anything is read. Raises: UsageError."""
+        """Refuses options that do not go together, before anything is read.
+
+        Raises: UsageError.
+        """
         form = None
         if out is not None:
             # a mesh goes into fewer formats than Gaussians

@@ -1,6 +1,7 @@
-"""The commands `humangs fit` and `humangs check`: find the body in photos, and check the result.
+"""The commands `humangs fit` and `humangs check`, which find the body in photos and check the
+result.
 
-Options and places are checked before the work begins. Results are written after it.
+Options and output places are checked before the work begins. Results are written at its end.
 """
 
 import dataclasses
@@ -33,12 +34,13 @@ class Detections:
         Path | None, arg(help=f"Keypoint file or folder: {KEYPOINTS.listed()}.")
     ] = None
     person: int | None = None
-    """Number of the person, from 0, if a view has several: in the keypoint file or, without one, on
-    people.png.
+    """Number of the person, from 0, if a view has several: the number in the keypoint file, or on
+    people.png if there is no such file.
     """
 
     def read(self, views: Any) -> Any:
-        """Reads the keypoints of the views of a `Photos` or `Capture`; None if there is no file.
+        """Reads the keypoints of the views of a `Photos` or `Capture`. Returns None if no file was
+        given.
 
         Raises: see `read_keypoints`.
         """
@@ -50,9 +52,11 @@ class Detections:
         return read_keypoints(self.keypoints, views.names, width, height, person=self.person)
 
     def read_or_recorded(self, capture: Path, views: Any) -> tuple[Any, Any]:
-        """Reads the keypoints of the views, from --keypoints or from an earlier fit of the capture.
+        """Reads the keypoints of the views from --keypoints, or else from an earlier fit of the
+        capture.
 
-        Returns: the keypoints, and the record of the earlier fit. Each is None if there is none.
+        Returns the keypoints, and the record of the earlier fit if they are from it. Each is None
+        if there is none.
         """
         from humangs_jax.capture.fitting.files import FIT_FILE, read_fit_record
         from humangs_jax.data.photos import capture_folder
@@ -66,12 +70,13 @@ class Detections:
 
 @dataclasses.dataclass(frozen=True)
 class MaskFit:
-    """Fit of a capture that has a body."""
+    """Options of the fit to masks, for a capture that has a body."""
 
     to_masks: bool = False
-    """Improve cameras, shape and poses by masks and keypoints: those of the fit, or --keypoints.
+    """Improve cameras, shape and poses by masks and keypoints.
 
-    Never worse than the start.
+    Keypoints are those of the earlier fit, or --keypoints. The result is never worse than the
+    start.
     """
     fixed_cameras: bool = False
     """Leave cameras as they are.
@@ -80,9 +85,9 @@ class MaskFit:
     --to-masks moves all cameras.
     """
     tight_clothes: bool = False
-    """With --to-masks, fill the masks: to measure a body in no or tight clothes.
+    """With --to-masks, let the body fill the masks, to measure a body in tight clothes or none.
 
-    Avatars are better without.
+    For avatars it is better without.
     """
 
 
@@ -91,15 +96,15 @@ WAYS: dict[_Way, set[str]] = {
     "--to-masks": {"keypoints", "person", "fixed_cameras", "tight_clothes"},
     "--keypoints": {"person", "body", "smoothness", "fixed_cameras"},
 }
-"""The two ways to fit, by the option that chooses each, and their other options."""
+"""The two ways to fit, named by the option that chooses each, with their other options."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
     """Find the body in photos with cameras.
 
-    Shape and poses come from 2D keypoints: those of --keypoints, or of the shipped detector. With
-    --to-masks: better cameras and poses from masks. docs: fitting.
+    Shape and poses are fitted to 2D keypoints: those of --keypoints, or those of the shipped
+    detector. --to-masks improves cameras and poses by masks. docs: fitting.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -109,17 +114,17 @@ class Fit:
     detections: OmitArgPrefixes[Detections]
     mask_fit: OmitArgPrefixes[MaskFit]
     capture: Positional[Path]
-    """Folder with capture.json; its body.npz need not exist."""
+    """Folder with capture.json. It need not have a body.npz yet."""
     body: Path | None = None
     """Model file (SMPL-X .npz or .pkl). Default: the shipped body."""
     smoothness: Annotated[float, at_least(0)] = 0.0
-    """For sequences: typical acceleration of joints, metres per frame squared; 0.02 for walking at
-    24 fps. 0: none.
+    """For sequences: typical acceleration of joints, metres per frame squared, such as 0.02 for
+    walking at 24 fps. 0: no smoothing.
     """
     out: Path | None = None
     """Folder for the result. Default: the capture folder itself."""
     overwrite: bool = False
-    """Replace what is there."""
+    """Replace an existing result."""
 
     def run(self) -> None:
         """Fits to masks or to keypoints, as the options say."""
@@ -137,7 +142,7 @@ class Fit:
             self._fit_keypoints()
 
     def _given(self) -> Iterator[str]:
-        """Yields the names of options of fitting whose value is not the default."""
+        """Yields the names of the options of fitting whose value is not the default."""
         for part in (self.mask_fit, self.detections, self):
             for field in dataclasses.fields(part):
                 value = getattr(part, field.name)
@@ -146,7 +151,8 @@ class Fit:
                     yield field.name
 
     def _check_places(self) -> None:
-        """Checks whether the result can be written, as far as is known before the capture is read.
+        """Checks whether the result can be written, as far as this is known before the capture is
+        read.
 
         Raises: UsageError if it cannot.
         """
@@ -259,8 +265,8 @@ _DEFAULT_SHEET = Path("check.png")
 class Check:
     """Draw the body over each photo, and name what looks wrong.
 
-    For a capture of `humangs fit`, also its keypoints, how far off the body is, and what the views
-    do not determine.
+    For a capture of `humangs fit`, also draw its keypoints, and say how far off the body is and
+    what the views do not determine.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -271,7 +277,7 @@ class Check:
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]
     out: Annotated[Path, OutputPath((".png",))] = _DEFAULT_SHEET
-    """The contact sheet to write, .png; that of the keypoints is NAME_fit.png beside it."""
+    """The contact sheet to write, .png. The sheet of keypoints is NAME_fit.png beside it."""
 
     def run(self) -> None:
         sheet = self.out.with_name(f"{self.out.stem}_fit{self.out.suffix}")
@@ -322,9 +328,9 @@ class Check:
             suggest("humangs reconstruct", self.capture, "--out avatar.npz")
 
     def _found(self, capture: Any, keypoints: Any) -> tuple[Any, Any]:
-        """Returns capture and keypoints, with missing masks and keypoints found in the photos.
+        """Finds missing masks and keypoints in the photos. Returns capture and keypoints with them.
 
-        Nothing is written to files.
+        No file is written.
         """
         import numpy as np
 

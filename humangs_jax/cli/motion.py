@@ -1,4 +1,4 @@
-"""`humangs motion`: the motion of a person in a video."""
+"""`humangs motion`: finds the motion of a person in a video."""
 
 import dataclasses
 from pathlib import Path
@@ -13,10 +13,10 @@ from humangs_jax.core.configuration import Range, at_least
 
 @dataclasses.dataclass(frozen=True)
 class MotionOfVideo:
-    """Find the motion of a person in a video of one camera that stands still.
+    """Find the motion of a person in a video whose camera stands still.
 
-    The result moves any avatar: `--motion M.npz` of animate, export and view. A run that was
-    interrupted goes on where it was. docs: motions.
+    The result moves any avatar: `--motion M.npz` of animate, export and view. If a run is
+    interrupted, the same command goes on from there. docs: motions.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -24,15 +24,17 @@ class MotionOfVideo:
         "humangs motion dance.mp4 --out dance.npz --avatar avatar.npz --check check.mp4",
     )
     video: Positional[Path]
-    """A video in which the whole person is seen."""
+    """A video that shows the whole person."""
     out: Annotated[Path, OutputPath((".npz",))]
     """The motion to write, .npz."""
     person: Annotated[int | None, at_least(0)] = None
-    """Number of the person, the largest first, from 0. Default: the largest."""
+    """Number of the person, from 0, counted from the largest. Default: the largest."""
     height: Annotated[float | None, Range(0.4, 2.5)] = None
-    """Height of the person, metres: the scale of the motion. Default: a usual height."""
+    """Height of the person, metres, which gives the scale of the motion. Default: a usual
+    height.
+    """
     avatar: Path | None = None
-    """Move the body of this avatar as the person moves, in its size."""
+    """Find the motion for the body of this avatar, in its size."""
     focal_mm: Annotated[float | None, Range(5.0, 2000.0)] = None
     """Focal length of the camera on 35-mm film. Default: that of a telephone, 29."""
     check: Annotated[

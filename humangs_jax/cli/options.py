@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from humangs_jax.core.array_types import Array
 
 Side = Annotated[int, Range(16, 8192)]
-"""Pixels along a side of an image. The largest image takes a gigabyte while it is drawn."""
+"""Side of an image, pixels. The largest image takes a gigabyte while it is drawn."""
 Workers = Annotated[int | None, at_least(1)]
 Preset = Literal["realtime", "balanced", "quality", "best"]
 """Names of `humangs_jax.PRESETS`."""
@@ -66,16 +66,16 @@ class PartOfMotion:
     """Options that say which part of the file of --motion is played, and how."""
 
     motion_fps: Annotated[float | None, Range(0.01, 1000.0)] = None
-    """Frames per second of the motion, where its file says none. Default: those of the file."""
+    """Frames per second of the motion, in place of those in its file. Default: its file's."""
     motion_up: Literal["y", "-y", "z", "-z", "x", "-x"] | None = None
     """The axis that points up in the motion's world, like --motion-up=z.
 
-    Default: the file's, or as people stand.
+    Default: the axis that the file names, or along which people stand.
     """
     person: int | None = None
     """Number of the person, in a motion of several people."""
     clip: str | None = None
-    """Name or number of the animation, in a .glb of several. Default: the first."""
+    """Name or number of the animation, if a .glb has several. Default: the first."""
 
     def options(self, path: Path | None) -> tuple[str | Path, ...]:
         """Returns the words with which another command plays the same motion.
@@ -122,9 +122,9 @@ WHOLE = PartOfMotion()
 
 @dataclasses.dataclass(frozen=True)
 class OutputPath:
-    """Annotation of an option that says where results go.
+    """Annotation of an option that names a place for results.
 
-    Without suffixes it is a folder, which is made if it does not exist.
+    Without suffixes the place is a folder, which is made if it does not exist.
     """
 
     suffixes: tuple[str, ...] = ()
@@ -132,7 +132,7 @@ class OutputPath:
     folder: bool = False
     """Whether a name without suffix is a folder."""
     avatar: bool = False
-    """Whether the file replaces an avatar only."""
+    """Whether the file may replace an existing file only if that is an avatar."""
 
 
 AVATAR = OutputPath((".npz",), avatar=True)
@@ -205,7 +205,9 @@ def fields_of(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any]]:
 
 
 def types_in(kind: Any) -> list[Any]:
-    """Returns the types inside of annotations, unions and tuples, or the type itself."""
+    """Returns the types inside of an annotation, a union or a tuple. For another type returns the
+    type itself.
+    """
     if get_origin(kind) is Annotated:
         return types_in(get_args(kind)[0])
     if get_origin(kind) in (Union, UnionType, tuple):
@@ -214,7 +216,9 @@ def types_in(kind: Any) -> list[Any]:
 
 
 def _value_shown(kind: Any) -> str | None:
-    """Returns how --help shows the values of a type, without None. None: as tyro shows them."""
+    """Returns how --help shows the values of a type, without None. Returns None where tyro's own
+    text is used.
+    """
     if get_origin(kind) is tuple:
         return None
     names = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH"}
@@ -348,7 +352,7 @@ def _require_writable(path: Path, option: str) -> None:
 
 
 def tell_deleted(folder: Path, unless: Path | None = None) -> None:
-    """Shows what --overwrite will delete in a folder that is replaced.
+    """Shows what --overwrite will delete in a folder that is going to be replaced.
 
     Shows nothing if the folder is empty, or if it is the folder `unless`.
     """
@@ -383,7 +387,7 @@ def refine_limits(text: str) -> dict[str, Any]:
 def first_refinement(text: str | None) -> RefineConfig | None:
     """Parses --refine of a new avatar, as `refine_limits` does.
 
-    Returns: None for "0", which means no refinement; without --refine, iterations alone.
+    Returns None for "0", which means no refinement. Without --refine, returns iterations alone.
     """
     if text is None:
         return ITERATIONS_ALONE

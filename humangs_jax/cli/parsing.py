@@ -16,7 +16,7 @@ from humangs_jax.cli.options import UsageError, fields_of, option_of, types_in
 
 
 def parsed(command: type[Any], name: str, words: Sequence[str]) -> Any:
-    """Parses words into a command with its options. name: of the command, as it is typed.
+    """Parses words into a command with its options. name: name of the command, as it is typed.
 
     Raises: UsageError for wrong words; SystemExit after --help.
     """
@@ -37,7 +37,7 @@ def parsed(command: type[Any], name: str, words: Sequence[str]) -> Any:
 
 
 def _inside(box: str) -> list[str]:
-    """Returns the lines inside of a box that have words; their indents stay."""
+    """Returns the lines inside of a box that have any words. Their indents stay."""
     # characters that boxes are drawn with, or rules where the terminal knows ASCII only
     frame = "[\u2500-\u257f]+|-{3,}"
     lines = [re.sub(frame, "", line).rstrip() for line in box.splitlines()]
@@ -59,7 +59,7 @@ def _wide_screen() -> Generator[None]:
 
 
 def _one_line(command: type[Any], name: str, words: Sequence[str], lines: list[str]) -> str:
-    """Returns one line about what is wrong with the words. lines: tyro's message."""
+    """Returns one line that says what is wrong with the words. lines: tyro's message."""
     text = " ".join(line.strip() for line in lines)
     example = f"as in `{command.examples[0]}`"
     match = re.search(r"[Ii]nvalid choice '(?P<given>.*?)' for argument '(?P<option>.*?)'", text)
@@ -107,7 +107,9 @@ def _value_after(words: Sequence[str], option: str) -> str:
 
 
 def _wrong_value(command: type[Any], option: str, given: str) -> str:
-    """Returns the line about a wrong value: what is expected, and the nearest word or default."""
+    """Returns the line about a wrong value: what is expected, and the nearest possible word or the
+    default.
+    """
     choices = _choices(_kind(command, option))
     near = difflib.get_close_matches(given, choices, n=1)
     if near:
@@ -132,7 +134,7 @@ def _no_value(command: type[Any], option: str, words: Sequence[str]) -> str:
 
 
 def _usual(command: type[Any], option: str) -> str:
-    """Returns words about the default of an option, if it is a number, else ""."""
+    """Returns words about the default of an option if it is a number; else ""."""
     usual = next(
         (field.default for field, _ in fields_of(command) if option_of(field.name) == option), None
     )
@@ -146,7 +148,7 @@ def _shown(option: str) -> str:
 
 
 def _expected(command: type[Any], option: str) -> str:
-    """Returns in words what the values of an option may be."""
+    """Returns the possible values of an option in words."""
     kind = _kind(command, option)
     names = {int: "a whole number", float: "a number"}
     numbers = [names[part] for part in types_in(kind) if part in names]

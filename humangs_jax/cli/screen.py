@@ -2,8 +2,8 @@
 
 At its end a command shows how long its stages took, and what to do next. Commands use `stage`,
 `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `finish` and `fail`. Results
-go to stdout, everything else to stderr. --quiet leaves results and errors, --verbose shows what
-libraries log as well.
+go to stdout, and everything else to stderr. --quiet shows only results and errors. --verbose also
+shows what libraries log.
 """
 
 import atexit
@@ -31,24 +31,26 @@ from humangs_jax.core.progress import stage as stage
 # destructors, Python drops the KeyboardInterrupt with a note, and the command would go on. And
 # extensions crash where it comes while they are imported.
 heard = threading.Event()
-"""Is set when Python has received Ctrl-C in this command."""
+"""Event that is set once Python has received Ctrl-C in this command."""
 PATIENCE = 2.0
-"""Seconds that Python has to receive Ctrl-C and to tidy up. Calls that write files are shorter."""
+"""Time that Python has to receive Ctrl-C and to tidy up, seconds. Calls that write files are
+shorter.
+"""
 
 
 def end_within_seconds() -> None:
-    """Makes Ctrl-C end this process within seconds; the console script calls this.
+    """Makes Ctrl-C end this process within seconds. The console script calls this.
 
     Ctrl-C raises KeyboardInterrupt. If Python does not receive the signal in time, the process ends
-    at once. Signals that ask a process to end (from `timeout`, or a terminal that is closed) do the
-    same. While a command handles Ctrl-C itself, as training does to save its state, nothing is
-    forced.
+    at once. Signals that ask a process to end (from `timeout`, or from a terminal that is closed)
+    have the same effect. While a command handles Ctrl-C itself, as training does to save its state,
+    nothing is forced.
     """
     if sys.platform == "win32" or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return  # there, wake-up descriptors are sockets; or somebody else handles it
 
     def again():
-        """Repeats after 20 ms an interrupt that was dropped, or that came at a bad time."""
+        """Sends an interrupt again after 20 ms, because it was dropped or came at a bad time."""
         threading.Timer(0.02, os.kill, (os.getpid(), signal.SIGINT)).start()
 
     def interrupt(number, frame):
@@ -59,7 +61,7 @@ def end_within_seconds() -> None:
         signal.default_int_handler(number, frame)
 
     def end(number, frame):
-        """Does nothing: `watch` receives the signal."""
+        """Does nothing, because `watch` receives the signal."""
 
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -102,7 +104,7 @@ def end_within_seconds() -> None:
 
 
 def _importing(frame: FrameType | None) -> bool:
-    """Whether a module is being imported.
+    """Returns whether a module is being imported.
 
     Extensions that are interrupted while they are imported crash, or raise other errors.
     """
@@ -114,7 +116,7 @@ def _importing(frame: FrameType | None) -> bool:
 
 
 class _Handler(logging.Handler):
-    """Shows what libraries log by `say`, as everything else."""
+    """Shows what libraries log, with `say` like everything else."""
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
@@ -124,10 +126,10 @@ class _Handler(logging.Handler):
 
 
 def silence(verbose: bool) -> None:
-    """Keeps what libraries log, and errors in their threads, off the screen.
+    """Keeps logs of libraries, and errors in their threads, off the screen.
 
-    Call it before JAX is imported, in a whole program, not in a test. verbose: whether logs are
-    shown.
+    Call it before JAX is imported, and only in a whole program, not in a test. verbose: whether
+    logs are shown.
     """
     # 3 leaves fatal errors: XLA logs its boxes about slow compilation as errors, and real errors
     # of a program arrive as exceptions
@@ -166,23 +168,25 @@ def silence(verbose: bool) -> None:
 
 
 def tell(text: object) -> None:
-    """Shows a result that the user asked for, such as a report; with --quiet too."""
+    """Shows a result that the user asked for, such as a report, even with --quiet."""
     say(text)
 
 
 def wrote(path: str | Path, what: str) -> None:
-    """Shows that a file or folder was written, and what it has."""
+    """Shows that a file or folder was written, and what it has. what: its content in words."""
     if not progress.current().quiet:
         say(f"{path}: {what}")
 
 
 def warn(text: object) -> None:
-    """Shows a warning about something that looks wrong; the command goes on."""
+    """Shows a warning about something that looks wrong. The command goes on."""
     say(f"humangs: warning: {text}", error=True, lines=False)
 
 
 def fail(error: BaseException, verbose: bool) -> None:
-    """Shows the error that ends the command, in one line; if verbose, its traceback before."""
+    """Shows the error that ends the command, in one line. verbose: whether its traceback is shown
+    before.
+    """
     progress.end()
     if verbose:
         say("".join(traceback.format_exception(error)).rstrip(), error=True)
@@ -222,7 +226,7 @@ def quoted(path: Path) -> str:
 
 
 def finish() -> None:
-    """Prints the stages of the command with their seconds, and what to do next."""
+    """Shows the times of the command's stages, seconds, and what to do next."""
     shown = progress.current()
     if not shown.quiet and shown.seconds:
         parts = ", ".join(f"{name} {took:.1f}" for name, took in shown.seconds.items())

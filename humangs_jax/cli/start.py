@@ -1,4 +1,4 @@
-"""`humangs start`: from a folder of photos to an avatar in the browser."""
+"""`humangs start`: makes an avatar from a folder of photos and shows it in the browser."""
 
 import dataclasses
 import webbrowser
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class Start:
     """From photos or a video of a person to an avatar in the browser.
 
-    Cameras, masks and keypoints are used where they are there, and estimated where they are not.
-    Run it again when something was added. docs: your_photos.
+    Cameras, masks and keypoints are used if the folder has them, and estimated otherwise. Run it
+    again after you have added something. docs: your_photos.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -29,7 +29,7 @@ class Start:
         "humangs start photos --cameras calibration.json --out me",
     )
     photos: Positional[Path]
-    """Folder of photos, perhaps with cameras, masks and keypoints in it.
+    """Folder of photos, which may also have cameras, masks and keypoints.
 
     Or a video: its best frames become OUT_photos.
     """
@@ -53,11 +53,11 @@ class Start:
         Path | None, arg(help=f"Keypoints, if they are elsewhere: {KEYPOINTS.listed()}.")
     ] = None
     person: Annotated[int | None, at_least(0)] = None
-    """Number of the person, from 0, if a view has several: in the keypoint file or, without one, on
-    people.png.
+    """Number of the person, from 0, if a view has several: the number in the keypoint file, or on
+    people.png if there is no such file.
     """
     height: Annotated[float | None, Range(0.3, 3)] = None
-    """Height of the person without shoes, metres: the scale where there is no calibration.
+    """Height of the person without shoes, metres. It gives the scale if there is no calibration.
 
     Default: an average person's.
     """
@@ -75,14 +75,14 @@ class Start:
     ] = True
     """Move masks that are too large or too small to the edges in the photos."""
     refine: str | None = None
-    """Fit the avatar to the photos for so long: 15s (or 15), 100steps, or 0.
+    """How long to fit the avatar to the photos: 15s (or 15), 100steps, or 0.
 
     Default, with masks: iterations and the head.
     """
     browser: Annotated[bool, off("open the page at the end")] = True
     """Open the page at the end."""
     overwrite: bool = False
-    """Start again, also where --out already has a body or a finished avatar."""
+    """Begin anew, even if --out has a body or a finished avatar."""
 
     def run(self) -> None:
         refinement = first_refinement(self.refine)

@@ -1,4 +1,6 @@
-"""The commands `humangs preprocess`, `train`, `convert`, `evaluate`: data sets, weights, scores."""
+"""The commands `humangs preprocess`, `train`, `convert` and `evaluate`, for data sets, weights and
+scores.
+"""
 
 import dataclasses
 import hashlib
@@ -25,25 +27,27 @@ _TENSORS = OutputPath((".safetensors",))
 
 @dataclasses.dataclass(frozen=True)
 class ScanViews:
-    """Photos that are rendered of scans (thuman)."""
+    """Options of the photos that are rendered from scans (thuman)."""
 
     views: Annotated[int, at_least(1)] = 60
-    """Photos of each scan, from random azimuths and elevations of -5 to 15 degrees."""
+    """Number of photos of each scan, from random azimuths and from elevations of -5 to 15
+    degrees.
+    """
     near: bool = False
     """All cameras at 2.0 bounding radii: the published "near" test set. Short for --factors 2 2."""
     factors: tuple[float, float] = (1.0, 1.75)
-    """Camera distance in bounding radii, uniform between the two."""
+    """Range of the camera's distance in bounding radii, from which it is drawn uniformly."""
     train: Annotated[int, at_least(0)] = 2300
-    """Scans of the training list, the first of the published shuffle."""
+    """Number of scans in the training list, which are the first of the published shuffle."""
     test: Annotated[int, at_least(0)] = 145
-    """Scans of the test list, the next of the shuffle."""
+    """Number of scans in the test list, which follow those of the training list."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Preprocess:
     """Turn a data set into photos with cameras and bodies.
 
-    By the published protocol. Can be interrupted and resumed. Layouts, licences, and lines for
+    Follows the published protocol. Can be interrupted and resumed. Layouts, licences, and lines for
     SLURM: docs: datasets.
     """
 
@@ -53,24 +57,24 @@ class Preprocess:
     )
     kind: Annotated[Positional[Kind], arg(help=_RAW.listed())]
     source: Positional[Path]
-    """The data set; of thuman the folder that holds model/ and smplx/, of videos a subject or the
-    folder of several.
+    """The data set: for thuman the folder that has model/ and smplx/, for videos the folder of one
+    subject or of several.
     """
     scans: OmitArgPrefixes[ScanViews]
     out: Annotated[Path, OutputPath()]
     """The folder to write: one folder for each scan or subject, lists, and manifest.json."""
     body: Path
-    """The model of the fits: SMPLX_NEUTRAL.npz or, for scans of THuman2.0, SMPLX_MALE.npz."""
+    """The body model of the fits: SMPLX_NEUTRAL.npz or, for scans of THuman2.0, SMPLX_MALE.npz."""
     size: Annotated[int, at_least(1)] = 512
     """Side of the photos in pixels."""
     every: Annotated[int, at_least(1)] = 10
     """Frame step of videos: 10 takes frames 0, 10, 20 and so on."""
     layout: Literal["scenes", "capture"] = "scenes"
-    """The published scene lists, or capture folders."""
+    """What to write: scene lists as published, or capture folders."""
     shard: str = "0/1"
     """I/N: the I-th of N parts, counted from 0, for job arrays."""
     workers: Workers = None
-    """Processes, for scans. Default: as many as cores."""
+    """Number of processes, for scans. Default: one for each core."""
 
     def run(self) -> None:
         scans = self.scans
@@ -108,7 +112,7 @@ class Preprocess:
 
 @dataclasses.dataclass(frozen=True)
 class LossNetworkFiles:
-    """Networks under perceptual losses (docs: loss_networks)."""
+    """Networks of the perceptual losses (docs: loss_networks)."""
 
     vgg19: Path | None = None
     """Weights of VGG-19 for the perceptual loss.
@@ -116,14 +120,14 @@ class LossNetworkFiles:
     Default: structural dissimilarity (SSIM) takes its place.
     """
     lpips_backbone: Path | None = None
-    """Weights of the network under LPIPS.
+    """Weights of the network of LPIPS.
 
-    Default: no LPIPS in validation; in the loss SSIM takes its place.
+    Default: no LPIPS in validation, and SSIM in its place in the loss.
     """
     lpips_heads: Path | None = None
     """The linear heads of LPIPS, if the backbone's file does not have them."""
     lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg"
-    """The network under LPIPS."""
+    """The network of LPIPS."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +135,7 @@ class Processes:
     """Training in several processes (docs: scaling)."""
 
     distributed: bool = False
-    """This is one of several processes.
+    """Run as one of several processes.
 
     SLURM or a TPU pod says which one, or the following options do.
     """
@@ -154,7 +158,7 @@ class Processes:
 class Train:
     """Train a network on capture folders, on all devices.
 
-    Continues the run in --out. docs: training.
+    If --out has a run, it is continued. docs: training.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -177,23 +181,23 @@ class Train:
     config: str = "small"
     """small, paper, published or tiny, or a JSON file of settings like the config.json of a run."""
     on_the_fly: Annotated[int, at_least(0)] = 0
-    """Also (or without DATA only) train on this number of synthetic people who are rendered anew
-    for every step.
+    """Also train on this number of synthetic people, who are rendered anew for every step. Without
+    DATA, train on them alone.
     """
     validation: Path | None = None
     """Other people to evaluate on now and then: anything that DATA accepts."""
     steps: Annotated[int | None, at_least(1)] = None
-    """Length of the run. Default: that of the configuration.
+    """Number of steps of the run. Default: that of the configuration.
 
-    A finished run goes on if it is longer.
+    A finished run goes on if the number is larger.
     """
     init_weights: Path | None = None
-    """Start from these weights, and their network, instead of random ones."""
+    """Start from these weights and their network, not from random weights."""
     fsdp: Annotated[int | None, at_least(1)] = None
     """How many devices share one copy of parameters and moments. Default: all."""
     diagnose: bool = False
-    """Repeat the step of the run that failed, or the next one, and name the first stage whose
-    numbers are not finite.
+    """Repeat the failed step of a run, or the next step, and name the first stage that has numbers
+    that are not finite.
     """
 
     def run(self) -> None:
@@ -272,8 +276,8 @@ class Train:
 class Convert:
     """Convert a checkpoint of the published network into our weights.
 
-    Without torch. Sizes and parts are read off the shapes; everything else is as in the preset
-    `published`. docs: parity.
+    Works without torch. Sizes and parts follow from the shapes of tensors, and everything else is
+    as in the preset `published`. docs: parity.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -281,21 +285,21 @@ class Convert:
         "humangs convert checkpoint.pt --losses losses.safetensors --dtype float16",
     )
     checkpoint: Positional[Path]
-    """.pt with a state dict under 'model', or that state dict as .safetensors."""
+    """.pt file with a state dict under 'model', or that state dict as .safetensors."""
     out: Annotated[Path, _TENSORS] = Path("weights.safetensors")
     """The weights file to write."""
     losses: Annotated[Path | None, _TENSORS] = None
-    """Also write the loss networks that the checkpoint carries (VGG-19, LPIPS), for training and
+    """Also write the loss networks that are in the checkpoint (VGG-19, LPIPS), for training and
     evaluation.
     """
     head_width: int | None = None
-    """Features per attention head, needed if no shape tells it (networks without q_norm and
+    """Features per attention head. Needed only if no shape shows it (networks without q_norm and
     k_norm).
     """
     pool: Literal["all", "visible"] = "all"
-    """Average a vertex's features over all views (as released) or over those that see it."""
+    """Average the features of a vertex over all views (as released) or over those that see it."""
     dtype: Literal["float32", "float16"] = "float32"
-    """Type of the stored numbers; float16 halves the file."""
+    """Number type of the stored weights. float16 halves the file."""
 
     def run(self) -> None:
         out, losses, checkpoint = self.out, self.losses, self.checkpoint
@@ -342,24 +346,26 @@ class Convert:
 
 @dataclasses.dataclass(frozen=True)
 class LpipsFiles:
-    """Weights of LPIPS, each a file of the backbone and, if that has none, one of the heads (docs:
-    loss_networks).
+    """Weights of LPIPS. Each option takes a file of the backbone and, if that file has no heads,
+    one of the heads (docs: loss_networks).
     """
 
     lpips_vgg: tuple[Path, ...] = ()
-    """LPIPS of vgg. Default: of the extra `lpips`, if it is installed."""
+    """LPIPS with the backbone vgg. Default: the weights of the extra `lpips`, if it is
+    installed.
+    """
     lpips_alex: tuple[Path, ...] = ()
-    """LPIPS of alex."""
+    """LPIPS with the backbone alex."""
     lpips_squeeze: tuple[Path, ...] = ()
-    """LPIPS of squeeze."""
+    """LPIPS with the backbone squeeze."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
     """Score novel views of people against photos: PSNR, SSIM, LPIPS.
 
-    Of weights (people are reconstructed from some photos and compared on the others), of avatars,
-    or of images that any program rendered. The same command goes on after an interruption.
+    Scores weights (people are reconstructed from some photos and compared on the others), avatars,
+    or images that any program has rendered. After an interruption the same command goes on.
     Protocols of papers: docs: evaluation.
     """
 
@@ -371,35 +377,37 @@ class Evaluate:
     source: Positional[Path]
     """A capture folder, a folder of them, a scene list, or a data set (docs: datasets)."""
     avatar: Path | None = None
-    """File written by `humangs reconstruct`, or a folder with PERSON.npz."""
+    """File written by `humangs reconstruct`, or a folder of PERSON.npz files."""
     weights: Path | None = None
     """Network weights (.safetensors).
 
     Default, without --avatar and --predictions: the shipped ones.
     """
     predictions: Path | None = None
-    """Folder with PERSON/VIEW.png, named like the photos; VIEW.png for one capture."""
+    """Folder of PERSON/VIEW.png, or of VIEW.png for one capture. Files have the names of the
+    photos.
+    """
     protocol: Literal["humangs", "animatable-gaussians", "ghg", "giga", "lhm", "lhm++", "lvsm"] = (
         "humangs"
     )
-    """Whose backgrounds, crops, networks and SSIM."""
+    """Protocol that decides backgrounds, crops, networks and SSIM."""
     body: Path | None = None
     """Model file that the parameters of a data set belong to.
 
     Default: the body that comes with the package.
     """
     inputs: Annotated[int | None, at_least(1)] = None
-    """How many photos are inputs, evenly spaced. Default: 4."""
+    """Number of photos that are inputs, evenly spaced. Default: 4."""
     indices: Path | None = None
     """JSON that says which views are inputs and targets: {"PERSON": {"context": [...], "target":
     [...]}}.
     """
     json: Annotated[Path | None, OutputPath((".json",))] = None
-    """Write all numbers here."""
+    """Write all numbers to this file."""
     html: Annotated[Path | None, OutputPath((".html",))] = None
-    """Write a page with inputs, truth, ours and error, worst first."""
+    """Write a page with inputs, truth, ours and error, the worst first."""
     csv: Annotated[Path | None, OutputPath((".csv",))] = None
-    """Write one line an image."""
+    """Write a file with one line per image."""
     markdown: Annotated[Path | None, OutputPath((".md",))] = None
     """Write a table of people."""
     latex: Annotated[Path | None, OutputPath((".tex",))] = None

@@ -1,3 +1,3 @@
-"""The core: array types and axes, configurations with ranges and JSON, registries, checks of
-arguments, compilation, processes.
+"""Array types and axes, configurations with ranges and JSON, registries, checks of arguments,
+compilation, processes.
 """

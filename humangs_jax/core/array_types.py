@@ -20,8 +20,8 @@ s       shape coefficients of the body
 m       frames of a motion
 ======  ====================================================
 
-Functions are written for ONE example and batched with `jax.vmap`; fields of pytrees are annotated
-unbatched.
+Functions are written for ONE example, and `jax.vmap` batches them. Annotations of pytree fields
+have no batch axes.
 """
 
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, Shaped, UInt, UInt8

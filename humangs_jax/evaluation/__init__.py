@@ -1,1 +1,1 @@
-"""Evaluation: protocols, cases, scores, and the report."""
+"""Protocols, cases, scores, and the report."""

@@ -1,3 +1,1 @@
-"""Geometry: quaternions (wxyz), axes, transforms, `Camera` with its lenses, Plücker rays,
-meshes.
-"""
+"""Quaternions (wxyz), axes, transforms, `Camera` with its lenses, Plücker rays, meshes."""

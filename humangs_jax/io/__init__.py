@@ -1,3 +1,3 @@
-"""Files: reads untrusted files within one set of limits, refuses them in one line, and writes files
+"""Reads untrusted files within one set of limits, refuses bad files in one line, and writes files
 whole or not at all.
 """

@@ -1,3 +1,3 @@
-"""The network: `humangs` is one module over exchangeable `parts`. Also presets, weights files, and
+"""The network `humangs`, one module over exchangeable `parts`. Also presets, weights files, and
 conversion.
 """

@@ -1,3 +1,3 @@
-"""Rendering: `splatting`, the API, composes `projection`, `tiling` and `compositing`. `reference`
-is a plain renderer to compare with. `mesh` has the rasterizer and position maps.
+"""`splatting`, the API, composes `projection`, `tiling` and `compositing`. `reference` is a plain
+renderer to compare with. `mesh` has the rasterizer and position maps.
 """

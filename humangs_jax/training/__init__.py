@@ -1,1 +1,1 @@
-"""Training: state, step, sharding, checkpoints, log, validation, loop, diagnosis."""
+"""State, step, sharding, checkpoints, log, validation, loop, diagnosis."""
