@@ -43,7 +43,7 @@ LONGEST = 2048
 
 @dataclasses.dataclass(frozen=True)
 class PhotosImported:
-    """What `import_photos` did."""
+    """What `import_photos` has written and found."""
 
     lines: tuple[str, ...]
     """What was written and found, one line each."""

@@ -1,4 +1,4 @@
-"""`python -m humangs_jax.cli`."""
+"""Lets `python -m humangs_jax.cli` run the program."""
 
 from humangs_jax.cli import main
 

@@ -51,9 +51,9 @@ _SPLATS = {
 
 @dataclasses.dataclass(frozen=True)
 class Animate:
-    """Animate an avatar with a motion: a video or PNG files.
+    """Animate an avatar with a motion, as a video or PNG files.
 
-    The camera goes along with the person. Files of motions: docs: motions.
+    The camera follows the person. Files of motions: docs: motions.
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -77,7 +77,7 @@ class Animate:
         "animation.mp4"
     )
     turn: Annotated[float, _FINITE] = 0.0
-    """Degrees that the camera travels around the avatar during the motion."""
+    """Angle that the camera travels around the avatar during the motion, degrees."""
     camera: Annotated[
         Path | None,
         arg(
@@ -91,19 +91,19 @@ class Animate:
         bool,
         off("follow the person: the camera stands still and sees everywhere that the person goes"),
     ] = True
-    """The camera goes along with the person."""
+    """Let the camera follow the person."""
     fps: Annotated[float | None, _RATE] = None
-    """Frames per second of the video: the motion keeps its speed. Default: those of the motion."""
+    """Frames per second of the video. The motion keeps its speed. Default: those of the motion."""
     start: float = 0.0
     """Begin at this second of the motion."""
     stop: float | None = None
     """End at this second of the motion. Default: its end."""
     loop: int = 1
-    """How often to play the motion; each repetition starts where the last one ended."""
+    """How often to play the motion. Each repetition starts where the last one ended."""
     preset: Preset | None = None
-    """Speed against accuracy of splatting, without --splat (docs: tradeoff)."""
+    """Preset of splatting, from fast to accurate, if --splat is not given (docs: tradeoff)."""
     config: Path | None = None
-    """As --preset, from a file of `humangs tune`."""
+    """Like --preset, with the settings in a file of `humangs tune`."""
 
     def run(self) -> None:
         if self.camera is not None:
@@ -176,10 +176,10 @@ class Animate:
 
 @dataclasses.dataclass(frozen=True)
 class Render:
-    """Render an avatar from a circle of cameras, or those of a file or capture; or Gaussians of any
-    program.
+    """Render an avatar, or Gaussians of any program, as images or a video.
 
-    As images, as layers of an EXR file, or as a video of one turn (docs: video).
+    Cameras are on a circle, or those of a file or a capture. Images can also be written as layers
+    of an EXR file. A video is one turn (docs: video).
     """
 
     examples: ClassVar[tuple[str, ...]] = (
@@ -187,7 +187,7 @@ class Render:
         "humangs render scene.ply --camera sparse/0 --out views",
     )
     avatar: Positional[Path]
-    """File written by `humangs reconstruct`; or Gaussians: .ply, .splat, .spz or .glb."""
+    """File written by `humangs reconstruct`, or a file of Gaussians: .ply, .splat, .spz or .glb."""
     shot: OmitArgPrefixes[FrameSettings]
     camera: Annotated[
         Path | None,
@@ -209,24 +209,28 @@ class Render:
         ),
     ] = Path("views")
     pose: Literal["t", "a"] = "t"
-    """T-pose, or A-pose with the arms down (circle only)."""
+    """T-pose, or A-pose with the arms down. Not with --capture."""
     views: Annotated[int | None, at_least(1)] = None
-    """How many cameras on the circle. Default: 8; for a video, those of a turn of 4 seconds."""
+    """Number of cameras on the circle. Default: 8, or for a video as many as a turn of 4 seconds
+    has.
+    """
     fps: Annotated[float, _RATE] = 24.0
     """Frames per second of a video."""
     capture: Path | None = None
     """Take cameras and poses from this capture folder instead of a circle."""
     exr: bool = False
-    """Also write views.exr, one part per view: premultiplied colors, --channels, and the camera."""
+    """Also write views.exr with one part per view: premultiplied colors, --channels, and the
+    camera.
+    """
     channels: str = "rgba,z"
     """Channels of views.exr: rgba (always there), z, position, normal, part, separated by commas.
     """
     exr_type: Literal["float", "half"] = "float"
-    """Number type of views.exr. half: depths and positions still have 32 bits."""
+    """Number type of views.exr. With half, depths and positions still have 32 bits."""
     preset: Preset | None = None
-    """Speed against accuracy of splatting, without --splat (docs: tradeoff)."""
+    """Preset of splatting, from fast to accurate, if --splat is not given (docs: tradeoff)."""
     config: Path | None = None
-    """As --preset, from a file of `humangs tune`."""
+    """Like --preset, with the settings in a file of `humangs tune`."""
 
     def run(self) -> None:
         # a video is one turn; images are 8 views of a circle
@@ -355,9 +359,9 @@ class Render:
         wrote(self.out, f"{what} of {len(gaussians.means):,} Gaussians")
 
     def _require_one_kind_of_cameras(self) -> None:
-        """Refuses other options of cameras beside --capture or --camera.
+        """Refuses options that choose cameras in another way than --capture or --camera does.
 
-        Raises: UsageError naming the first option.
+        Raises: UsageError, which names the first such option.
         """
         given = ["views"] * (self.views is not None)
         if self.capture is not None:
@@ -390,10 +394,10 @@ class View:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     motion: Path | None = None
-    """The motion it plays. Default: the shipped walk."""
+    """The motion that the avatar plays. Default: the shipped walk."""
     part: OmitArgPrefixes[PartOfMotion] = WHOLE
     port: Annotated[int, Range(0, 65535)] = 0
-    """Port on 127.0.0.1; 0 for any free one."""
+    """Port on 127.0.0.1. 0: any free port."""
     browser: Annotated[bool, off("open a browser; the address is printed")] = True
     """Open a browser."""
 

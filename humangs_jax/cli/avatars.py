@@ -1,4 +1,6 @@
-"""The commands `humangs demo`, `reconstruct`, `refine` and `tune`: avatars from photos."""
+"""The commands `humangs demo`, `reconstruct`, `refine` and `tune`, which make avatars from
+photos.
+"""
 
 import dataclasses
 import functools
@@ -53,8 +55,8 @@ class Demo:
     Default: 15s, or as --preset says.
     """
     preset: Preset | None = None
-    """Speed against accuracy (docs: tradeoff): photos, network, splatting, and refinement
-    without --refine.
+    """Preset, from fast to accurate (docs: tradeoff), for photos, network and splatting, and for
+    refinement if --refine is not given.
     """
 
     def run(self) -> None:
@@ -109,11 +111,11 @@ class Reconstruct:
     Default, with masks: iterations and the head.
     """
     preset: Preset | None = None
-    """Speed against accuracy (docs: tradeoff): photos, network and refinement, without the
-    options above.
+    """Preset, from fast to accurate (docs: tradeoff), for photos, network and refinement, where the
+    options above are not given.
     """
     config: Path | None = None
-    """As --preset, from a file of `humangs tune`."""
+    """Like --preset, with the settings in a file of `humangs tune`."""
     batch: Annotated[int | None, at_least(1)] = None
     """Number of captures that the network reads at once. Default: 8."""
     shard: str = "0/1"

@@ -1,6 +1,7 @@
 """The commands `humangs detect`, `import` and `synth`.
 
-They find people in photos, and make capture folders from calibrated photos or of synthetic people.
+They find people in photos, and make capture folders from calibrated photos or from synthetic
+people.
 """
 
 import dataclasses
@@ -198,7 +199,9 @@ class Synth:
     size: int = 512
     """Side of the photos in pixels: 128, 256, 512 (a set of 512 can be read at all three)."""
     views: Annotated[int | None, at_least(1)] = None
-    """Photos of each pose, around the person, 1.8 to 2.2 bounding radii away. Default: 60."""
+    """Number of photos of each pose, around the person, from 1.8 to 2.2 bounding radii away.
+    Default: 60.
+    """
     close_views: Annotated[int | None, at_least(0)] = None
     """Number of further photos of each pose that show parts of the person, from 0.8 to 1.7 radii
     away.
@@ -220,7 +223,7 @@ class Synth:
     scans: bool = False
     """Also write scan/: the first pose as a textured mesh, OBJ and GLB."""
     workers: Workers = None
-    """Processes. Default: as many as cores."""
+    """Number of processes. Default: one for each core."""
 
     def run(self) -> None:
         if self.size not in SIZES:

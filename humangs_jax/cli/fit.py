@@ -28,7 +28,7 @@ from humangs_jax.data.formats import KEYPOINTS
 
 @dataclasses.dataclass(frozen=True)
 class Detections:
-    """2D keypoints of a detector."""
+    """Options of the 2D keypoints that a detector has found."""
 
     keypoints: Annotated[
         Path | None, arg(help=f"Keypoint file or folder: {KEYPOINTS.listed()}.")
@@ -127,7 +127,7 @@ class Fit:
     """Replace an existing result."""
 
     def run(self) -> None:
-        """Fits to masks or to keypoints, as the options say."""
+        """Fits to masks or to keypoints. The options say which."""
         way: _Way = "--to-masks" if self.mask_fit.to_masks else "--keypoints"
         for option in self._given():
             if option not in WAYS[way] and option_of(option) != way:

@@ -47,7 +47,7 @@ class Start:
     others: Path | None = None
     """Folder of masks of other people and of things in front of the person, if it is elsewhere.
 
-    Nothing is concluded from these pixels.
+    These pixels of the photos are ignored.
     """
     keypoints: Annotated[
         Path | None, arg(help=f"Keypoints, if they are elsewhere: {KEYPOINTS.listed()}.")

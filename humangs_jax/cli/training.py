@@ -34,7 +34,9 @@ class ScanViews:
     degrees.
     """
     near: bool = False
-    """All cameras at 2.0 bounding radii: the published "near" test set. Short for --factors 2 2."""
+    """Take all cameras at 2.0 bounding radii, the published "near" test set. Short for --factors 2
+    2.
+    """
     factors: tuple[float, float] = (1.0, 1.75)
     """Range of the camera's distance in bounding radii, from which it is drawn uniformly."""
     train: Annotated[int, at_least(0)] = 2300
@@ -172,14 +174,18 @@ class Train:
     datasets).
     """
     body: Path | None = None
-    """Model file that DATA's parameters belong to, such as SMPLX_NEUTRAL.npz.
+    """File of the body model to which DATA's parameters belong, such as SMPLX_NEUTRAL.npz.
 
     Default: the body that comes with the package.
     """
     out: Annotated[Path, OutputPath()] = Path("runs/train")
-    """Checkpoints, log, TensorBoard curves, validation images and weights.safetensors."""
+    """Folder for checkpoints, log, TensorBoard curves, validation images and
+    weights.safetensors.
+    """
     config: str = "small"
-    """small, paper, published or tiny, or a JSON file of settings like the config.json of a run."""
+    """Name of a configuration (small, paper, published or tiny), or a JSON file of settings like
+    the config.json of a run.
+    """
     on_the_fly: Annotated[int, at_least(0)] = 0
     """Also train on this number of synthetic people, who are rendered anew for every step. Without
     DATA, train on them alone.
@@ -392,7 +398,7 @@ class Evaluate:
     )
     """Protocol that decides backgrounds, crops, networks and SSIM."""
     body: Path | None = None
-    """Model file that the parameters of a data set belong to.
+    """File of the body model to which the parameters of a data set belong.
 
     Default: the body that comes with the package.
     """

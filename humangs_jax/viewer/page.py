@@ -1,7 +1,7 @@
 """Makes the page that shows an avatar: one HTML file for disk, localhost or a notebook.
 
-The page needs no network, and a Content-Security-Policy forbids it all connections. Its code is in
-the files of page/ beside this module, which are put into the one file here. The avatar and its
+The page needs no network, and its Content-Security-Policy forbids all connections. Its code is in
+the files of page/ beside this module, which are joined into one file here. The avatar and its
 motion are in the page as 16-bit arrays, see `Packed`.
 """
 
@@ -382,12 +382,12 @@ def show(avatar: Avatar, motion: Motion | None = None, height: int = 560) -> Not
     of the notebook's file (about 1.2 MB).
 
     Args:
-        avatar: one person.
+        avatar: the avatar, of one person.
         motion: how the avatar moves. None: the shipped walk.
-        height: of the page, pixels.
+        height: height of the page, pixels.
 
     Returns:
-        What Jupyter displays.
+        The page, which Jupyter displays.
 
     Raises:
         ValueError: as `page_html`.
@@ -463,7 +463,7 @@ def known_body(avatar: Avatar) -> BodyModel | None:
 def page_script(*names: str) -> str:
     """Returns the text of some of the page's scripts, after the tables of `page_rules`.
 
-    names: of files in page/, without .js.
+    names: names of files in page/, without .js.
     """
     rules = json.dumps(page_rules(), separators=(",", ":")).replace("<", "\\u003c")
     return "\n".join([f"const RULES = {rules};", *(read_part(f"{name}.js") for name in names)])
