@@ -1,10 +1,10 @@
-"""A real capture, made ready: four synchronised videos of a man on a treadmill, from the demo of
-PyPI `pose2sim` (BSD-3).
+"""Prepares a real capture: four synchronised videos of a man on a treadmill, from the demo of PyPI
+`pose2sim` (BSD-3).
 
-Of each chosen frame four photos without lens distortion, 512 pixels a side around the man, with his
-cameras, BlazePose's keypoints and masks, and careful masks to score by: where a photo differs from
-the background, the median over frames of what he does not cover. No photo is written but into the
-folder that the user names.
+Each chosen frame becomes four photos around the man, without lens distortion, 512 pixels a side.
+With them come their cameras, BlazePose's keypoints and masks, and careful masks to score by. A
+careful mask is where a photo differs from the background, which is the median over frames of what
+the man does not cover. Photos are written only into the folder that the user names.
 """
 
 from collections.abc import Collection, Sequence
@@ -36,60 +36,67 @@ from humangs_jax.io.images import resized, to_uint8, write_png
 
 PACKAGE, VERSION = "pose2sim", "0.10.49"
 FRAMES = (0, 12, 33, 66, 90)
-"""Of the videos: those that are measured."""
+"""Numbers of the frames that are measured."""
 DEMO = "Pose2Sim/Demo_SinglePerson"
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 STRAIGHT, BENT = "straight", "bent"
 """Photos without the lenses' distortion, and as they were taken."""
 SIZE, PERSON = 512, 440
-"""Pixels a side of a photo, and of the man's height in it."""
+"""Side of a photo in pixels, and height of the man in it."""
 EVERY = 5
-"""The background is the median over every fifth frame."""
+"""Step between the frames whose median is the background."""
 Y_UP_FROM_Z_UP = np.asarray([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Rotation of a world with z up into one with y up."""
 SPREAD, DIFFERENT = 25, 0.07
-"""Pixels of a video by which BlazePose's mask is dilated for the background; difference of colors
-from which on one is his.
+"""Pixels of a video by which BlazePose's mask is dilated for the background, and the difference of
+colors from which on a pixel belongs to the man.
 """
 SHADOW, TINT = (0.5, 1.02), 0.04
-"""A shadow multiplies the background by so much, in all channels alike but for the second number.
+"""Range of the factors by which a shadow multiplies the background, and the largest difference of
+the factors of its channels.
 """
 SAME, BRIGHT, SPECK = 0.03, 0.3, 800
-"""Difference below which a pixel is the background's, if that is brighter than the second; pixels
-of a part that is kept.
+"""Difference below which a pixel belongs to the background, brightness that the background has
+there at least, and pixels of the smallest part that is kept.
 """
 NEAR, DEEP = 14, 7
-"""Pixels of a video: he is nowhere further outside of BlazePose's mask than the first, and
-everywhere further inside than the second."""
+"""Pixels of a video outside of BlazePose's mask beyond which the man cannot be, and pixels inside
+of it beyond which he must be.
+"""
 RIM = 3
-"""Pixels of a photo: colors of the truth's rim are those from so far inside."""
+"""Pixels of a photo from the rim of the man to the colors that his rim gets in the truth."""
 
 
 class RealFrame(NamedTuple):
-    """One moment in v views.
-
-    images: (v, s, s, 3), with the room. detected, careful: (v, s, s) masks of the detector, and of
-    what differs from the room.
-    cameras: as published. keypoints: MediaPipe's 33. world: (v, 33, 3) landmarks in metres. crop:
-    (v, 3, 3), pixels of the photos from pixels of the video (homogeneous). names: of the views.
-    moments: whether each view has another pose, where the cameras are from the person; None: they
-    are published.
-    """
+    """One moment in v views."""
 
     images: Float[np.ndarray, "v s s 3"]
+    """Photos with the room."""
     detected: Float[np.ndarray, "v s s"]
+    """Masks of the detector."""
     careful: Float[np.ndarray, "v s s"]
+    """Masks of what differs from the room."""
     cameras: Camera
+    """Published cameras of the photos."""
     keypoints: Keypoints
+    """MediaPipe's 33 keypoints in each photo."""
     world: Float[np.ndarray, "v 33 3"]
+    """Landmarks of each photo in metres."""
     crop: Float[np.ndarray, "v 3 3"]
+    """Homogeneous matrices from pixels of the video to pixels of the photos."""
     names: tuple[str, ...]
+    """Names of the views."""
     moments: bool | None = None
+    """Whether each view has another pose, if the cameras come from the person. None: the cameras
+    are published.
+    """
 
     def save(
         self, folder: Path, masks: Float[np.ndarray, "v s s"], cameras: Camera | None = None
     ) -> None:
-        """A capture folder of the photos, with the room, and these masks. cameras: not the
-        published ones.
+        """Writes a capture folder of the photos, which show the room, and of these masks.
+
+        `cameras` are used instead of the published ones.
         """
         views, cameras = [], cameras or self.cameras
         for i, name in enumerate(self.names):
@@ -105,19 +112,17 @@ class RealFrame(NamedTuple):
         write_description(folder, views)
 
     def truth(self) -> Float[np.ndarray, "v s s 3"]:
-        """The man alone on white, by the careful masks, with rims in his colors."""
-        return np.stack(
-            [
-                on_white_background(*pair)
-                for pair in zip(self._without_rims(), self.careful, strict=True)
-            ]
-        )
+        """Returns the man alone on white, cut out by the careful masks, with rims in his colors."""
+        pairs = zip(self._without_rims(), self.careful, strict=True)
+        return np.stack([on_white_background(image, mask) for image, mask in pairs])
 
     def _without_rims(self):
+        """Yields the photos with each pixel near or outside of the rim of the man in the color of
+        the nearest pixel further inside.
+        """
+        ball = ndimage.generate_binary_structure(2, 1)
         for image, mask in zip(self.images, self.careful, strict=True):
-            inner = ndimage.binary_erosion(
-                mask > 0.5, ndimage.generate_binary_structure(2, 1), iterations=RIM
-            )
+            inner = ndimage.binary_erosion(mask > 0.5, ball, iterations=RIM)
             rows, columns = ndimage.distance_transform_edt(
                 ~inner, return_distances=False, return_indices=True
             )
@@ -125,21 +130,22 @@ class RealFrame(NamedTuple):
 
 
 class VideoCamera(NamedTuple):
-    """K (3, 3), the centre of the first pixel at (0.5, 0.5); cam_from_world (4, 4), y up;
-    distortion: k1 k2 p1 p2 of OpenCV.
-    """
+    """The camera of a video."""
 
     K: Float[np.ndarray, "3 3"]
+    """Intrinsics, with the centre of the first pixel at (0.5, 0.5)."""
     cam_from_world: Float[np.ndarray, "4 4"]
+    """Extrinsics in a world with y up, metres."""
     distortion: Float[np.ndarray, "4"]
+    """Distortion of the lens: k1, k2, p1 and p2 of OpenCV."""
 
     def distorted(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Where the video shows what a pinhole would show at these pixels."""
+        """Returns the pixels of the video that show what a pinhole would show at these pixels."""
         focal, middle = self.K[[0, 1], [0, 1]], self.K[:2, 2]
         return distort((pixels - middle) / focal, np.append(self.distortion, 0.0)) * focal + middle
 
     def undistorted(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """The inverse, by iteration: the distortion is some pixels."""
+        """Returns the inverse of `distorted` by iteration, for distortions of some pixels."""
         found = pixels
         for _ in range(10):
             found = found + pixels - self.distorted(found)
@@ -147,7 +153,10 @@ class VideoCamera(NamedTuple):
 
 
 def unpacked(folder: Path) -> Path:
-    """The demo's folder in `folder`. Raises: ValueError, saying how to put it there."""
+    """Returns the folder of the demo inside of `folder`.
+
+    Raises: ValueError that describes how to put it there.
+    """
     if not (folder / DEMO).is_dir():
         how = f"pip install --no-deps --target {folder} {PACKAGE}=={VERSION}"
         raise ValueError(f"{folder}: expected {DEMO} in it: {how}")
@@ -155,14 +164,16 @@ def unpacked(folder: Path) -> Path:
 
 
 def read_cameras(file: Path) -> dict[str, VideoCamera]:
-    """Qualisys's calibration by camera: intrinsics in 64ths of a pixel, rotations in axes of their
-    own, millimetres.
+    """Reads the calibration of Qualisys as {serial number: camera}.
+
+    The file has intrinsics in 64ths of a pixel, lengths in millimetres, and axes of cameras with y
+    and z in other directions than OpenCV.
     """
     found = {}
     for camera in ElementTree.parse(file).getroot().iter("camera"):
-        lens, place, view = (
-            _numbers(camera, name) for name in ("intrinsic", "transform", "fov_video")
-        )
+        lens = _numbers(camera, "intrinsic")
+        place = _numbers(camera, "transform")
+        view = _numbers(camera, "fov_video")
         K = np.eye(3)
         K[[0, 1], [0, 1]] = lens["focalLengthU"] / 64, lens["focalLengthV"] / 64
         K[:2, 2] = (
@@ -181,10 +192,12 @@ def read_cameras(file: Path) -> dict[str, VideoCamera]:
 
 
 def _numbers(camera: Any, name: str) -> dict[str, float]:
+    """Returns the attributes of an element inside of a camera's element as numbers."""
     return {key: float(value) for key, value in camera.find(name).attrib.items()}
 
 
 def read_frames(video: Path, wanted: Collection[int]) -> dict[int, UInt8[np.ndarray, "h w 3"]]:
+    """Reads {number: frame} of the frames of a video with these numbers."""
     import imageio_ffmpeg
 
     reader = imageio_ffmpeg.read_frames(str(video))
@@ -196,10 +209,10 @@ def read_frames(video: Path, wanted: Collection[int]) -> dict[int, UInt8[np.ndar
 def prepare(
     folder: Path, frames: Sequence[int] = FRAMES, *, straight: bool = True
 ) -> dict[int, RealFrame]:
-    """The frames of the capture, from `folder`/prepared where they are there. straight: without the
-    lenses' distortion.
+    """Returns {number: frame} of the capture, from `folder`/prepared where they are there.
 
-    The empty room, as each camera sees it, is in room_NAME.png there.
+    Frames that are missing there are made from the videos. The empty room, as each camera sees it,
+    is written to room_NAME.png there. `straight` takes out the lenses' distortion.
     """
     place, kind = folder / "prepared", STRAIGHT if straight else BENT
     missing = [frame for frame in frames if not (place / f"{frame:03d}_{kind}.npz").exists()]
@@ -218,6 +231,7 @@ def prepare(
 
 
 def _load(file, frame):
+    """Loads a prepared frame."""
     with np.load(file) as stored:
         data = {name: stored[name] for name in stored.files}
 
@@ -236,7 +250,10 @@ def _load(file, frame):
 
 
 def _views(networks, video, camera, frames):
-    """Of one camera: name of a file -> arrays of its view; and the empty room."""
+    """Makes the views of one camera.
+
+    Returns {name of a file: arrays of the view}, and the empty room (h, w, 3).
+    """
     photos = read_frames(video, {*frames, *range(0, 100, EVERY)})
     people = {
         i: largest_person(networks, photo.astype(np.float32) / 255) for i, photo in photos.items()
@@ -253,15 +270,12 @@ def _views(networks, video, camera, frames):
 
 
 def _view(pictures, person, camera):
-    """A square around the man, with his landmarks and the camera of the square."""
+    """Returns the arrays of a square around the man, with his landmarks and the square's camera."""
     (top, bottom), (left, right) = person_box(pictures["careful"] > 0.5)
     side = (bottom - top) * SIZE / PERSON
     corner = np.asarray([left + right - side, top + bottom - side]) / 2
-    crop = np.diag([SIZE / side, SIZE / side, 1.0]) @ [
-        [1, 0, -corner[0]],
-        [0, 1, -corner[1]],
-        [0, 0, 1],
-    ]
+    shift = [[1, 0, -corner[0]], [0, 1, -corner[1]], [0, 0, 1]]
+    crop = np.diag([SIZE / side, SIZE / side, 1.0]) @ shift
     found = {name: _cut(picture, camera, corner, side) for name, picture in pictures.items()}
     found |= {
         "K": crop @ camera.K,
@@ -277,7 +291,10 @@ def _view(pictures, person, camera):
 
 
 def _cut(picture, camera, corner, side):
-    """A square of a picture of the video, 8 bits: about one sample a pixel, then means by area."""
+    """Cuts a square out of a picture of the video, without distortion and with 8 bits.
+
+    The picture is sampled about once a pixel, and then resized by means over areas.
+    """
     fine = SIZE * max(1, round(side / SIZE))
     steps = (np.arange(fine) + 0.5) * side / fine
     grid = camera.distorted(np.stack(np.meshgrid(steps, steps), axis=-1) + corner) - 0.5
@@ -285,8 +302,10 @@ def _cut(picture, camera, corner, side):
 
 
 def largest_person(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> Landmarks:
-    """The man fills a photo, bystanders do not. With the mask as the package sharpens it, at the
-    size of the photo, and the centre of the first pixel at one half.
+    """Returns the person with the largest mask, who is the man and no bystander.
+
+    The mask is sharpened as the package does it, and has the size of the photo. Pixels have the
+    centre of the first one at one half.
     """
     height, width = photo.shape[:2]
     people = find_people(networks, photo)
@@ -300,8 +319,8 @@ def largest_person(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> Lan
 def background(
     photos: Sequence[UInt8[np.ndarray, "h w 3"]], masks: Sequence[Float[np.ndarray, "h w"]]
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The median of what the person does not cover, and where there is anything of that in three
-    photos or more.
+    """Returns the median of what the person does not cover, and whether three photos or more show
+    it at a pixel.
     """
     ball = ndimage.generate_binary_structure(2, 1)
     free = np.stack(
@@ -319,22 +338,24 @@ def careful_mask(
     known: Bool[np.ndarray, "h w"],
     detected: Float[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w"]:
-    """Where a photo differs from the background, and is no shadow, near BlazePose's mask; that mask
-    where nothing is known.
+    """Returns the mask of what differs from the background near BlazePose's mask, and is no shadow.
+
+    Where the background is not known, it is BlazePose's mask.
     """
 
     def smooth(image):
         return ndimage.gaussian_filter(image, (1.0, 1.0, 0))
 
+    # pixels that differ from the room, and those that are only darker
     ours, theirs = smooth(photo), smooth(room)
     different = np.abs(ours - theirs).max(-1) > DIFFERENT
     ratio = (ours + 0.02) / (theirs + 0.02)
     middle = ratio.mean(-1)
     shadow = (middle > SHADOW[0]) & (middle < SHADOW[1]) & (np.ptp(ratio, axis=-1) < TINT)
     person = detected > 0.5
-    far, deep = (ndimage.distance_transform_edt(~person), ndimage.distance_transform_edt(person))
-    # dark shorts before the dark belt differ from it by nothing; a bright wall that is as it was is
-    # no person
+    far, deep = ndimage.distance_transform_edt(~person), ndimage.distance_transform_edt(person)
+    # dark shorts do not differ from the dark belt behind them, so what is deep inside belongs to
+    # the person, except where a bright wall is unchanged
     wall = known & (np.abs(ours - theirs).max(-1) < SAME) & (theirs.max(-1) > BRIGHT)
     found = np.where(known, different & ~shadow, person)
     found = (found & (far < NEAR)) | ((deep > DEEP) & ~ndimage.binary_opening(wall, iterations=2))
@@ -344,7 +365,7 @@ def careful_mask(
 
 
 def _without_small(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Without connected parts of fewer than `SPECK` pixels."""
+    """Returns a mask without its connected parts of fewer than `SPECK` pixels."""
     parts, _ = ndimage.label(inside)
     areas = np.bincount(parts.ravel())
     return (areas >= SPECK)[parts] & inside

@@ -1,5 +1,5 @@
-"""Real people: what `humangs start` makes of them, and how like them the avatar is where no
-photo was.
+"""Measures what `humangs start` makes of real people, and how well the avatar shows them where no
+photo was taken.
 """
 
 import dataclasses
@@ -47,19 +47,19 @@ COLUMNS = {
     "seconds": ("seconds", 0),
     "load": ("load", 0),
 }
-"""Keys of a row's numbers: heading and digits."""
+"""{number of a row: its heading and digits}."""
 MEASURED = {"psnr": "psnr", "fg": "psnr_fg", "corrected": "psnr_corrected", "alex": "alex"}
-"""Scores of a held-out photo, by what its numbers are called in a row."""
+"""{name of a number in a row: score of a held-out photo}."""
 TURN = 8
-"""Photos of the turning man, 45 degrees apart."""
+"""Number of photos of the turning man, 45 degrees apart."""
 RATE = 10
-"""Frames a second of his video: 53 of them are a turn, which takes a person some five seconds."""
+"""Frames a second of his video. 53 frames are a turn, which takes a person some five seconds."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenCV's axes of a camera to those of transforms.json."""
+"""Matrix from OpenCV's axes of a camera to those of transforms.json."""
 SIDES = 6
 """Pictures in a row of the sheet."""
 WOMAN, ANGLES = "20_1", (0, 90, 180, 270)
-"""Of the scans: the woman's number, and the views that there are of her."""
+"""The woman's number among the scans, and the degrees of the views that exist of her."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,11 +71,11 @@ class Case:
     options: tuple[str, ...] = ()
     """Further options of `humangs start`."""
     frame: RealFrame | None = None
-    """Careful masks and photos without rims to score by; None: as `start` cut the photos out."""
+    """Careful masks and photos without rims to score by. None: photos as `start` cuts them out."""
 
 
 Cases = Iterator[tuple[str, Callable[[], Case]]]
-"""(row, what makes its photos)."""
+"""Pairs of the name of a row and a function that makes its photos."""
 
 
 # The people
@@ -83,12 +83,13 @@ Cases = Iterator[tuple[str, Callable[[], Case]]]
 
 
 def known_man(source: Path, work: Path) -> Cases:
-    """The demo of `pose2sim`: four cameras, with their calibration and without."""
+    """Yields the cases of the demo of `pose2sim`: four cameras, with and without calibration."""
     for way in ("calibrated", "photos alone"):
         yield f"known man, {way}", functools.partial(_known, source, work, way == "calibrated")
 
 
 def _known(source: Path, work: Path, calibrated: bool) -> Case:
+    """Writes the photos of the known man, and their cameras if they are calibrated."""
     number = FRAMES[0]
     frame = prepare(source, [number], straight=calibrated)[number]
     folder = work / f"known_{'calibrated' if calibrated else 'alone'}"
@@ -103,12 +104,13 @@ def _known(source: Path, work: Path, calibrated: bool) -> Case:
 
 
 def turning_man(source: Path, work: Path) -> Cases:
-    """A man who turns before one camera, `input.gif`: eight photos, and the video."""
+    """Yields the cases of a man who turns before one camera, `input.gif`: photos, and the video."""
     for way in ("photos", "video"):
         yield f"turning man, {way}", functools.partial(_turning, source, work, way)
 
 
 def _turning(source: Path, work: Path, way: str) -> Case:
+    """Writes the photos or the video of the turning man."""
     with Image.open(source / "input.gif") as clip:
         frames = [np.asarray(each.convert("RGB")) for each in ImageSequence.Iterator(clip)]
     if way == "video":
@@ -123,15 +125,19 @@ def _turning(source: Path, work: Path, way: str) -> Case:
 
 
 def woman(source: Path, work: Path) -> Cases:
-    """Renderings of a scan with calibrated cameras and masks; a girl stands before her."""
+    """Yields the case of a woman: renderings of a scan with calibrated cameras and masks. A girl
+    stands in front of her.
+    """
     yield "woman, calibrated, masks", functools.partial(_woman, source, work)
 
 
 def _woman(source: Path, work: Path) -> Case:
+    """Writes the photos, the masks and the cameras of the woman."""
     folder, names, K, matrices = work / "woman", [], [], []
     for kind in ("images", "masks"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
-    flip = np.diag([1.0, -1.0, 1.0, 1.0])  # of images and of the world: y is down in both
+    # y of the images and of the world points down, and is turned up
+    flip = np.diag([1.0, -1.0, 1.0, 1.0])
     for angle in ANGLES:
         parameters = source / "parameter" / WOMAN
         own, pose = np.load(parameters / f"{angle}_intrinsic.npy"), np.eye(4)
@@ -141,9 +147,8 @@ def _woman(source: Path, work: Path) -> Case:
             photo.convert("RGB").save(folder / "images" / f"{angle:03d}.png")
         with Image.open(source / "mask" / WOMAN / f"{angle}.jpg") as mask:
             person = np.asarray(mask.convert("L")) > 127
-        Image.fromarray(to_uint8(person.astype(np.float32))).save(
-            folder / "masks" / f"{angle:03d}.png"
-        )
+        mask_picture = Image.fromarray(to_uint8(person.astype(np.float32)))
+        mask_picture.save(folder / "masks" / f"{angle:03d}.png")
         own[1, 2] = side - own[1, 2]
         names.append(f"{angle:03d}")
         K.append(own)
@@ -159,8 +164,9 @@ def write_transforms(
     matrices: Float[np.ndarray, "v 4 4"],
     side: int,
 ) -> None:
-    """A transforms.json of square photos in `folder / "images"`. matrices: cam_from_world,
-    OpenCV.
+    """Writes a transforms.json of square photos in `folder / "images"`.
+
+    `matrices` are cam_from_world in the axes of OpenCV, and `side` is that of the photos in pixels.
     """
     frames = [
         {
@@ -179,7 +185,16 @@ def write_transforms(
 
 
 def measure(make: Callable[[], Case], out: Path, views: int) -> dict[str, Any]:
-    """Numbers of a case; what an earlier run of `humangs start` has finished is not made again."""
+    """Makes a capture of a case by `humangs start`, and returns the numbers of held-out photos.
+
+    A capture that an earlier run has finished is not made again.
+
+    Args:
+        make: makes the photos of the case
+        out: folder of the capture
+        views: number of photos that are held out, 0: all
+    """
+    # the command runs in a new process, whose time is that of a user
     case = make()
     times = out.with_name(f"{out.name}.json")
     if not (times.is_file() and (out / "avatar.html").is_file()):
@@ -192,7 +207,9 @@ def measure(make: Callable[[], Case], out: Path, views: int) -> dict[str, Any]:
         write_json(times, {"seconds": seconds, "load": os.getloadavg()[0]})
     capture = load_capture(out)
     count = capture.view_count
-    held = range(count) if not views else np.unique(np.arange(views) * count // views).tolist()
+    held = range(count)
+    if views:
+        held = np.unique(np.arange(views) * count // views).tolist()
     truth, masks = _careful(case.frame, capture)
     found = held_out_scores(capture, avatar_of, held, truth, masks)
     numbers = {
@@ -207,7 +224,7 @@ def measure(make: Callable[[], Case], out: Path, views: int) -> dict[str, Any]:
 def _careful(
     frame: RealFrame | None, capture: Capture
 ) -> tuple[Float[np.ndarray, "v h w 3"] | None, Float[np.ndarray, "v h w"] | None]:
-    """The person on white and the masks to score the views of a capture by, in their order."""
+    """Returns the person on white and the masks to score by, in the order of a capture's views."""
     if frame is None:
         return None, None
     rows = [frame.names.index(name.rpartition("/")[2]) for name in capture.names]
@@ -215,15 +232,15 @@ def _careful(
 
 
 def avatar_of(capture: Capture) -> Avatar:
-    """By the network, iterations of the learned update, and steps on the head where there are
-    any.
+    """Makes an avatar by the network, the iterations of the learned update, and the default steps
+    on the head.
     """
     config = RefineConfig(iterations=ITERATIONS, steps=0, seconds=None, image_size=512)
     return refine(reconstruct(*load_weights(), capture), capture, config)
 
 
 def draw_sheet(capture: Capture, path: Path) -> None:
-    """The avatar from six sides in the pose of its photos, and walking; no photo."""
+    """Draws the avatar from six sides in the pose of its photos, and walking. No photo is shown."""
     avatar, shot = avatar_of(capture), FrameSettings(width=200, height=300)
     around = images(avatar, *turntable_views(avatar, capture.pose(0), SIDES, shot), shot)
     motion = load_motion(rest_joints=avatar.rest_joints)
@@ -235,13 +252,13 @@ def draw_sheet(capture: Capture, path: Path) -> None:
 
 
 def section(rows: dict[str, dict[str, Any]]) -> str:
-    """The table of the page."""
+    """Formats the table of the page."""
     lines = [[row, *cells(numbers, COLUMNS)] for row, numbers in rows.items()]
     return markdown_table(["row", *(heading for heading, _ in COLUMNS.values())], lines)
 
 
 def _place_of(work: Path, row: str) -> Path:
-    """Where the capture of a row is kept."""
+    """Returns the folder of the capture of a row."""
     return work / f"start_{row.replace(', ', '_')}"
 
 
@@ -256,23 +273,24 @@ def real_people(
     rows: tuple[str, ...] = (),
     pictures: Path | None = None,
 ) -> None:
-    """Real people: what `humangs start` makes of them, and how like them the avatar is where no
-    photo was.
+    """Measures what `humangs start` makes of real people, and how well the avatar shows them where
+    no photo was taken.
 
     Nothing is fetched: the folders hold what their owners publish. Needs the extra `photos` and
-    `imageio-ffmpeg`. Each photo is held out in turn: body and cameras have seen all, the avatar the
-    others. Own pose: the one that was found with the held-out photo; shared pose: the mean of the
-    others'. Colors corrected: the gain of each channel is fitted to the held-out photo, own pose.
-    seconds: of `humangs start`; the first row compiles.
+    `imageio-ffmpeg`. Each photo is held out in turn. Body and cameras are found from all photos,
+    the avatar from the others. "own pose" is the one that was found with the held-out photo.
+    "shared pose" is the mean of the poses of the others. For "colors corrected" the gain of each
+    channel is fitted to the held-out photo, in its own pose. "seconds" are those of `humangs
+    start`; the first row compiles.
 
     Options:
-    work: where photos, captures and times are kept; a later run goes on from there
+    work: folder of photos, captures and times; a later run goes on from there
     known: unpacked `pose2sim` 0.10.49, with Pose2Sim/Demo_SinglePerson in it
     turning: assets/demos/iper_023_1_1 of github.com/JanaldoChen/Anim-NeRF
     scan: dataset/multihuman of github.com/DSaurus/DeepMultiCap
     views: photos that are held out, evenly spread; 0: all
-    rows: how their names begin, as "turning man, video"; all if none is given
-    pictures: a sheet of the avatar of the first row
+    rows: beginnings of the names of rows, as "turning man, video"; default: all rows
+    pictures: image to write, a sheet of the avatar of the first row
     """
     people = {known_man: known, turning_man: turning, woman: scan}
     given = {person: source for person, source in people.items() if source is not None}
@@ -281,6 +299,8 @@ def real_people(
     for source in given.values():
         if not source.is_dir():
             raise ValueError(f"{source}: no such folder")
+
+    # captures and times stay in the folder, and are not made again
     enable_compile_cache()
     work.mkdir(parents=True, exist_ok=True)
     cases = {

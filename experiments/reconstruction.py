@@ -1,8 +1,10 @@
-"""Time, arithmetic and memory of one reconstruction: photos and body in, canonical Gaussians out.
+"""Measures time, arithmetic and memory of one reconstruction, from photos and body to canonical
+Gaussians.
 
-The subject is the person of the demo, seen by cameras of the published protocol. What the photos
-show changes no cost but one: how many patches the person touches. Random weights cost what trained
-ones cost. Operations are counted from the traced programs, loops included (`costs.py`).
+The subject is the person of the demo, seen by cameras of the published protocol. Costs depend on
+the contents of the photos only through the number of patches that the person touches. Random
+weights cost what trained ones cost. Operations are counted in the traced programs, with their loops
+(`costs.py`).
 """
 
 import functools
@@ -31,27 +33,33 @@ from humangs_jax.network.weights import expected_variables, load_weights
 from humangs_jax.rendering.buffers import round_up
 
 MATMUL_SHAPE = (4096, 768, 3072)
-"""A product of the published network's MLP at 256 x 256: what "matrix-product peak" means here."""
+"""Sizes of a matrix product of the published network's MLP at 256 x 256 pixels, whose speed is the
+peak that others are compared with.
+"""
 TOKENS = ("all", "foreground")
+"""Which patches are tokens."""
 LOG_SCALE, HEAD_SCALE = -4.6, 0.05
-"""Bias of the scales before their softplus, and how much weaker random geometry heads are than
-other random layers.
+"""Bias of the scales before their softplus, and factor by which random geometry heads are weaker
+than other random layers.
 """
 
 
 def benchmark_inputs(config: Any, views: int, size: int) -> Any:
-    """`HumanGSInputs` of the demo's photos, in turns until there are that many, as a network of
-    this configuration wants them.
+    """Returns the `HumanGSInputs` of `views` photos of the demo, for a network of this
+    configuration.
+
+    Photos are repeated if the demo has fewer. `size` is their side in pixels.
     """
     capture = load_capture(DEMO_CAPTURE)
-    photos = to_network_views(capture.select([i % capture.view_count for i in range(views)]), size)
+    chosen = [i % capture.view_count for i in range(views)]
+    photos = to_network_views(capture.select(chosen), size)
     prepare = jax.jit(prepare_inputs, static_argnames="config")
     return jax.block_until_ready(prepare(gaussian_body(capture.body, config), photos, config))
 
 
 def foreground(inputs: Any, config: Any) -> tuple[Any, int, float]:
-    """(configuration for foreground tokens with room for these photos, tokens that the person
-    touches, their share).
+    """Returns the configuration for foreground tokens with room for these photos, the number of
+    tokens that the person touches, and their share.
     """
     patch = config.architecture.encoder.patch_size
     touched = int(needed_tokens(inputs.foreground, inputs.view_count, patch))
@@ -61,9 +69,10 @@ def foreground(inputs: Any, config: Any) -> tuple[Any, int, float]:
 
 
 def random_variables(config: Any) -> Any:
-    """Variables in which every number matters, of Gaussians about a centimetre large.
+    """Returns random variables of a network, with which every number matters and Gaussians are
+    about a centimetre large.
 
-    Drawn by numpy: initialising the published network compiles for 10 s.
+    NumPy draws them, because initialising the published network compiles for 10 s.
     """
     rng = np.random.default_rng(0)
 
@@ -82,7 +91,9 @@ def random_variables(config: Any) -> Any:
 
 
 def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float, int]:
-    """(compiled program, seconds that tracing and compiling took, operations)."""
+    """Compiles a function, and returns the program, the seconds of tracing and compiling, and the
+    number of operations.
+    """
     start = time.perf_counter()
     traced = jax.jit(function).trace(*arguments)
     program = traced.lower().compile()
@@ -90,7 +101,9 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float,
 
 
 def matmul_program(dtype: str) -> tuple[Callable[[], Any], float]:
-    """(a plain matrix product in that dtype, its floating-point operations)."""
+    """Returns a function that does a plain matrix product in a dtype, and its floating-point
+    operations.
+    """
     rows, inner, columns = MATMUL_SHAPE
     rng = np.random.default_rng(0)
     a = jnp.asarray(rng.standard_normal((rows, inner)), dtype)
@@ -100,9 +113,9 @@ def matmul_program(dtype: str) -> tuple[Callable[[], Any], float]:
 
 
 def configured(preset: str, size: int) -> HumanGSConfig:
-    """A preset for photos of that size, in the dtype that suits the machine.
+    """Returns a preset for photos of `size` pixels, in the dtype that suits the machine.
 
-    Raises ValueError for an unknown preset.
+    Raises: ValueError for an unknown preset.
     """
     if preset not in PRESETS:
         raise ValueError(f"--preset {preset}: expected one of {', '.join(PRESETS)}")
@@ -111,7 +124,7 @@ def configured(preset: str, size: int) -> HumanGSConfig:
 
 
 def whole(variables: Any, inputs: Any, config: HumanGSConfig) -> tuple[Any, float, int]:
-    """The network as one program, see `compiled`."""
+    """Compiles the network as one program, see `compiled`."""
     return compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)
 
 
@@ -125,19 +138,20 @@ def reconstruction_benchmark(
     memory: tuple[int, ...] = (1, 4, 8, 16),
     memory_size: int = 512,
 ) -> None:
-    """Time, arithmetic and memory of a reconstruction, with all tokens and with those of the
-    foreground.
+    """Measures time, arithmetic and memory of a reconstruction, with all tokens and with those of
+    the foreground.
 
-    In turns with a plain matrix product, which gives the peak of this run. Operations are counted
-    from traced programs. Memory is XLA's analysis of programs that are not run (table
-    reconstruction_memory). Published at 256 with 4 views takes 3 minutes on 2 cores.
+    Programs are timed in turns with a plain matrix product, which gives the peak of this run.
+    Operations are counted in traced programs. Memory is XLA's analysis of programs that are not run
+    (table reconstruction_memory). The preset "published" at 256 pixels with 4 views takes 3 minutes
+    on 2 cores.
 
     Options:
     preset: published, paper, small or tiny
     size: side of the photos, pixels
     repeats: timed iterations
     memory: numbers of views to analyse the memory for
-    memory_size: side of the photos there
+    memory_size: side of the photos whose memory is analysed, pixels
     """
     config, large = configured(preset, size), configured(preset, memory_size)
     settings = {
@@ -159,46 +173,36 @@ def reconstruction_benchmark(
         cells = [
             f"{case['ms'] / 1e3:.1f}, {case['cpu_ms'] / 1e3:.1f}",
             f"{case['flops'] / 1e9:.0f}",
-        ]
-        cells += [
             f"{case['over_products']:.2f}",
             f"{case['temporary_mb']:.0f}",
             f"{case['compile_s']:.1f}",
         ]
         table.append([name, case["tokens"], *cells])
-    header = [
-        "tokens",
-        "slots",
-        "wall, CPU s",
-        "GFLOP",
-        "over plain products (CPU)",
-        "MiB",
-        "compile s",
-    ]
+    header = ["tokens", "slots", "wall, CPU s", "GFLOP", "over plain products (CPU)", "MiB"]
+    header += ["compile s"]
     title = f"{preset}, {views} views of {size}, {config.runtime.dtype}, {rows['time']['device']}."
     run.show(f"{title}\n\n{markdown_table(header, table)}", rows["time"] | settings)
     if memory:
-        table = [
-            [
-                f"{name} tokens, {unit}",
-                *(f"{scale * rows[f'{name}, {n}'][key]:.{digits}f}" for n in memory),
-            ]
-            for name in TOKENS
-            for unit, key, scale, digits in (
-                ("MiB", "temporary_mb", 1, 0),
-                ("TFLOP", "flops", 1e-12, 2),
-            )
-        ]
+        table = []
+        for name in TOKENS:
+            found = [rows[f"{name}, {count}"] for count in memory]
+            mebibytes = [f"{row['temporary_mb']:.0f}" for row in found]
+            operations = [f"{1e-12 * row['flops']:.2f}" for row in found]
+            table.append([f"{name} tokens, MiB", *mebibytes])
+            table.append([f"{name} tokens, TFLOP", *operations])
         header = [f"{preset} at {memory_size}", *(f"{count} views" for count in memory)]
         rows.pop("time")
         run.show(markdown_table(header, table), rows, "reconstruction_memory")
 
 
 def benchmark(config: HumanGSConfig, views: int, size: int, repeats: int) -> dict[str, Any]:
-    """Of all tokens and those of the foreground: ms, operations, MiB, and the time over that of as
-    many plain products.
+    """Measures a network with all tokens and with those of the foreground.
+
+    Returns for each ms, operations, MiB, and the CPU time as a multiple of that of plain matrix
+    products with as many operations.
     """
-    jax.config.update("jax_enable_compilation_cache", False)  # compile times are of a first run
+    # compile times are those of a first run
+    jax.config.update("jax_enable_compilation_cache", False)
     inputs, variables = benchmark_inputs(config, views, size), random_variables(config)
     packed, touched, share = foreground(inputs, config)
     product, product_flops = matmul_program(config.runtime.dtype)
@@ -212,7 +216,13 @@ def benchmark(config: HumanGSConfig, views: int, size: int, repeats: int) -> dic
             "temporary_mb": temporary_mb(program),
             "tokens": tokens,
         }
-        runs[name] = lambda program=program: jax.block_until_ready(program(variables, inputs))
+
+        def timed(program=program):
+            return jax.block_until_ready(program(variables, inputs))
+
+        runs[name] = timed
+
+    # all programs take turns
     times = {name: list(map(float, pair)) for name, pair in medians(runs, repeats).items()}
     for name, fact in facts.items():
         wall, cpu = times[name]
@@ -230,8 +240,8 @@ def benchmark(config: HumanGSConfig, views: int, size: int, repeats: int) -> dic
 
 
 def _memory(config: HumanGSConfig, views: int, size: int) -> dict[str, float]:
-    """MiB that a program for that number of photos of that size needs besides its arguments and
-    results; its operations.
+    """Returns the operations of a program for this number of photos, and the MiB that it needs
+    besides its arguments and results.
     """
     subject = benchmark_inputs(config.with_runtime(tokens="all"), views, size)
     if config.tokens == "foreground":
@@ -245,13 +255,14 @@ def _memory(config: HumanGSConfig, views: int, size: int) -> dict[str, float]:
 def reconstruction_batches(
     run: Run, sizes: tuple[int, ...] = (1, 2, 4, 8, 16, 32), runs: int = 3
 ) -> None:
-    """Subjects a second of `hg.reconstruct_views` under `vmap`, by the size of the batch: four
-    photos, shipped weights.
+    """Measures how many subjects a second `hg.reconstruct_views` does under `vmap`, by the size of
+    the batch, with four photos and the shipped weights.
 
     Options:
-        sizes: of the batches
+        sizes: sizes of the batches
         runs: timed calls of each, in turns; the median counts
     """
+    # a compiled program for each size
     (variables, config), capture = load_weights(), load_capture(DEMO_CAPTURE)
     batched = jax.jit(jax.vmap(reconstruct_views, in_axes=(None, None, None, 0)))
     calls, memory = {}, {}
@@ -259,20 +270,17 @@ def reconstruction_batches(
         body, views, own = stack_captures(config, [capture] * size)
         program = batched.lower(variables, own, body, views).compile()
         memory[str(size)] = temporary_mb(program)
-        arguments = variables, own, body, views
-        calls[str(size)] = lambda program=program, arguments=arguments: jax.block_until_ready(
-            program(*arguments)
-        )
+
+        def call(program=program, arguments=(variables, own, body, views)):
+            return jax.block_until_ready(program(*arguments))
+
+        calls[str(size)] = call
     each = {size: float(ms[0]) / int(size) for size, ms in medians(calls, runs).items()}
     first = each[str(sizes[0])]
     rows = [
         [size, f"{1000 / ms:.2f}", f"{first / ms:.2f}", f"{memory[size]:,.0f}"]
         for size, ms in each.items()
     ]
-    header = [
-        "subjects in a batch",
-        "subjects a second",
-        f"relative to {sizes[0]}",
-        "working memory, MB",
-    ]
+    header = ["subjects in a batch", "subjects a second", f"relative to {sizes[0]}"]
+    header += ["working memory, MB"]
     run.show(markdown_table(header, rows, "rrrr"), {"ms": each, "memory_mb": memory})

@@ -1,4 +1,4 @@
-"""What refinement gains, and README's tables, which are made of it."""
+"""Measures what refinement gains, and makes README's tables of it."""
 
 import dataclasses
 import itertools
@@ -23,8 +23,8 @@ from humangs_jax.refinement.learned import SHIPPED
 from humangs_jax.refinement.refine import refine_with_report
 
 DEGREES, SHAPES = 0.2, 0.02
-"""Of --off: turn of a joint and change of a shape coefficient (standard deviations) for each
-millimetre.
+"""Standard deviations of a joint's turn in degrees and of the change of a shape coefficient, for
+each millimetre of --off.
 """
 SHOWN = {
     "psnr": ("PSNR", 2),
@@ -34,7 +34,7 @@ SHOWN = {
     "semi_transparent": ("semi-transparent foreground", 3),
 }
 OF_POSES = ("psnr", "psnr_fg", "lpips")
-"""Of `SHOWN`, those that tables have of novel poses."""
+"""The scores of `SHOWN` that tables have of novel poses."""
 
 
 @entry
@@ -50,21 +50,23 @@ def refinement(
     sheet: Path | None = None,
     details_sheet: Path | None = None,
 ) -> None:
-    """What refinement gains on held-out views, against its seconds.
+    """Measures what refinement gains on held-out views, against its seconds.
 
-    0 seconds are the start; seconds do not count compilation. One device: one core of a CPU. With
-    --off, held-out views show the pose of the photos and are drawn with the same wrong body.
+    0 seconds is the avatar before refinement. Seconds do not count compilation. The device is one
+    core of a CPU. With --off, held-out views show the pose of the photos and are drawn with the
+    same wrong body.
 
     Options:
     seconds: lengths of the runs
     sizes: sides of the photos in pixels (--size is not used)
     views: numbers of photos
-    iterations: of the learned update; 0: Adam alone
-    off: standard deviations of the body's translation, millimetres; for each, joints turn by 0.2
-    degrees, shapes change by 0.02
-    plot: PSNR against seconds
-    sheet: truth, feed-forward and the longest run of every person, largest size
-    details_sheet: the same of faces, hands, hems and shoes
+    iterations: numbers of iterations of the learned update; 0: Adam alone
+    off: standard deviations of the body's translation in millimetres; for each millimetre joints
+    turn by 0.2 degrees, and shapes change by 0.02
+    plot: figure to write, with PSNR against seconds
+    sheet: image to write, with the truth, the feed-forward avatar and the longest run of every
+    person at the largest size
+    details_sheet: image to write, with faces, hands, hems and shoes of the same
     """
     start = people.start()
     settings: dict[str, Any] = {
@@ -74,40 +76,36 @@ def refinement(
         "off": off,
         "iterations": iterations,
     }
-    settings |= {"refiner": shipped_digest(SHIPPED)} if any(iterations) else {}
-    hows = {
-        f"{n} iterations, Adam" if n else "Adam": RefineConfig(iterations=n) for n in iterations
-    }
+    if any(iterations):
+        settings["refiner"] = shipped_digest(SHIPPED)
+    hows = {}
+    for count in iterations:
+        name = f"{count} iterations, Adam" if count else "Adam"
+        hows[name] = RefineConfig(iterations=count)
 
+    # every way to refine at every size, number of photos and error of the body
     def measure(seed):
         row, pictures = {}, None
         for size in sizes:
             subject = start.subject(seed, views, size)
             for count, wrong, how in itertools.product(views, off, hows):
-                cell, drawn = _refined(
-                    start, with_body_off(subject, wrong), count, hows[how], seconds
-                )
+                person = with_body_off(subject, wrong)
+                cell, drawn = _refined(start, person, count, hows[how], seconds)
                 row[f"{size} {count} {wrong:g} {how}"] = cell
-                pictures = drawn if count == max(views) else pictures
+                if count == max(views):
+                    pictures = drawn
         return row, pictures
 
-    rows, settings = (
-        start.rows(run, measure, settings, bool(sheet or details_sheet)),
-        start.settings | settings,
-    )
+    rows = start.rows(run, measure, settings, bool(sheet or details_sheet))
+    settings = start.settings | settings
     numbers = refinement_means(rows)
-    run.show(
-        refinement_section(numbers, settings, len(rows)),
-        {"settings": settings, "means": numbers, "people": len(rows)},
-    )
+    text = refinement_section(numbers, settings, len(rows))
+    run.show(text, {"settings": settings, "means": numbers, "people": len(rows)})
+
+    # pictures of all people
     if sheet:
-        write_triples(
-            sheet,
-            {
-                seed: [cropped(image) for image in drawn]
-                for seed, (drawn, _) in run.pictures.items()
-            },
-        )
+        strips = {seed: list(map(cropped, drawn)) for seed, (drawn, _) in run.pictures.items()}
+        write_triples(sheet, strips)
     if details_sheet:
         write_triples(details_sheet, {seed: close for seed, (_, close) in run.pictures.items()}, 1)
     if plot:
@@ -115,7 +113,9 @@ def refinement(
 
 
 def with_body_off(subject: Any, millimetres: float) -> Any:
-    """The person, whose photos and held-out views of the same pose come with a body that is off."""
+    """Returns a person whose photos and held-out views of the same pose come with a body that is
+    off.
+    """
     if not millimetres:
         return subject
     poses, betas = subject.photos.poses[:1], subject.photos.betas
@@ -129,7 +129,9 @@ def with_body_off(subject: Any, millimetres: float) -> Any:
 
 
 def body_off(poses: Any, betas: Any, millimetres: float, seed: int) -> tuple[Any, Any]:
-    """Poses (p,) and shape coefficients with the errors of a fit, the same of all poses."""
+    """Returns poses (p,) and shape coefficients with the errors of a fit, which are the same in all
+    poses.
+    """
     rng = np.random.default_rng(seed)
 
     def off(array, std):
@@ -143,14 +145,15 @@ def body_off(poses: Any, betas: Any, millimetres: float, seed: int) -> tuple[Any
 
 
 def _refined(start, subject, count, how, seconds):
-    """Scores by seconds and task; truth, feed-forward and refined of a held-out view from the
-    front, whole and in details.
+    """Refines an avatar for each of the seconds.
+
+    Returns {seconds: {task: scores}}, and pictures of a held-out view from the front: the truth,
+    the feed-forward avatar and the longest refinement, as whole images and as details.
     """
     inputs = subject.inputs(count)
     avatar = reconstruct(start.variables, start.config, inputs)
-    view = frontal_view(
-        subject.photos, subject.held_out, task_views(subject.held_out)["novel"].tolist()
-    )
+    novel = task_views(subject.held_out)["novel"].tolist()
+    view = frontal_view(subject.photos, subject.held_out, novel)
     scores, first = score_all(avatar, subject.held_out, start.lpips, view)
     cell, last = {"0": scores}, first
     for length in seconds:
@@ -163,41 +166,37 @@ def _refined(start, subject, count, how, seconds):
         }
         cell[f"{length:g}"] = scores | {"run": about | {"photos_psnr": refined.psnr[1]}}
     drawn = (subject.held_out.images[view], first, last)
-    return cell, (
-        drawn,
-        [np.concatenate(list(details(image, subject.held_out, view)), axis=1) for image in drawn],
-    )
+    close = [list(details(image, subject.held_out, view)) for image in drawn]
+    return cell, (drawn, [np.concatenate(each, axis=1) for each in close])
 
 
 def score_all(
     avatar: Any, held_out: Any, lpips: Lpips | None = None, view: int = 0
 ) -> tuple[dict[str, Any], np.ndarray]:
-    """Scores by task, also the semi-transparent foreground of the true images, and the image of a
-    view.
+    """Returns {task: scores} of an avatar, and the image of a view.
+
+    The scores also have the share of semi-transparent foreground in the true images.
     """
     drawn = predict_views(avatar, held_out)
     scores = score_tasks(drawn.images, held_out, lpips, drawn.alpha)
     for task, views in task_views(held_out).items():
         if task in scores:
-            true = [
-                float(semi_transparent(mask, mask)) for mask in jnp.asarray(held_out.masks)[views]
-            ]
+            masks = jnp.asarray(held_out.masks)[views]
+            true = [float(semi_transparent(mask, mask)) for mask in masks]
             scores[task]["semi_transparent_of_truth"] = sum(true) / len(true)
     return scores, drawn.images[view]
 
 
 def refinement_means(rows: list[Any]) -> dict[str, Any]:
-    """{cell: {seconds: {task: mean scores, "least_gain": of any person}}} of people's rows."""
+    """Returns {cell: {seconds: {task: mean scores, "least_gain": that of any person}}} of the rows
+    of people.
+    """
     found = {}
     for name, lengths in rows[0].items():
         found[name] = {}
         for seconds in lengths:
-            tasks = means(
-                [
-                    {task: row[name][seconds][task] for task in TASKS if task in lengths[seconds]}
-                    for row in rows
-                ]
-            )
+            known = [task for task in TASKS if task in lengths[seconds]]
+            tasks = means([{task: row[name][seconds][task] for task in known} for row in rows])
 
             def gain(row, name=name, seconds=seconds):
                 return row[name][seconds]["novel"]["psnr"] - row[name]["0"]["novel"]["psnr"]
@@ -207,15 +206,28 @@ def refinement_means(rows: list[Any]) -> dict[str, Any]:
 
 
 def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people: int) -> str:
-    """The table of the page. Starts are shown once: they are those of all ways to refine."""
-    first, off, rows, begun = next(iter(numbers.values()))["0"], any(settings["off"]), [], set()
+    """Formats the table of the page.
+
+    The avatar before refinement is shown once, because it is the same for all ways to refine.
+    """
+    # columns (task, score) that the rows have
+    first, off = next(iter(numbers.values()))["0"], any(settings["off"])
     wanted = {"novel": tuple(SHOWN), "animation": OF_POSES}
     columns = [
-        (t, k) for t in TASKS if t in first for k in wanted[t] if first[t].get(k) is not None
+        (task, key)
+        for task in TASKS
+        if task in first
+        for key in wanted[task]
+        if first[task].get(key) is not None
     ]
+
+    # a line for each way to refine and its seconds
+    rows, begun = [], set()
     for name, lengths in numbers.items():
         size, count, wrong, how = name.split(" ", 3)
-        what = [f"{count} of {size} px", *([f"{wrong} mm"] if off else [])]
+        what = [f"{count} of {size} px"]
+        if off:
+            what.append(f"{wrong} mm")
         for seconds, cell in lengths.items():
             scores = [f"{cell[task][key]:.{SHOWN[key][1]}f}" for task, key in columns]
             if seconds != "0":
@@ -223,34 +235,36 @@ def refinement_section(numbers: dict[str, Any], settings: dict[str, Any], people
             elif tuple(what) not in begun:
                 begun.add(tuple(what))
                 rows.append([*what, "none", seconds, *scores, ""])
-    names = [(f"{TASKS[task]}: " if key == "psnr" else "") + SHOWN[key][0] for task, key in columns]
-    header = [
-        "photos",
-        *(["body off"] if off else []),
-        "refinement",
-        "seconds",
-        *names,
-        "worst-subject gain",
-    ]
-    about = (
-        f"Means over {people} people of the {settings['split']} seeds; PSNR in dB"
-        + (f"; LPIPS {settings['lpips_net']}" if settings.get("lpips_net") else "")
-        + "; seconds: of the whole run on one core, without compilation; silhouette: PSNR within 3"
-        " pixels (of 256) of the true "
-        + "one; worst-subject gain: the least of any person in novel views."
+
+    # the first column of a task names the task
+    header = ["photos", "body off"] if off else ["photos"]
+    header += ["refinement", "seconds"]
+    for task, key in columns:
+        heading = SHOWN[key][0]
+        header.append(f"{TASKS[task]}: {heading}" if key == "psnr" else heading)
+    header.append("worst-subject gain")
+
+    about = f"Means over {people} people of the {settings['split']} seeds; PSNR in dB"
+    if settings.get("lpips_net"):
+        about += f"; LPIPS {settings['lpips_net']}"
+    about += (
+        "; seconds: of the whole run on one core, without compilation; silhouette: PSNR within 3"
+        " pixels (of 256) of the true one; worst-subject gain: the least of any person in novel"
+        " views."
     )
     true = {
         name.split()[0]: lengths["0"]["novel"]["semi_transparent_of_truth"]
         for name, lengths in numbers.items()
         if "semi_transparent_of_truth" in lengths["0"]["novel"]
     }
-    shares = ", ".join(f"{share:.3f} at {size} px" for size, share in true.items())
-    about += f" Semi-transparent foreground of the true images: {shares}." if true else ""
+    if true:
+        shares = ", ".join(f"{share:.3f} at {size} px" for size, share in true.items())
+        about += f" Semi-transparent foreground of the true images: {shares}."
     return f"{about}\n\n{markdown_table(header, rows, 'l' * (3 + off) + 'r' * (len(columns) + 1))}"
 
 
 def plot_refinement(path: Path, numbers: dict[str, Any]) -> None:
-    """PSNR of the whole image and of the foreground against seconds."""
+    """Draws the PSNR of the whole image and of the foreground against seconds."""
     with figure(path, 2, (9, 3.6), legend=0.2) as axes:
         for axis, key, title in zip(
             axes, ("psnr", "psnr_fg"), ("whole image", SHOWN["psnr_fg"][0]), strict=True
@@ -278,18 +292,21 @@ def plot_refinement(path: Path, numbers: dict[str, Any]) -> None:
 
 @entry
 def readme(run: Run, refined: Path, timed: Path | None = None) -> None:
-    """README's tables of quality and of the demo's times, from two runs of the demo and from tables
-    of the docs.
+    """Makes README's tables of quality and of the demo's times, from two runs of the demo and from
+    tables of the docs.
 
-    HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --out b; readme
-    b/report.json --timed a/report.json Times are those of an idle machine, from an empty compile
-    cache.
+    The runs are made by these commands, on an idle machine and without a compile cache:
+
+        HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a
+        humangs demo --out b
+        python -m experiments readme b/report.json --timed a/report.json
 
     Tables: readme_quality
 
     Options:
     refined: report of the refined demo
-    timed: report of the unrefined demo, nothing compiled before; without it times stay
+    timed: report of the unrefined demo, with nothing compiled before; default: times are not
+    changed
     """
     paths = (
         REPOSITORY / "docs" / "results" / f"{name}.json"
@@ -302,10 +319,14 @@ def readme(run: Run, refined: Path, timed: Path | None = None) -> None:
 
 
 def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any]) -> str:
-    """The demo person and the test people.
+    """Formats README's table of quality, of the demo's person and of the test people.
 
-    Raises: ValueError if the demo was not refined, or the weights of the two tables are not the
-    same.
+    Args:
+        demo: report of the refined demo
+        people: numbers of the table evaluation_views
+        refined: numbers of the table appearance
+
+    Raises: ValueError if the demo was not refined, or if the two tables are of different weights.
     """
     if "refined" not in demo:
         raise ValueError(
@@ -321,9 +342,10 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
         return refined["means"]["all"][f"{size} 0 {task}"]["default"]
 
     columns = {"psnr": ("PSNR", 1), "psnr_fg": ("foreground PSNR", 1), "alex": ("LPIPS (Alex)", 3)}
-    own = {"psnr": "psnr", "psnr_fg": "psnr_fg"} | (
-        {"alex": "lpips"} if people["settings"].get("lpips_net") == "alex" else {}
-    )
+    # evaluation_views has LPIPS of one network under another name
+    own = {"psnr": "psnr", "psnr_fg": "psnr_fg"}
+    if people["settings"].get("lpips_net") == "alex":
+        own["alex"] = "lpips"
     feed_forward = people["by_views"]["4"]["novel"]
     rows = {
         f"{people['people']} synthetic people, 256 px, feed-forward": {
@@ -344,6 +366,7 @@ def readme_quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[s
 
 
 def readme_times(demo: dict[str, Any]) -> str:
+    """Formats README's table of the demo's times, from the report of the unrefined demo."""
     spent, views = demo["timings"], demo["views"]
     photos = f"{views['input']} photos of {demo['image_size'][0]} px"
     stages = {

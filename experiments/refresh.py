@@ -1,4 +1,4 @@
-"""Makes tables of the docs again, one after the other, with what is shipped today."""
+"""Makes tables of the docs again, one after the other, with the package as it is."""
 
 import re
 import shlex
@@ -11,9 +11,9 @@ from experiments.results import REPOSITORY
 
 LIST = REPOSITORY / "experiments" / "README.md"
 ROW = re.compile(r"^\| \[(\w+)\]\([^)]*\) \| `([^`]+)` \|$", re.MULTILINE)
-"""A row of the list: the table, and the command that makes it."""
+"""Matches a row of the list: the table, and the command that makes it."""
 FILES = re.compile(r"\b(?!OUT\b)[A-Z]{2,}\b|\.py |\.pt ")
-"""A command that wants files which only the user has, or that is no entry."""
+"""Matches a command that needs files which only the user has, or that is no entry."""
 
 
 @entry
@@ -22,13 +22,14 @@ def refresh(run: Run, out: Path, tables: tuple[str, ...]) -> int:
     them.
 
     What an experiment has measured lies in OUT/TABLE.json and is not measured again, so that the
-    same command goes on after an interruption. A table of an earlier day: begin in another OUT.
-    The exit status is 1 if an experiment failed; the others are made all the same.
+    same command continues after an interruption. A new OUT measures everything again. The exit
+    status is 1 if an experiment failed. The others are made nevertheless.
 
     Options:
-    out: folder
-    tables: which, in this order
+    out: folder of measurements
+    tables: names of the tables, in this order
     """
+    # the commands of the list, but for those that need files of the user
     commands = dict(ROW.findall(LIST.read_text(encoding="utf-8")))
     commands = {name: line for name, line in commands.items() if not FILES.search(line)}
     missing = [name for name in tables if name not in commands]

@@ -1,11 +1,12 @@
-"""Tables of README.md and docs/ from docs/results/*.json, and those of formats from the package.
+"""Renders the tables of README.md and docs/ from docs/results/*.json, and those of formats from the
+package.
 
     python experiments/render_tables.py [--check]
 
-Every section `<!-- table: NAME -->` ... `<!-- end -->` becomes what docs/results/NAME.json holds
-(format: `experiments/results.py`). --check writes nothing; exit status 1 if a page differs from its
-JSON files, if a section has no file, or if a file is shown nowhere. `<!-- formats: NAME -->` ...
-`<!-- end -->` becomes what the code has: one of `TABLES`.
+Every section `<!-- table: NAME -->` ... `<!-- end -->` gets the contents of docs/results/NAME.json,
+whose format `experiments/results.py` describes. Every section `<!-- formats: NAME -->` ...
+`<!-- end -->` gets one of `TABLES`, which the code makes. --check writes nothing. The exit status
+is 1 if a section has no file, if a file is shown nowhere, or, with --check, if a page differs.
 """
 
 import argparse
@@ -29,7 +30,7 @@ Table = tuple[Sequence[str], Sequence[Sequence[str]]]
 
 
 def main() -> int:
-    """Command line; the exit status."""
+    """Runs the command line and returns its exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -43,10 +44,14 @@ def main() -> int:
 
 
 def render_pages(repository: Path, write: bool) -> list[str]:
-    """Renders README.md and docs/*.md; returns what is wrong, one line each."""
+    """Renders README.md and docs/*.md, and returns what is wrong, one line for each fault.
+
+    If `write` is false, nothing is written, and pages that differ are faults.
+    """
     results, faults, shown = repository / "docs" / "results", [], set()
     known = {path.stem for path in results.glob("*.json")}
     for page in pages(repository):
+        # sections with a file, and markers without an end
         old = page.read_text()
         names = [match["name"] for match in SECTION.finditer(old)]
         faults += [
@@ -73,7 +78,7 @@ def render_pages(repository: Path, write: bool) -> list[str]:
 
 
 def format_table(name: str) -> str:
-    """What the package or the experiments have, as a table in Markdown. name: of `TABLES`."""
+    """Returns the table of `TABLES` with this name in Markdown."""
     header, rows = TABLES[name]()
     return "".join(f"| {' | '.join(row)} |\n" for row in (header, ["---"] * len(header), *rows))
 
@@ -84,7 +89,7 @@ def _quoted(words: Iterable[str]) -> str:
 
 
 def _cameras() -> Table:
-    """The formats of calibrations."""
+    """Returns the formats of calibrations."""
     from humangs_jax.data.formats import CAMERAS
 
     centers = {"half": "+0.5", "integer": "whole numbers"}
@@ -103,7 +108,7 @@ def _cameras() -> Table:
 
 
 def _keypoints() -> Table:
-    """The formats of keypoints."""
+    """Returns the formats of keypoints."""
     from humangs_jax.data.formats import KEYPOINTS
 
     rows = [(each.about, _quoted(each.names), each.content) for each in KEYPOINTS.values()]
@@ -111,7 +116,7 @@ def _keypoints() -> Table:
 
 
 def _motions() -> Table:
-    """The layouts of arrays of poses."""
+    """Returns the layouts of arrays of poses."""
     from humangs_jax.data.formats import MOTIONS
 
     header = ("of", "keys that tell it", "up", "frames per second, where the file has none")
@@ -128,7 +133,7 @@ def _motions() -> Table:
 
 
 def _limits() -> Table:
-    """What a file or a command may cost."""
+    """Returns the limits of what a file or a command may cost."""
     from experiments.knobs import docstrings
     from humangs_jax.io.reading import Limits
 
@@ -139,7 +144,7 @@ def _limits() -> Table:
 
 
 def _protocols() -> Table:
-    """How images are compared."""
+    """Returns the protocols by which images are compared."""
     from humangs_jax.evaluation import scores
     from humangs_jax.losses.losses import GAUSSIAN, TORCHMETRICS, UNIFORM
 
@@ -169,7 +174,9 @@ def _protocols() -> Table:
 
 
 def _rooms() -> Table:
-    """The folders of the package from the lowest layer up, by the docstrings of their modules."""
+    """Returns the folders of the package from the lowest layer up, with the docstrings of their
+    modules.
+    """
     contracts = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["importlinter"]
     (layers,) = (each for each in contracts["contracts"] if each["name"] == FLOORS)
     (forbidden,) = (each for each in contracts["contracts"] if each["type"] == "forbidden")
@@ -179,15 +186,18 @@ def _rooms() -> Table:
         room = module.partition(".")[2]
         text = (REPOSITORY / "humangs_jax" / room / "__init__.py").read_text()
         about = ast.get_docstring(ast.parse(text)) or ""
-        kind = "wing" if module in forbidden["forbidden_modules"] else "on top"
-        kind = "core" if module in forbidden["source_modules"] else kind
+        kind = "on top"
+        if module in forbidden["source_modules"]:
+            kind = "core"
+        elif module in forbidden["forbidden_modules"]:
+            kind = "wing"
         rows.append((kind, f"`{room}/`", " ".join(about.partition("\n\n")[0].split())))
     order = ("core", "wing", "on top")
     return ("", "room", "contents"), sorted(rows, key=lambda row: order.index(row[0]))
 
 
 def _exports() -> Table:
-    """The files of other programs that an avatar becomes."""
+    """Returns the files of other programs that an avatar can become."""
     from humangs_jax.avatar.export import EXPORTS
 
     rows = []
@@ -200,7 +210,7 @@ def _exports() -> Table:
 
 
 def _videos() -> Table:
-    """The files that a motion becomes."""
+    """Returns the files that a motion can become."""
     from humangs_jax.avatar.export import VIDEOS
     from humangs_jax.core.registry import FOLDER
 
@@ -215,7 +225,7 @@ def _videos() -> Table:
 
 
 def _systems() -> Table:
-    """The networks that the paper is compared with."""
+    """Returns the networks that the paper is compared with."""
     from experiments.systems import ONE_PHOTO, SYSTEMS
 
     rows = []
@@ -237,7 +247,7 @@ TABLES: dict[str, Callable[[], Table]] = {
     "systems": _systems,
     "videos": _videos,
 }
-"""By the name in `<!-- formats: NAME -->`."""
+"""{name in `<!-- formats: NAME -->`: function that makes the table}."""
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Results beside the docs, and the tables that pages show of them.
+"""Writes results beside the docs, and the tables that pages show of them.
 
 `docs/results/NAME.json` holds
 
@@ -9,8 +9,8 @@
                         "align"})
     numbers             the unrounded numbers, as the script wrote them; null if unknown
 
-A page shows it between `<!-- table: NAME -->` and `<!-- end -->`. `publish` writes both,
-`render_tables.py` all pages again.
+A page shows a result between `<!-- table: NAME -->` and `<!-- end -->`. `publish` writes the result
+and its page. `render_tables.py` renders all pages again.
 """
 
 import datetime
@@ -35,7 +35,7 @@ ALIGNMENTS = {"l": "---", "r": "---:"}
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a file whole or not at all; makes its folder."""
+    """Writes a file whole or not at all, and makes its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.part")
     temporary.write_text(text)
@@ -43,13 +43,14 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, result: object) -> None:
-    """Writes a result, a list of plain values on one line."""
+    """Writes a result as JSON, with each list of plain values on one line."""
     write_text(path, json_text(result) + "\n")
 
 
 def json_text(value: Any, indent: str = "") -> str:
-    """JSON with one line for every list of plain values."""
+    """Returns JSON with one line for every list of plain values. NumPy arrays become lists."""
     inner = indent + "  "
+    nested = (dict, list, tuple)
     if isinstance(value, dict) and value:
         # a key that is no string becomes one as json.dumps makes it
         keys = [next(iter(json.loads(json.dumps({key: None})))) for key in value]
@@ -58,24 +59,21 @@ def json_text(value: Any, indent: str = "") -> str:
             for key, item in zip(keys, value.values(), strict=True)
         ]
         brackets = "{}"
-    elif isinstance(value, list | tuple) and any(
-        isinstance(item, dict | list | tuple) for item in value
-    ):
+    elif isinstance(value, list | tuple) and any(isinstance(item, nested) for item in value):
         items, brackets = [json_text(item, inner) for item in value], "[]"
     else:
-        return json.dumps(
-            value, ensure_ascii=False, default=lambda array: array.tolist()
-        )  # of numpy
-    return (
-        f"{brackets[0]}\n" + ",\n".join(inner + item for item in items) + f"\n{indent}{brackets[1]}"
-    )
+        return json.dumps(value, ensure_ascii=False, default=lambda array: array.tolist())
+    lines = ",\n".join(inner + item for item in items)
+    return f"{brackets[0]}\n{lines}\n{indent}{brackets[1]}"
 
 
 def markdown_table(
     header: Sequence[str], rows: Sequence[Sequence[object]], align: str | None = None
 ) -> str:
-    """A table. align holds "l" or "r" for each column; by default the first is aligned to the left,
-    others to the right.
+    """Formats a table in Markdown.
+
+    `align` has "l" or "r" for each column. By default the first column is aligned to the left, and
+    the others to the right.
     """
     rule = [ALIGNMENTS[side] for side in align or default_alignment(header)]
     return "\n".join(
@@ -86,23 +84,29 @@ def markdown_table(
 def cells(
     numbers: Mapping[str, float | None], columns: Mapping[str, tuple[str, int]], missing: str = "-"
 ) -> list[str]:
-    """Numbers of a row, by columns: key -> heading and digits."""
+    """Formats the numbers of a row in the order of columns {key: (heading, digits)}.
+
+    `missing` stands for a number that is missing or None.
+    """
     values = ((numbers.get(key), digits) for key, (_, digits) in columns.items())
     return [missing if value is None else f"{value:,.{digits}f}" for value, digits in values]
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """A number with at least `digits` significant digits, without an exponent."""
-    decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1
+    """Formats a number with at least `digits` significant digits, without an exponent."""
+    decimals = digits - 1
+    if value:
+        decimals -= math.floor(math.log10(abs(value)))
     return f"{value:.{max(0, decimals)}f}"
 
 
 def default_alignment(header: Sequence[str]) -> str:
+    """Returns "l" for the first column, and "r" for the others."""
     return "l" + "r" * (len(header) - 1)
 
 
 def blocks_of(text: str) -> list[str | dict[str, Any]]:
-    """Paragraphs and tables of a section as data. `text_of` is the inverse."""
+    """Returns the paragraphs and tables of a section as data. `text_of` is the inverse."""
     blocks: list[str | dict[str, Any]] = []
     for paragraph in re.split(r"\n\s*\n", text.strip()):
         if paragraph.startswith("|"):
@@ -119,13 +123,14 @@ def blocks_of(text: str) -> list[str | dict[str, Any]]:
 
 
 def text_of(blocks: Sequence[str | dict[str, Any]]) -> str:
+    """Returns the Markdown of paragraphs and tables."""
     return "\n\n".join(
         block if isinstance(block, str) else markdown_table(**block) for block in blocks
     )
 
 
 def pages(repository: Path | None = None) -> list[Path]:
-    """README.md, all pages of the docs, and that of the experiments."""
+    """Returns README.md, all pages of the docs, and README.md of the experiments."""
     repository = repository or REPOSITORY
     found = [
         repository / "README.md",
@@ -136,9 +141,9 @@ def pages(repository: Path | None = None) -> list[Path]:
 
 
 def page_of(name: str) -> Path:
-    """The page that shows a table.
+    """Returns the page that shows a table.
 
-    Raises: ValueError unless one page does, once.
+    Raises: ValueError unless exactly one section of the pages has this name.
     """
     found = [
         page
@@ -157,9 +162,14 @@ def page_of(name: str) -> Path:
 def publish(
     page: Path, name: str, text: str, numbers: object = None, record: dict[str, Any] | None = None
 ) -> None:
-    """Writes docs/results/NAME.json, and the page's section of that name.
+    """Writes docs/results/NAME.json, and the section of the page with that name.
 
-    record: what made it, by default this process (`run_record`).
+    Args:
+        page: page that shows the table
+        name: name of the table
+        text: the section in Markdown
+        numbers: the unrounded numbers
+        record: what made the result; default: this process (`run_record`)
     """
     folder = next(parent for parent in page.parents if (parent / "docs").is_dir()) / "docs"
     path, blocks = folder / "results" / f"{name}.json", blocks_of(text)
@@ -169,8 +179,9 @@ def publish(
 
 
 def rendered(page: str, results: Path, names: Sequence[str] | None = None) -> str:
-    """A page's text with its sections (of these names, or all) as the JSON files of a folder have
-    them.
+    """Returns the text of a page with its sections rendered from the JSON files in `results`.
+
+    Only sections with these names are rendered, or all if `names` is None.
 
     Raises: FileNotFoundError for a section without a JSON file.
     """
@@ -178,28 +189,31 @@ def rendered(page: str, results: Path, names: Sequence[str] | None = None) -> st
     def section(match: re.Match[str]) -> str:
         if names is not None and match["name"] not in names:
             return match[0]
-        return (
-            match[1]
-            + text_of(json.loads((results / f"{match['name']}.json").read_text())["blocks"])
-            + "\n"
-        )
+        result = json.loads((results / f"{match['name']}.json").read_text())
+        return f"{match[1]}{text_of(result['blocks'])}\n"
 
     return SECTION.sub(section, page)
 
 
 def run_record(name: str | None = None, options: Sequence[str] | None = None) -> dict[str, Any]:
-    """What made a result: an experiment (by default this process's script) and its options
-    (absolute paths without their folders, also after NAME=), date, machine, versions.
+    """Returns what made a result: the experiment and its options, date, machine and versions.
+
+    Absolute paths in the options lose their folders, also after NAME=.
+
+    Args:
+        name: the experiment; default: the script of this process
+        options: its options; default: the arguments of this process
     """
     script = Path(sys.argv[0]).resolve()
-    made_by = (
-        script.relative_to(REPOSITORY).as_posix()
-        if script.is_relative_to(REPOSITORY)
-        else script.name
-    )
+    if name:
+        made_by = f"python -m experiments {name}"
+    elif script.is_relative_to(REPOSITORY):
+        made_by = script.relative_to(REPOSITORY).as_posix()
+    else:
+        made_by = script.name
     given = sys.argv[1:] if options is None else options
     return {
-        "script": f"python -m experiments {name}" if name else made_by,
+        "script": made_by,
         "arguments": shlex.join(re.sub(r"(^|=)/.*/", r"\1", each) for each in given),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "machine": {"cpu": cpu_model(), "cores": cores()},
@@ -210,19 +224,24 @@ def run_record(name: str | None = None, options: Sequence[str] | None = None) ->
 
 
 def cores() -> int | None:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    """Returns the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count()
 
 
 def cpu_model() -> str:
+    """Returns the name of the CPU, or of its kind where the name is not known."""
     information = Path("/proc/cpuinfo")
-    names = (
-        re.findall(r"model name\s*: (.*)", information.read_text()) if information.exists() else []
-    )
-    return names[0] if names else platform.processor() or platform.machine()
+    if information.exists():
+        names = re.findall(r"model name\s*: (.*)", information.read_text())
+        if names:
+            return names[0]
+    return platform.processor() or platform.machine()
 
 
 def version(package: str) -> str | None:
+    """Returns the version of an installed package, or None if it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

@@ -1,5 +1,5 @@
-"""How far inputs and number types may go: extremes of each quantity, ranges of use, errors of every
-stage.
+"""Measures how far inputs and number types may go: extremes of each quantity, ranges of use, and
+errors of every stage.
 """
 
 import dataclasses
@@ -37,27 +37,30 @@ from humangs_jax.training.forward import draw_targets, white_backgrounds
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """photos, held_out: changes of the captures that the avatar is made of and compared with.
-    photographed: the person is photographed anew, by the changed cameras. network: (variables,
-    configuration) -> others.
-    """
+    """One change of the inputs. Without arguments nothing is changed."""
 
     photos: changes.Change = lambda capture: capture
+    """Change of the capture that the avatar is made of."""
     held_out: changes.Change = lambda capture: capture
+    """Change of the capture that the avatar is compared with."""
     photographed: bool = False
+    """Whether new photos of the person are made by the changed cameras."""
     network: Callable[[Any, Any], tuple[Any, Any]] = lambda variables, config: (variables, config)
+    """Change of the network: (variables, configuration) to others."""
 
 
 def computed(dtype: str) -> Callable[[Any, Any], tuple[Any, Any]]:
+    """Returns the change of a network that computes in a dtype."""
     return lambda variables, config: (variables, config.with_runtime(dtype=dtype))
 
 
 def in_type(dtype: str) -> Callable[[Any, Any], tuple[Any, Any]]:
+    """Returns the change of a network that has its weights in a dtype."""
     return lambda variables, config: (jax.tree.map(lambda x: x.astype(dtype), variables), config)
 
 
 def with_nan(variables: Any, config: Any) -> tuple[Any, Any]:
-    """NaN in one entry of the first array."""
+    """Sets one number of the first array of the weights to NaN."""
     leaves, structure = jax.tree.flatten(variables)
     leaves[0] = np.array(leaves[0])
     leaves[0].reshape(-1)[0] = np.nan
@@ -121,14 +124,14 @@ CASES: dict[str, Case] = {
 
 @entry
 def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
-    """What `reconstruct` makes of inputs at the extremes: an error, a warning or an avatar, and how
-    good that is.
+    """Measures what `reconstruct` makes of inputs at the extremes: an error, a warning or an
+    avatar, and how good the avatar is.
 
-    One person of the validation seeds, four photos of 256 pixels; each case changes one thing.
-    "warned": the quick check, which `humangs reconstruct` runs first, says something. "reach":
-    largest distance of a Gaussian from its vertex, in body heights; all numbers have to be finite.
-    PSNR: held-out views of the same pose, by the true cameras and pose. "error": a line names the
-    array.
+    The subject is a person of the validation seeds with four photos of 256 pixels. Each case
+    changes one thing. "warned": the quick check, which `humangs reconstruct` runs first, warns.
+    "reach" is the largest distance of a Gaussian from its vertex, in body heights. All numbers have
+    to be finite. PSNR is that of held-out views of the same pose, with the true cameras and pose.
+    "error": the last column names the array.
 
     Options:
     cases: words; only cases whose names have one of them
@@ -137,9 +140,11 @@ def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
         raise ValueError("--publish writes the whole table: expected no --cases")
     (subject,), network = changes.subjects(1), load_weights()
 
+    # each case changes the photos, the network or the held-out views
     def measure(case):
         capture = case.photos(subject.inputs(changes.VIEWS))
-        capture = changes.photographed(subject.seed, capture) if case.photographed else capture
+        if case.photographed:
+            capture = changes.photographed(subject.seed, capture)
         return changes.outcome(case.network(*network), capture, case.held_out(subject.held_out))
 
     chosen = [name for name in CASES if not cases or any(word in name for word in cases)]
@@ -150,9 +155,10 @@ def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
             rows.append([name, "error", "", "", "", row["error"]])
             continue
         shown = [f"{row['reach']:.2f}", f"{row['psnr']:.1f}", f"{row['psnr_fg']:.1f}"]
-        rows.append(
-            [name, "warned" if row["warnings"] else "avatar", *shown, (row["warnings"] or [""])[0]]
-        )
+        result, first_line = "avatar", ""
+        if row["warnings"]:
+            result, first_line = "warned", row["warnings"][0]
+        rows.append([name, result, *shown, first_line])
     header = ["case", "result", "reach", "PSNR", "foreground PSNR", "first line"]
     run.show(markdown_table(header, rows, "llrrrl"), numbers)
 
@@ -161,9 +167,9 @@ def extremes(run: Run, cases: tuple[str, ...] = ()) -> None:
 # --------------------------------------------------------------------------------------------------
 
 BOUND = 1.0
-"""Decibels of PSNR."""
+"""Loss of PSNR in decibels that ends a range of use."""
 RENDERED = "distance of the cameras"
-"""The quantity with new photos from the cameras as they are changed."""
+"""The quantity for which new photos are made by the changed cameras."""
 LIMITS: dict[str, tuple[str, float | None, dict[float, changes.Change]]] = {
     "photos": (
         "",
@@ -224,26 +230,30 @@ LIMITS: dict[str, tuple[str, float | None, dict[float, changes.Change]]] = {
 }
 """{quantity: (unit, the value at which nothing is changed, {value: change})}.
 
-None: it is somewhere among the values.
+The value at which nothing is changed is None where it lies among the values and is not known.
 """
 
 
 @entry
 def limits(run: Run, people: int = 2) -> None:
-    """How far a quantity may be off, alone, until the mean PSNR of some people has fallen by 1 dB.
+    """Measures how far a single quantity may be off until the mean PSNR of people has fallen by
+    1 dB.
 
-    People of the validation seeds, four photos of 256 pixels; linear between the values tried.
+    The people are of the validation seeds, with four photos of 256 pixels. Losses are interpolated
+    linearly between the values that are tried.
 
     Options:
-    people: how many
+    people: number of people
     """
     network, chosen = load_weights(), changes.subjects(people)
 
+    # mean PSNR with one quantity changed
     def score(name, change):
         scores = []
         for subject in chosen:
             capture = change(subject.inputs(changes.VIEWS))
-            capture = changes.photographed(subject.seed, capture) if name == RENDERED else capture
+            if name == RENDERED:
+                capture = changes.photographed(subject.seed, capture)
             scores.append(changes.outcome(network, capture, subject.held_out)["psnr"])
         return float(np.mean(scores))
 
@@ -256,18 +266,20 @@ def limits(run: Run, people: int = 2) -> None:
         f"{name} {value:g}": functools.partial(score, name, change)
         for (name, value), change in tried.items()
     }
-    scores = run.rows(
-        {"plain": lambda: score("", lambda capture: capture)} | cases, {"people": people}
-    )
+    plain = functools.partial(score, "", lambda capture: capture)
+    scores = run.rows({"plain": plain} | cases, {"people": people})
+
+    # what each value costs, and the range in which that is less than 1 dB
     losses: dict[str, Any] = {}
     for name, value in tried:
         losses.setdefault(name, {})[value] = scores["plain"] - scores[f"{name} {value:g}"]
     ranges, rows = {name: interval(name, losses[name]) for name in LIMITS}, []
+
+    def shown(end):
+        return "-" if end is None else f"{end:.3g}"
+
     for name, lost in losses.items():
-        ends = [
-            "-" if ranges[name][end] is None else f"{ranges[name][end]:.3g}"
-            for end in ("low", "high")
-        ]
+        ends = [shown(ranges[name][end]) for end in ("low", "high")]
         values = ", ".join(f"{value:g}: {loss:.1f}" for value, loss in sorted(lost.items()))
         rows.append([f"{name}, {ranges[name]['unit']}".rstrip(", "), *ends, values])
     header = ["quantity", "from", "to", "dB lost at each value tried"]
@@ -275,11 +287,14 @@ def limits(run: Run, people: int = 2) -> None:
 
 
 def interval(name: str, losses: dict[float, float]) -> dict[str, Any]:
-    """The range around the best value in which the loss stays below `BOUND`; None for an end that
-    was not reached.
+    """Returns the range around the best value in which the loss stays below `BOUND`.
+
+    An end that was not reached is None.
     """
     unit, zero, _ = LIMITS[name]
-    points = sorted((losses | ({} if zero is None else {zero: 0.0})).items())
+    if zero is not None:
+        losses = losses | {zero: 0.0}
+    points = sorted(losses.items())
     middle = min(range(len(points)), key=lambda i: points[i][1])
 
     def end(step):
@@ -292,7 +307,9 @@ def interval(name: str, losses: dict[float, float]) -> dict[str, Any]:
         return None
 
     low, high = end(-1), end(1)
-    low = 0.0 if low is None and points[0][0] == 0 else low  # errors that have no sign
+    # errors that have no sign begin at 0
+    if low is None and points[0][0] == 0:
+        low = 0.0
     if name == "photos" and low is not None:
         low = math.ceil(low)
     return {"unit": unit, "low": low, "high": high}
@@ -307,40 +324,42 @@ COLUMNS = {
     "cotangents": "gradient sent back",
     "gradients": "gradient of parameters",
 }
+"""{what a stage is compared by: its heading}."""
 TARGETS = 2
+"""Number of held-out views that are drawn."""
 
 
 @entry
 def stability(
     run: Run, types: tuple[Types, ...] = ("float32", "tf32", "bfloat16", "float16"), seeds: int = 3
 ) -> None:
-    """Error of every stage, from photos to images and back to gradients, by number type, against
-    float64 from the same numbers.
+    """Measures the error of every stage, from photos to images and back to gradients, by number
+    type, against float64 from the same numbers.
 
-    The shipped weights on people of the validation seeds. An error is a relative L2 norm, the
-    largest over the arrays of a stage and over the people: of what the stage gives, of the
-    gradients that it sends back, and of those of its parameters. float16 runs forward only. tf32:
-    float32 with products as the device's matrix units compute them; left out where it has none.
+    The shipped weights run on people of the validation seeds. An error is a relative L2 norm, the
+    largest over the arrays of a stage and over the people. Compared are what the stage returns, the
+    gradients that it sends back, and the gradients of its parameters. float16 runs forward only.
+    tf32 is float32 with products as the device's matrix units compute them. It is left out where
+    the device has none.
 
     Tables: stability_shipped
 
     Options:
     types: number types to compare
-    seeds: people
+    seeds: number of people
     """
-    worst = _worst(
-        shipped_cases(seeds),
-        [name for name in types if name != "tf32" or jax.default_backend() == "gpu"],
-    )
-    columns = [
-        (n, c)
-        for n in next(iter(worst.values()))
-        for c in COLUMNS
-        if n != "float16" or c == "values"
-    ]
+    # only GPUs have tf32
+    if jax.default_backend() != "gpu":
+        types = tuple(name for name in types if name != "tf32")
+    worst = _worst(shipped_cases(seeds), types)
+    columns = []
+    for name in next(iter(worst.values())):
+        columns += [(name, each) for each in COLUMNS if name != "float16" or each == "values"]
 
     def show(stage, name, column):
-        return f"{stage[name][column]['error']:.0e}" if column in stage.get(name, {}) else ""
+        if column not in stage.get(name, {}):
+            return ""
+        return f"{stage[name][column]['error']:.0e}"
 
     rows = [[title, *(show(stage, *pair) for pair in columns)] for title, stage in worst.items()]
     header = ["stage", *(f"{name}: {COLUMNS[column]}" for name, column in columns)]
@@ -348,7 +367,9 @@ def stability(
 
 
 def _worst(cases, types):
-    """{stage: {type: {column: {"error", "of": the leaf that has it}}}}."""
+    """Returns the largest errors, {stage: {type: {column: {"error", "of": the leaf that has
+    it}}}}.
+    """
     worst: dict[str, Any] = {}
     for case in bar(cases, desc="stability", unit="case"):
         reference = observe(case, "float64")
@@ -358,9 +379,8 @@ def _worst(cases, types):
                     for leaf, array in arrays.items():
                         truth = np.asarray(reference[stage][column][leaf], np.float64)
                         norm = np.linalg.norm(truth)
-                        error = float(
-                            np.linalg.norm(np.asarray(array, np.float64) - truth) / (norm or 1.0)
-                        )
+                        difference = np.linalg.norm(np.asarray(array, np.float64) - truth)
+                        error = float(difference / (norm or 1.0))
                         cell = worst.setdefault(stage, {}).setdefault(name, {})
                         known = cell.get(column, {}).get("error", -1.0)
                         if np.isnan(error) or known < error:  # NaN is the worst
@@ -369,19 +389,16 @@ def _worst(cases, types):
 
 
 def shipped_cases(count):
-    """(variables, config, body, example) of people of the validation seeds, with one token
-    capacity: a program serves all.
+    """Returns (variables, config, body, example) of people of the validation seeds.
+
+    All have one token capacity, so that one program serves all of them.
     """
     whole, (variables, config) = load_body(), load_weights()
     body, size, examples = gaussian_body(whole, config), config.conventions.image_size, []
     for seed in seeds_of("validation", 0, count):
         person = make_evaluation_subject(seed, whole, [changes.VIEWS], 256, HeldOut(TARGETS, 0, 0))
-        examples.append(
-            Example(
-                to_network_views(person.inputs(changes.VIEWS), size),
-                to_network_views(person.held_out, size),
-            )
-        )
+        seen = to_network_views(person.inputs(changes.VIEWS), size)
+        examples.append(Example(seen, to_network_views(person.held_out, size)))
     inputs = [prepare_inputs(body, example.inputs, config) for example in examples]
     fitted = [fit_buffers(each.foreground, each.view_count, config) for each in inputs]
     config = max(fitted, key=lambda fit: fit.runtime.token_capacity)
@@ -389,8 +406,9 @@ def shipped_cases(count):
 
 
 def observe(case, name):
-    """{stage: {column: {leaf: array}}} of one training step's forward and backward pass in a number
-    type.
+    """Runs the forward and the backward pass of a training step in a number type.
+
+    Returns {stage: {column: {leaf: array}}}. float16 has only the forward pass.
     """
     variables, config, body, example = case
     run = TrainConfig(
@@ -407,24 +425,17 @@ def observe(case, name):
     def cast(tree):
         return jax.tree.map(lambda x: np.asarray(x, number) if real(x) else np.asarray(x), tree)
 
-    with (
-        jax.enable_x64(wide),
-        jax.default_matmul_precision("tensorfloat32" if name == "tf32" else "highest"),
-    ):
+    # products are exact unless the type is about them
+    precision = "tensorfloat32" if name == "tf32" else "highest"
+    with jax.enable_x64(wide), jax.default_matmul_precision(precision):
         learned = cast(variables["params"]), cast(variables.get("batch_stats", {}))
         if name == "float16":
             model = config.with_runtime(dtype="float16", scan=False)
-            stages = {
-                stage: {"values": values}
-                for stage, values in observer(model, run)(
-                    *learned, cast(body), cast(example)
-                ).items()
-            }
+            values = observer(model, run)(*learned, cast(body), cast(example))
+            stages = {stage: {"values": each} for stage, each in values.items()}
         else:
-            run = dataclasses.replace(
-                run,
-                model=config.with_runtime(dtype="bfloat16" if name == "bfloat16" else "float32"),
-            )
+            dtype = "bfloat16" if name == "bfloat16" else "float32"
+            run = dataclasses.replace(run, model=config.with_runtime(dtype=dtype))
             _, found = observe_subject(
                 *learned, cast(body), cast(example), jax.random.key(0), run, NO_NETWORKS
             )
@@ -437,17 +448,16 @@ def observe(case, name):
 
 @functools.cache
 def observer(model, run):
-    """The stages of a forward pass, a compiled function of parameters, batch statistics, body and
-    example.
+    """Returns a compiled function of parameters, batch statistics, body and example, which returns
+    the stages of a forward pass.
     """
 
     def forward(params, batch_stats, body, example):
         recorder = Recorder()
         variables = {"params": params, "batch_stats": batch_stats}
         with nn.intercept_methods(recorder):
-            outputs, _ = apply_humangs(
-                variables, prepare_inputs(body, example.inputs, model), model, True
-            )
+            inputs = prepare_inputs(body, example.inputs, model)
+            outputs, _ = apply_humangs(variables, inputs, model, True)
             backgrounds = white_backgrounds(example.targets)
             draw_targets(
                 variables, outputs, body, example.inputs, example.targets, backgrounds, run
