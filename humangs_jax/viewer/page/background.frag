@@ -1,5 +1,6 @@
 #version 300 es
-// The splats over a plain colour or over nothing, and if wanted a floor with soft shadows below the feet.
+// Lays the splats over a plain colour, or over nothing, and optionally over a floor with soft
+// shadows below the feet.
 precision highp float;
 precision highp sampler2D;
 
@@ -18,13 +19,13 @@ out vec4 result;
 
 const float CELL = 0.5, SHADOW = 0.17;
 
-// A thin line at every multiple of CELL; width: what a pixel covers of the floor, metres.
+// Returns thin lines at the multiples of CELL, 0 to 1. width: size of a pixel on the floor, metres.
 float lines(vec2 p, vec2 width) {
   vec2 away = abs(fract(p / CELL - 0.5) - 0.5) * CELL / max(width, vec2(1e-5));
   return 1.0 - min(min(away.x, away.y), 1.0);
 }
 
-// Lines and shadows of the floor, premultiplied, to be laid over the plain colour.
+// Returns lines and shadows of the floor, premultiplied, for laying over the plain colour.
 vec4 floor_layer(vec3 plain, vec3 ray) {
   float t = (floor_height - eye.y) / ray.y;
   if (ray.y > -1e-3 || t < 0.0) return vec4(0.0);    // seen from below, or above the horizon

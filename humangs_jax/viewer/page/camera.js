@@ -1,4 +1,5 @@
-// The camera that people steer: on a sphere around a target. OpenCV axes (x right, y down, z forward), y up in the world.
+// The camera that people steer, on a sphere around a target. Axes are OpenCV's (x right, y down, z
+// forward), and y is up in the world.
 
 const FIELD_OF_VIEW = Math.PI / 6;  // vertical; narrow enough that a person keeps natural proportions
 const HIGHEST = 1.55;               // radians: never over the head
@@ -7,8 +8,9 @@ function makeOrbit(target, distance) {
   return { target: [...target], distance, azimuth: 0.35, elevation: 0.1 };
 }
 
-// { K: [fx, fy, cx, cy], rotation: rows of cam_from_world, translation, eye, width, height }. right, bottom: pixels that panels
-// cover; the target stands in the middle of the rest.
+// Returns the camera of an orbit: { K: [fx, fy, cx, cy], rotation: rows of cam_from_world,
+// translation, eye, width, height }. right, bottom: pixels that panels cover. The target is in the
+// middle of the other pixels.
 function orbitCamera(orbit, width, height, follow, right = 0, bottom = 0) {
   const { distance, azimuth, elevation } = orbit, target = add(orbit.target, follow);
   const flat = Math.cos(elevation);
@@ -21,7 +23,7 @@ function orbitCamera(orbit, width, height, follow, right = 0, bottom = 0) {
   return { K, rotation, translation: scaled(matrixApply(rotation, eye), -1), eye, width, height };
 }
 
-// From K (3 x 3) and cam_from_world (4 x 4), as Python has them.
+// Returns the camera for K (3 x 3) and cam_from_world (4 x 4), as Python has them.
 function exactCamera({ K, cam_from_world: m, width, height }) {
   const rotation = [...m[0].slice(0, 3), ...m[1].slice(0, 3), ...m[2].slice(0, 3)];
   const translation = [m[0][3], m[1][3], m[2][3]];
@@ -30,7 +32,8 @@ function exactCamera({ K, cam_from_world: m, width, height }) {
   return { K: [K[0][0], K[1][1], K[0][2], K[1][2]], rotation, translation, eye, width, height };
 }
 
-// Mouse: left turns, right (or shift) moves, the wheel zooms. Touch: one finger turns, two move and zoom.
+// Lets people steer the camera. Mouse: the left button turns, the right one (or shift) moves, the
+// wheel zooms. Touch: one finger turns, two fingers move and zoom.
 function steerOrbit(orbit, canvas, changed, reset) {
   const pointers = new Map();
   const turn = (dx, dy) => {

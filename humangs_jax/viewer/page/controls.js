@@ -1,14 +1,16 @@
-// Everything people click, drag or press. `app` (main.js) holds the state; controls change it and say so.
+// Everything that people click, drag or press. `app` (main.js) holds the state. Controls change the
+// state and tell `app`.
 
 const BACKGROUNDS = ["#f6f5f2", "#ffffff", "#c9d3dc", "#4c5158", "#15171a"];
-// What turns about x (to the left), y (up) and z (to the front) of the T-pose do, by where the bone points.
+// Names of the turns about x (to the left), y (up) and z (to the front) of the T-pose, by the
+// direction of the bone.
 const UPRIGHT_TURNS = ["bend", "turn", "lean"];
 const ARM_TURNS = ["twist", "front, back", "up, down"];
 const LEG_TURNS = ["front, back", "twist", "sideways"];
 const FACE_TURNS = ["up, down", "left, right", "roll"];
 const FINGER_TURNS = ["twist", "spread", "curl"];
 const PLAIN_TURNS = ["turn", "turn", "turn"];
-// Title, joints, how far they turn in degrees, and what the turns do.
+// Groups of sliders: title, joints, largest turn in degrees, and names of the turns.
 const GROUPS = [
   ["Torso and head", /^(pelvis|spine\d|neck|head)$/, 50, UPRIGHT_TURNS],
   ["Left arm", /^left_(collar|shoulder|elbow|wrist)$/, 120, ARM_TURNS],
@@ -80,8 +82,8 @@ function makeControls(app) {
   setBackground(BACKGROUNDS[0]);
 
   // ---- sliders ----
-  // A row: what the slider does, the slider, and its value. label: the whole of it in words.
-  // home: where a double click goes.
+  // Makes a row: what the slider does, the slider, and its value. label: a full description. home:
+  // the value after a double click.
   const sliderRow = (caption, label, { low, high, value, home, step, shown }, onchange) => {
     const made = (tag, properties) => Object.assign(document.createElement(tag), properties);
     const input = made("input", { type: "range", min: low, max: high, step, value, title: label });
@@ -190,7 +192,8 @@ function makeControls(app) {
   }
 
   // ---- files ----
-  // rate: frames per second that the user gave; null: those of the file. clip: the index of its motion.
+  // Opens a motion. rate: frames per second that the user gave; null: those of the file. clip:
+  // index of the motion in the file.
   async function openMotion(file, rate = null, clip = 0) {
     if (!file) return;
     element("ask-rate").hidden = true;
@@ -271,7 +274,7 @@ function makeControls(app) {
 
   return {
     setBackground, setFloor,
-    // Shows the state that changes without a click.
+    // Shows the parts of the state that can change without a click.
     update() {
       const { motion } = scene, moving = app.mode === "motion" && motion;
       document.body.classList.toggle("still", !moving);

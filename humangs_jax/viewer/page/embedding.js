@@ -1,4 +1,5 @@
-// What an address may ask of the page, for pages that embed it: ?autoplay&panel=0&background=transparent
+// Options that an address can have, for pages that embed this one, such as
+// ?autoplay&panel=0&background=transparent
 
 const ON_OR_OFF = { pattern: /^[01]?$/, expected: "0 or 1" };
 const OPTIONS = new Map(Object.entries({
@@ -10,7 +11,8 @@ const OPTIONS = new Map(Object.entries({
   time: { pattern: /^\d+(\.\d*)?$/, expected: "seconds of the motion, such as 1.5" },
 }));
 
-// { options, problems }: values by name, and lines about what is wrong. Other names are for other programs.
+// Returns { options, problems }: values by name, and lines about wrong values. Other names belong
+// to other programs and are ignored.
 function readOptions(search) {
   const options = new Map(), problems = [];
   for (const [name, value] of new URLSearchParams(search)) {

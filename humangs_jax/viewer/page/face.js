@@ -1,5 +1,6 @@
-// Faces: an expression moves the means of the canonical Gaussians, before skinning, as humangs_jax/avatar/face.py does. What
-// stays hidden is put far away, where no camera looks; there is no stretch of the skin here.
+// Faces: an expression moves the means of the canonical Gaussians before skinning, as
+// humangs_jax/avatar/face.py does. Gaussians that stay hidden are moved far away, where no camera
+// looks. The skin is not stretched here.
 
 const STAYS = 65535;            // the row of Gaussians that no expression moves
 const IN_MOUTH = 255;           // seen between the lips
@@ -7,10 +8,11 @@ const AWAY = -1e4;              // metres
 const SMALLEST_OPENING = 0.001; // metres; as in Python, with the next two
 const BEFORE_LIPS = 0.004;
 const SHOWN = 0.4;              // of a lid or of what the mouth shows, from which on it is there
-// Regions of the sliders, by how names begin.
+// Regions of the sliders, by the beginning of the expression's name.
 const REGIONS = [["Eyes", /^eye/], ["Brows", /^brow/], ["Cheeks and nose", /^(cheek|nose)/], ["Jaw and tongue", /^(jaw|tongue)/],
   ["Mouth", /^mouth/], ["Other", /./]];
-// Idle: seconds between blinks, of a blink and between glances, and how far eyes look.
+// Idle movement: seconds between blinks, seconds of a blink, seconds between glances, how far eyes
+// look, and seconds of a glance.
 const BLINK_EVERY = [2, 6], BLINK_SECONDS = 0.18, GLANCE_EVERY = [0.8, 3.5], GLANCE = 0.35, GLANCE_SECONDS = 0.08;
 
 function motionFace(motion, frame) {
@@ -20,7 +22,8 @@ function motionFace(motion, frame) {
   return a.map((x, i) => x + t * (b[i] - x));
 }
 
-// Writes scene.means for coefficients, null for a face at rest. Returns whether anything has changed.
+// Writes scene.means for coefficients of expressions; null: a face at rest. Returns whether
+// anything has changed.
 function applyFace(scene, coefficients) {
   const { face } = scene.header, { arrays } = scene;
   if (!face) return false;
@@ -68,7 +71,7 @@ function eyeTurn(scene, joint, side, active, coefficients) {
   return turn.some((v) => v) ? { at: scene.rest[joint], turn: matrixFromQuat(quatFromAxisAngle(...turn)) } : null;
 }
 
-// Center, half width and half height of the opening between the lips.
+// Returns the center, half the width and half the height of the opening between the lips.
 function openingOf(scene, active, coefficients) {
   const lips = Array.from(scene.arrays.face_lips);
   for (const e of active)
@@ -84,7 +87,8 @@ function betweenLips(place, { center, width, height }) {
   return Math.max((1 - radius) / 0.3, (place[2] - center[2]) / BEFORE_LIPS);
 }
 
-// Blinks and glances of a person who has nothing to do. `change(coefficients)` is called when they change, null: none.
+// Makes the blinks and glances of a person who has nothing to do. Calls `change(coefficients)` when
+// they change; null: none.
 function makeIdle(face, change) {
   const between = ([low, high]) => low + Math.random() * (high - low);
   const now = () => performance.now() / 1000;
@@ -106,7 +110,7 @@ function makeIdle(face, change) {
     for (const side of ["Left", "Right"]) { set(`eyeLookUp${side}`, y); set(`eyeLookDown${side}`, -y); }
     return out;
   }
-  // Whether the eyes move now, or have just come to rest.
+  // Returns whether the eyes move now, or have just come to rest.
   function busy() {
     const time = now();
     return time > glanceAt || time < looked + 2 * GLANCE_SECONDS || (time > blinkAt && time < blinkAt + 2 * BLINK_SECONDS);

@@ -1,12 +1,12 @@
-// An animation of a GLB file, on the joints of its skin: as read_animation in
-// humangs_jax/motion/clips.py.
-// The rest pose is the one in which the skin was bound to the mesh, without a skin that of the nodes.
-// A place in space is { m: 3 x 3, t: [x, y, z] }.
+// Reads an animation of a GLB file for the joints of its skin, as read_animation in
+// humangs_jax/motion/clips.py does. The rest pose is the one in which the skin was bound to the
+// mesh, or that of the nodes if there is no skin. A place in space is { m: 3 x 3, t: [x, y, z] }.
 
 const GLB_START = 0x46546c67, GLB_JSON = 0x4e4f534a, GLB_BINARY = 0x004e4942;
 const GLB_PATHS = new Map([["translation", 3], ["rotation", 4], ["scale", 3]]);
 const GLB_COLUMNS = new Map([["SCALAR", 1], ["VEC2", 2], ["VEC3", 3], ["VEC4", 4], ["MAT4", 16]]);
-// By component type: how a number is read, its bytes, and what stands for 1 in normalized integers.
+// For each component type: how a number is read, its number of bytes, and the integer that means 1
+// if integers are normalized.
 const GLB_NUMBERS = new Map([
   [5120, ["getInt8", 1, 127]], [5121, ["getUint8", 1, 255]], [5122, ["getInt16", 2, 32767]],
   [5123, ["getUint16", 2, 65535]], [5125, ["getUint32", 4, 4294967295]], [5126, ["getFloat32", 4, 1]],
@@ -14,7 +14,8 @@ const GLB_NUMBERS = new Map([
 const SHOWN_CLIPS = 12;
 const STEP_ROUNDING = 0.01;  // of a frame: keys are rounded to float32
 
-// A clip as in skeletons.js, with the names of all clips in the file. index: of the one that is wanted.
+// Returns a clip as in skeletons.js, with the names of all clips in the file. index: of the wanted
+// clip.
 function parseGlb(bytes, index = 0) {
   const { content, binary } = glbChunks(bytes);
   try {
@@ -76,7 +77,8 @@ function glbClip(content, binary, index) {
 
 // ---- nodes ----
 
-// Names of bones by node, in files that say them (VRM): their nodes may be called anything.
+// Returns the names of bones by node, if the file has them (VRM). Its nodes may then have any
+// names.
 function humanoidNames(content) {
   for (const extension of Object.values(content.extensions ?? {})) {
     const bones = extension?.humanoid?.humanBones ?? {};
@@ -99,7 +101,8 @@ function glbParents(nodes) {
   return parents;
 }
 
-// The nodes that are joints, and where they were when they were bound, as far as the file tells.
+// Returns the nodes that are joints, and their places when the skin was bound, as far as the file
+// has them.
 function glbJoints(content, binary, nodes) {
   const skins = (content.skins ?? []).filter((skin) => skin.joints?.length);
   if (!skins.length) return { joints: nodes.map((_, i) => i), binding: new Map() };
@@ -114,7 +117,7 @@ function glbJoints(content, binary, nodes) {
   return { joints, binding: new Map(bound) };
 }
 
-// Joints and the nodes above them, parents first.
+// Returns the joints and all nodes above them, parents first.
 function withAncestors(joints, parents) {
   const order = new Set();
   for (const joint of joints) {
@@ -148,7 +151,7 @@ function rotationIn(m) {
   return matrixFromQuat(quatFromMatrix(transposed(columns.flatMap(normalized))));
 }
 
-// Of each node in `order` where it is at a time, as a Map.
+// Returns the place of each node in `order` in a frame, as a Map.
 function placesOfNodes(nodes, parents, order, tracks, times, frame) {
   const places = new Map();
   for (const i of order) {
@@ -182,7 +185,7 @@ function checkedNumbers(values, width, what) {
 
 // ---- numbers and tracks ----
 
-// Rows of numbers; integers that stand for numbers up to 1 are converted.
+// Returns rows of numbers. Normalized integers are converted to numbers up to 1.
 function readAccessor(content, binary, index, what) {
   const accessor = content.accessors[index];
   if (accessor.sparse || accessor.bufferView === undefined)
@@ -209,7 +212,7 @@ function readAccessor(content, binary, index, what) {
   return rows;
 }
 
-// By node, then by path: { times, values, stepped }.
+// Returns the tracks by node, then by path: { times, values, stepped }.
 function glbTracks(content, binary, animation, wanted) {
   const tracks = new Map();
   for (const { target, sampler: index } of animation.channels) {
@@ -233,7 +236,7 @@ function glbTracks(content, binary, animation, wanted) {
   return tracks;
 }
 
-// Times of the frames in seconds, as close as those of the densest track, and their rate.
+// Returns the times of the frames, seconds, as dense as those of the densest track, and their rate.
 function glbTimes(tracks) {
   const first = least(tracks.map(({ times }) => times[0]));
   const last = largest(tracks.map(({ times }) => times.at(-1)));
@@ -257,7 +260,7 @@ function sampledTrack({ times: keys, values, stepped }, path, times, frame) {
   return a.map((v, i) => v + share * (b[i] - v));
 }
 
-// The last key that is not after a time, the first if all are.
+// Returns the index of the last key that is not after a time, or of the first key if all are.
 function lastKey(keys, time) {
   let low = 0, high = keys.length;
   while (low < high) {

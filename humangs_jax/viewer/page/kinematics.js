@@ -1,6 +1,6 @@
-// Rotations, the joint tree and poses. The formulas are those of humangs_jax/body/model.py:
+// Rotations, the tree of joints, and poses. The formulas are those of humangs_jax/body/model.py:
 //   W_j = W_p R_j,   t_j = t_p + W_p (J_j - J_p),   G_j = [W_j | t_j - W_j J_j + translation].
-// Quaternions are wxyz, matrices row-major arrays of nine numbers.
+// Quaternions are wxyz, matrices are row-major arrays of nine numbers.
 
 function quatFromAxisAngle(x, y, z) {
   const angle = Math.hypot(x, y, z);
@@ -24,7 +24,7 @@ function quatNormalize(q) {
   return n > 0 ? q.map((v) => v / n) : [1, 0, 0, 0];
 }
 
-// The shorter way round, at constant speed.
+// Interpolates rotations the shorter way round, at constant speed.
 function quatSlerp(a, b, t) {
   let dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
   const sign = dot < 0 ? -1 : 1;
@@ -68,7 +68,7 @@ const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const normalized = (a) => scaled(a, 1 / Math.max(Math.hypot(...a), 1e-12));
 
-// Joints so that parents come first.
+// Returns the joints in an order in which parents come first.
 function jointOrder(parents) {
   const order = [], done = new Set([-1]);
   while (order.length < parents.length) {
@@ -79,7 +79,8 @@ function jointOrder(parents) {
   return order;
 }
 
-// rest: joints [x, y, z]; quats: one per joint, relative to its parent. Rows of G: Float32Array (12 j), and joints in space.
+// Poses the joints. rest: joints [x, y, z]; quats: one per joint, relative to its parent. Returns
+// the rows of G, Float32Array (12 j), and the joints in space.
 function poseJoints(rest, parents, order, quats, translation) {
   const world = [], position = [], rows = new Float32Array(12 * parents.length);
   for (const j of order) {
@@ -97,7 +98,7 @@ function poseJoints(rest, parents, order, quats, translation) {
 
 const A_POSE_DEGREES = 48;
 
-// Poses are { quats, translation }.
+// Returns the pose without rotations. Poses are { quats, translation }.
 function restPose(count) {
   return { quats: Array.from({ length: count }, () => [1, 0, 0, 0]), translation: [0, 0, 0] };
 }
@@ -113,7 +114,8 @@ function aPose(names) {
   return pose;
 }
 
-// motion: { quats (frames of joints), translations, fps }. A time between two frames is interpolated.
+// Returns the pose at a frame, interpolated between two frames. motion: { quats (frames of joints),
+// translations, fps }.
 function motionPose(motion, frame) {
   const last = motion.quats.length - 1;
   const first = Math.max(0, Math.min(last, Math.floor(frame))), t = Math.min(Math.max(frame - first, 0), 1);
@@ -125,7 +127,8 @@ function motionPose(motion, frame) {
   };
 }
 
-// Moved by a constant so that the person starts at x = z = 0 and, at the lowest, stands on y = 0 (as data/motion.grounded).
+// Moves a motion by a constant so that the person starts at x = z = 0 and, where lowest, stands on
+// y = 0 (as body.motion.grounded).
 function groundedMotion(motion, rest, parents, order, soleBelowJoint) {
   let lowest = Infinity, start = null;
   motion.quats.forEach((quats, i) => {

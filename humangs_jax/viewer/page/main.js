@@ -1,4 +1,5 @@
-// State, the loop that draws when something has changed, and `window.humangs`, by which tests set exact views.
+// The state, the loop that draws when something has changed, and `window.humangs`, with which tests
+// set exact views.
 
 const LEAST_FRAME_MS = 45;   // slower than this, the resolution falls while things move
 const QUALITIES = [1, 0.75, 0.5];
@@ -209,8 +210,8 @@ async function start() {
     Object.assign(orbit, home, { target: [...home.target] });
     invalidate();
   }
-  // { blob, width, height } of a PNG: what is on the screen, with the person in the middle and at full
-  // resolution, however low it is while things move. transparent: the person alone.
+  // Returns { blob, width, height } of a PNG of what is on the screen. The person is in the middle
+  // and at full resolution, even while the screen has a lower one. transparent: the person alone.
   async function picture(scale, transparent) {
     const { clientWidth, clientHeight } = canvas, most = Math.sqrt(LARGEST_PICTURE / (clientWidth * clientHeight));
     const longest = renderer.longestSide / Math.max(clientWidth, clientHeight);
@@ -222,7 +223,8 @@ async function start() {
     else drawFull();
     return { blob: await encoded, width, height };
   }
-  // While it is true the controls are hidden and the canvas keeps its size, which encoders want to be even.
+  // Begins or ends a recording. Meanwhile controls are hidden, and the canvas keeps its size, whose
+  // sides are even because encoders need that.
   function setRecording(recording) {
     recordedSize = recording ? sizeAt(fullRatio()).map((length) => length + (length % 2)) : null;
     document.body.classList.toggle("recording", recording);
@@ -260,8 +262,9 @@ async function start() {
       if (scene.motion) setFrame(kept.frame);
     },
     firstImage, floats: renderer.floats, gaussians: scene.count - (scene.header.face?.hidden ?? 0),
-    // Draws one image at once: { K, cam_from_world, width, height }, a pose { rotations, translation } or { frame },
-    // and a background; nothing but the person. `resume` goes back to the page.
+    // Draws one image at once, with nothing but the person. view: { K, cam_from_world, width,
+    // height }, a pose { rotations, translation } or { frame }, and a background. `resume` goes
+    // back to the page.
     draw(view) {
       exact = exactCamera(view);
       makeFace(view.expression ?? null);
@@ -276,7 +279,7 @@ async function start() {
       Object.assign(canvas.style, { width: "", height: "" });
       invalidate();
     },
-    // The image on the screen: its camera and pose, as Python takes them.
+    // Returns camera and pose of the image on the screen, as Python takes them.
     view() {
       const { camera, pose } = lastDrawn, [fx, fy, cx, cy] = camera.K, { rotation: r, translation: t } = camera;
       return {
@@ -286,7 +289,8 @@ async function start() {
         expression: currentFace(), frame: app.frame, mode: app.mode, playing: app.playing, background: app.look.background,
       };
     },
-    // Plays `frames` images of the motion, one after the other, and resolves with their number per second.
+    // Plays `frames` images of the motion, one after the other, and resolves with the number of
+    // images per second.
     async play(frames) {
       setPlaying(true);
       const began = performance.now();
@@ -298,7 +302,8 @@ async function start() {
       setPlaying(false);
       return fps;
     },
-    // Pauses, and resolves when the image on the screen is final: full resolution, and sorted for its view.
+    // Pauses, and resolves when the image on the screen is final: at full resolution, and sorted
+    // for its view.
     async settle() {
       setPlaying(false);
       app.idle?.set(false);
@@ -309,7 +314,8 @@ async function start() {
       while (sorting) await wait(20);
       renderer.finish();
     },
-    // Images per second, and milliseconds for one sort, of the motion drawn from a turning camera without waiting for the screen.
+    // Draws the motion from a turning camera without waiting for the screen. Returns images per
+    // second, and milliseconds of one sort.
     benchmark({ frames = 60, width = 512, height = 512 }) {
       const rows = [];
       let began = 0;
@@ -332,7 +338,8 @@ async function start() {
   };
 }
 
-// null where pages may not start workers (some notebooks): the page then sorts itself.
+// Starts the worker that sorts. Returns null where pages may not start workers (some notebooks);
+// the page then sorts itself.
 function startWorker(scene) {
   try {
     const url = URL.createObjectURL(new Blob([element("sorting").textContent], { type: "text/javascript" }));

@@ -1,14 +1,14 @@
-// Motions that people drop onto the page: .npz (ours, AMASS and others), .bvh (skeletons.js) and .glb
-// (glb.js). Formats and their conventions are those of humangs_jax/motion/, and so are the tables
-// (RULES, from rules.py); a file that is refused says in one line what was expected. What comes from a
-// file is never the key of an object, which has keys of its own such as "constructor".
+// Motions that people drop onto the page: .npz (ours, AMASS and others), .bvh (skeletons.js) and
+// .glb (glb.js). Formats, conventions and tables (RULES, from rules.py) are those of
+// humangs_jax/motion/. An error about a refused file says in one line what was expected. Text from
+// a file is never used as a key of an object, because objects have keys such as "constructor".
 
 const LARGEST_FILE = 512 * 2 ** 20;
 
-// { quats, translations, fps, note, clips } for the scene's joints; note: lines about the file for the user.
-// clips: names of the motions in the file, where it has several; clip: the index of the one that is wanted.
-// rate: frames per second that the user gave; null: those of the file. An error that asksRate can be
-// answered with one.
+// Returns { quats, translations, fps, note, clips } for the scene's joints. note: lines about the
+// file for the user. clips: names of the motions, if the file has several. clip: index of the
+// wanted one. rate: frames per second that the user gave; null: those of the file. An error that
+// has `asksRate` can be answered with a rate.
 async function readMotionFile(file, scene, rate = null, clip = 0) {
   if (file.size > LARGEST_FILE) throw new Error(`${file.name}: larger than 512 MB`);
   const bytes = new Uint8Array(await file.arrayBuffer()), text = () => new TextDecoder().decode(bytes);
@@ -24,7 +24,8 @@ async function readMotionFile(file, scene, rate = null, clip = 0) {
 
 const rateError = (message) => Object.assign(new Error(message), { asksRate: true });
 
-// Numbers that cannot be drawn would stop the page.
+// Returns the motion if all its numbers can be drawn, and throws if not, because wrong numbers
+// would stop the page.
 function checkedMotion(motion) {
   if (!(motion.fps > 0 && Number.isFinite(motion.fps) && Number.isFinite(1 / motion.fps)))
     throw rateError(`expected a positive number of frames per second, got ${motion.fps}`);
@@ -41,7 +42,7 @@ const mean = (values) => values.reduce((a, b) => a + b, 0) / values.length;
 
 // ---- npz: a zip archive of npy arrays --------------------------------------------------------------------------------
 
-// A Map of arrays by name.
+// Returns the arrays of an archive by name, as a Map.
 async function readNpz(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength), arrays = new Map();
   let end = bytes.length - 22;
@@ -68,7 +69,8 @@ const READERS = new Map(Object.entries({
   i2: "getInt16", u2: "getUint16", i1: "getInt8", u1: "getUint8",
 }));
 
-// { shape, data } in row-major order; null for text and pickled objects, which are not read.
+// Returns { shape, data } in row-major order; null for text and pickled objects, which are not
+// read.
 function readNpy(bytes, name) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   if (view.getUint8(0) !== 0x93) throw new Error(`key ${name}: not an npy array`);
@@ -105,7 +107,7 @@ function motionFromArrays(arrays, scene, asked = null) {
   }
   const count = scene.parents.length, full = largest(RULES.COLUMNS);
   if (format.kind !== "ours" && 3 * count !== full) throw new Error(`such files are for ${full / 3} joints, this avatar has ${count}`);
-  // rows of numbers, of one of some widths
+  // reads rows of numbers whose width is one of `widths`
   const numbers = (key, widths, amount = null) => {
     const found = arrays.get(key);
     if (!found) throw new Error(`key ${key} is missing`);
@@ -135,7 +137,8 @@ function motionFromArrays(arrays, scene, asked = null) {
   return { ...motion, note: [...notes, motion.note].filter(Boolean).join("; ") };
 }
 
-// Quaternions of all joints in each frame, of the places of a format (PLACES: the first joint, and how many).
+// Returns the quaternions of all joints in each frame. A format has parts, each with a place in
+// PLACES: the first joint and the number of joints.
 function posesOf(format, numbers, arrays, count) {
   let frames = null;
   for (const [place, key] of Object.entries(format.poses)) {
@@ -158,7 +161,8 @@ function posesOf(format, numbers, arrays, count) {
   return frames;
 }
 
-// The joint of ours that the j-th of a part is: of whole poses SMPL-H's fingers follow the body, and SMPL's hands are left out.
+// Returns our joint for the j-th joint of a part; null for none. In whole poses, SMPL-H's fingers
+// follow the body, and SMPL's hands are left out.
 function placeOf(j, joints, at, most, place) {
   const body = RULES.BODY_NUMBERS / 3, fingers = 2 * RULES.HAND_NUMBERS / 3;
   if (place !== "all" || joints === most || j < body) return j < most ? at + j : null;
@@ -173,7 +177,7 @@ function rotationMatrix(m, key) {
 
 // ---- Which way is up: as humangs_jax/motion/rules.py --------------------------------------------------------------
 
-// The world turned so that y is up.
+// Turns the world so that y is up.
 function turnedUp(motion, format, scene) {
   const frames = motion.quats.length, axes = motion.quats.map(([root]) => matrixFromQuat(root));
   const { axis, cosine } = nearestAxis([1, 4, 7].map((i) => mean(axes.map((m) => m[i])))), { PELVIS } = RULES;
@@ -191,7 +195,7 @@ function turnedUp(motion, format, scene) {
   };
 }
 
-// The axis that a vector points along most, and how far it does.
+// Returns the axis along which a vector points most, and its component there.
 function nearestAxis(v) {
   const i = v.reduce((best, x, k) => (Math.abs(x) > Math.abs(v[best]) ? k : best), 0);
   return { axis: (v[i] < 0 ? "-" : "") + "xyz"[i], cosine: Math.abs(v[i]) };
@@ -199,14 +203,16 @@ function nearestAxis(v) {
 
 const uprightMatrix = (axis) => matrixFromQuat(RULES.UPRIGHT[axis]).map(Math.round);
 
-// Frames that are asked for a floor, evenly spread, each followed by its next.
+// Returns the frames in which a floor is looked for: evenly spread frames, each followed by the
+// next one.
 function sampledFrames(count) {
   const amount = Math.min(Math.max(count - 1, 1), RULES.MOST_FRAMES), last = Math.max(count - 2, 0);
   const first = Array.from({ length: amount }, (_, i) => (amount > 1 ? Math.floor((i * last) / (amount - 1)) : 0));
   return [...new Set(first)].flatMap((f) => [f, Math.min(f + 1, count - 1)]);
 }
 
-// { up, note }: the axis that is up. points: joints in space, pairs of frames. hands: which of them carry who is upside down.
+// Finds the axis that is up. Returns { up, note }. points: joints in space, in pairs of frames.
+// hands: indices of the joints on which a person stands who is upside down.
 function upAxis(points, stands, usual, fps, hands, also = []) {
   const { ON_THE_FLOOR: enough } = RULES, opposite = stands !== usual && stands.at(-1) === usual.at(-1);
   const [here, there] = floorsOf(points, [usual, stands], fps), none = { up: usual, note: "" };
@@ -219,7 +225,8 @@ function upAxis(points, stands, usual, fps, hands, also = []) {
   return { up: usual, note: `${usual} is up, as usual in such files, and people lie along ${stands}` };
 }
 
-// Height of the lowest point above the origin, and which it is, in the first frame of each pair.
+// Returns the height of the lowest point above the origin, and its index, in the first frame of
+// each pair.
 function lowestPoints(points, axis) {
   const m = uprightMatrix(axis);
   return points.filter((_, f) => f % 2 === 0).map((frame) => {
@@ -228,7 +235,8 @@ function lowestPoints(points, axis) {
   });
 }
 
-// Share of the frames in which something is on the floor, for the usual axis and for another, which has to be surer.
+// Returns, for the usual axis and for another one, the share of the frames in which something is on
+// the floor. For the other axis more evidence is needed.
 function floorsOf(points, axes, fps) {
   const moves = [];
   for (let f = 0; f < points.length; f += 2) moves.push(points[f].map((p, j) => fps * Math.hypot(...subtract(points[f + 1][j], p))));

@@ -1,7 +1,9 @@
 #version 300 es
-// One Gaussian per pixel, in depth order: skinned by the full linear part of its blended transform and projected (EWA).
-// The mathematics and its constants are those of humangs_jax/rendering/projection.py. A pass of its own, so that it is done
-// once per Gaussian and not at each of its corners; integers hold the bits of floats, which not every GPU can draw.
+// Projects one Gaussian per pixel, in depth order. A Gaussian is skinned by the full linear part of
+// its blended transform, and projected (EWA). The mathematics and its constants are those of
+// humangs_jax/rendering/projection.py. This is a separate pass, so that it is done once per
+// Gaussian and not for each corner. Integers hold the bits of floats, because not every GPU can
+// draw to float textures.
 precision highp float;
 precision highp int;
 precision highp sampler2D;
@@ -48,7 +50,8 @@ mat3 matrix_of(vec4 q) {       // wxyz
               2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-// The best conditioned of four formulas; of a matrix that is no rotation it has |q| != 1 (geometry/quaternion.py).
+// Returns the quaternion of a matrix by the best conditioned of four formulas. For a matrix that is
+// no rotation, |q| is not 1 (geometry/quaternion.py).
 vec4 quat_of(mat3 t) {
   mat3 m = transpose(t);       // m[row][column]
   vec4 a = sqrt(max(vec4(0.0), 1.0 + vec4(m[0][0] + m[1][1] + m[2][2], m[0][0] - m[1][1] - m[2][2],

@@ -1,4 +1,4 @@
-// Pictures and videos that people take home: app.picture (main.js) draws them, here they become files.
+// Saves pictures and videos: app.picture (main.js) draws them, and here they become files.
 
 const VIDEO_TYPES = ["video/webm;codecs=vp9", "video/webm", "video/mp4"];  // the first that the browser writes
 const VIDEO_FPS = 30;
@@ -8,7 +8,7 @@ const KEEP_LINK_MS = 10000;  // until the browser has begun to save
 const PICTURE_MARK = "Software\0humangs_jax";  // as io/images.py marks pictures that are no photos
 const PNG_HEAD = 33;         // bytes of a PNG up to the end of its first chunk, the sizes
 
-// The checksum of a chunk of a PNG (CRC-32, ISO 3309).
+// Returns the checksum of a chunk of a PNG (CRC-32, ISO 3309).
 function crc32(bytes) {
   let crc = 0xffffffff;
   for (const byte of bytes) {
@@ -18,7 +18,8 @@ function crc32(bytes) {
   return (crc ^ 0xffffffff) >>> 0;
 }
 
-// The PNG with the text that tells humangs that it is a drawing, lest it be taken for a photo.
+// Returns the PNG with a text that marks it as a drawing, so that humangs does not take it for a
+// photo.
 async function marked(blob) {
   const png = new Uint8Array(await blob.arrayBuffer());
   const text = new TextEncoder().encode(`tEXt${PICTURE_MARK}`), chunk = new Uint8Array(text.length + 8);

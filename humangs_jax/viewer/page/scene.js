@@ -1,4 +1,5 @@
-// The avatar as Python packed it (humangs_jax/viewer/page.py): arrays, and the textures that the shaders read.
+// The avatar as Python has packed it (humangs_jax/viewer/page.py): its arrays, and the textures
+// that shaders read.
 
 const TEXELS_PER_ROW = 3072;  // of the texture of Gaussians: 3 texels each
 const ROW = 1024;             // Gaussians per row of both textures
@@ -47,7 +48,7 @@ function unpackMotion(header, arrays) {
   return { quats, translations: rows3(arrays.translations), fps, faces: faces ?? null };
 }
 
-// Three texels of four 32-bit numbers for each Gaussian; project.frag takes them apart.
+// Packs each Gaussian into three texels of four 32-bit numbers. project.frag unpacks them.
 function gaussianTexels(scene) {
   const { arrays, count } = scene, height = Math.ceil(count / ROW), out = new Uint32Array(4 * TEXELS_PER_ROW * height);
   const { scales, quats, colors, opacities, weights, weight_joints: joints, light_shading: shading } = arrays;
@@ -69,7 +70,8 @@ function gaussianTexels(scene) {
   return { data: out, width: TEXELS_PER_ROW, height };
 }
 
-// Means, and the normals that the light needs: three numbers of 8 bits are a whole number that a float holds.
+// Packs means, and the normals that light needs. The three 8-bit numbers of a normal become one
+// whole number, which a float holds exactly.
 function meanTexels(scene) {
   const height = Math.ceil(scene.count / ROW), out = new Float32Array(4 * ROW * height), n = scene.arrays.light_normals;
   for (let i = 0; i < scene.count; i++) {
@@ -79,7 +81,8 @@ function meanTexels(scene) {
   return { data: out, width: ROW, height };
 }
 
-// What is added by direction: for each function of the sphere a block of rows like those of the means.
+// Packs the colors that the direction of sight adds. Each function of the sphere has a block of
+// rows like those of the means.
 function harmonicTexels(scene) {
   const { harmonics } = scene.arrays, rows = Math.ceil(scene.count / ROW), { low, high } = scene.header.harmonics;
   const functions = harmonics.length / (3 * scene.count), out = new Float32Array(4 * ROW * rows * functions);
@@ -90,7 +93,8 @@ function harmonicTexels(scene) {
   return { data: out, width: ROW, height: rows * functions };
 }
 
-// Moves canonical means and joints for shape coefficients. The Gaussians of a vertex move with it and keep their sizes.
+// Moves canonical means and joints for shape coefficients. The Gaussians of a vertex move with it
+// and keep their sizes.
 function applyShape(scene, betas) {
   const { shape } = scene.header, directions = scene.arrays.shape_directions, joints = scene.arrays.shape_joints;
   const j = scene.parents.length, vertices = directions.length / (3 * betas.length);

@@ -1,12 +1,13 @@
-// Skeletons of other programs in motion, brought to the scene's joints: as humangs_jax/motion/clips.py and skeleton.py.
+// Converts skeletons of other programs in motion to the scene's joints, as
+// humangs_jax/motion/clips.py and skeleton.py do.
 
 const CHANNELS = ["xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation"];
 
-// A clip, which is a skeleton in motion: { joints: [{ name, parent }], place, own, fps, up, note }.
-// place: joints in the rest pose, in which nothing is turned. own: of each frame { world: rotations from
-// the rest pose, position }. up: the axis that the format says is up; null: found from the rest pose.
-// A joint's name in a BVH file ends with its line or before a brace. rate: frames per second in place of
-// the file's; null: the file's.
+// Reads a BVH file into a clip, which is a skeleton in motion: { joints: [{ name, parent }], place,
+// own, fps, up, note }. place: joints in the rest pose, in which nothing is turned. own: for each
+// frame { world: rotations from the rest pose, position }. up: the axis that is up in the format;
+// null: found from the rest pose. rate: frames per second in place of those of the file; null:
+// those of the file. A joint's name in a BVH file ends with its line or before a brace.
 function parseBvh(text, rate = null) {
   text = text.replace(/^\ufeff/, "");
   if (!/^\s*HIERARCHY(?!\S)/.test(text)) throw new Error("not a BVH file: expected HIERARCHY first");
@@ -33,7 +34,7 @@ function bvhNumber(word) {
   return value;
 }
 
-// Parents first; the ends of limbs are left out.
+// Returns the joints, parents first, without the ends of limbs.
 function bvhJoints(text) {
   const words = text.matchAll(/(ROOT|JOINT|End)\s+([^\r\n{}]*)|[{}]|[^\s{}]+/g), joints = [], open = [];
   let waiting = null;
@@ -65,8 +66,9 @@ function bvhJoints(text) {
   return joints;
 }
 
-// A Map from each joint of ours that the file has to the index of the file's: as humangs_jax/motion/matching.py. place, posed:
-// in the rest pose and in the first frame.
+// Returns a Map from our joints to indices of the file's joints, for those that the file has, as
+// humangs_jax/motion/matching.py does. place, posed: joints in the rest pose and in the first
+// frame.
 function matchJoints(joints, scene, place, posed) {
   const parents = joints.map((j) => j.parent), plain = plainNames(joints.map((j) => j.name));
   let source = namedJoints(plain);
@@ -92,7 +94,7 @@ function matchJoints(joints, scene, place, posed) {
   return new Map([...source].filter(([name]) => scene.names.includes(name)));
 }
 
-// Lower case, letters and digits, without what stands in front of all or many of them.
+// Returns names as lower-case letters and digits, without prefixes that all or many of them share.
 function plainNames(names) {
   const plain = names.map((name) => {
     const words = name.replace(/^.*[:|]/, "").toLowerCase().match(/[a-z0-9]+/g) || [];
@@ -127,7 +129,8 @@ const descends = (source, parents) => RULES.UNDER.every(([a, b]) => RULES.SIDES.
   return above === undefined || below === undefined || ancestors(parents, below).slice(1).includes(above);
 }));
 
-// The joints of arms, legs and pelvis by the tree, as entries of a Map; null where it is not one of a person.
+// Finds the joints of arms, legs and pelvis from the shape of the tree. Returns entries of a Map,
+// or null if it is not the tree of a person.
 function limbsOfTree(plain, parents, place, posed) {
   const lengths = parents.map((p, i) => (p < 0 ? 0 : Math.hypot(...subtract(place[i], place[p]))));
   const children = parents.map((_, i) => parents.flatMap((p, j) => (p === i ? [j] : []))), reach = [...lengths];
@@ -190,7 +193,8 @@ function matchToes(source, parents, place) {
   }
 }
 
-// What hangs between the arms: the first joint is the neck, the last the head, but for ends of bones.
+// Finds neck and head in the chain between the arms: its first joint is the neck, its last one the
+// head, apart from ends of bones.
 function matchHead(source, plain, parents) {
   if (source.has("neck") || source.has("head")) return;
   const arms = RULES.SIDES.map((side) => ancestors(parents, source.get(`${side}_shoulder`)).slice(1));
@@ -208,7 +212,8 @@ function matchHead(source, plain, parents) {
   if (chain.length > 1) source.set("head", chain.at(-1));
 }
 
-// Spines have one to five joints, called differently everywhere: ours are the first, the middle and the last of the file's.
+// Matches the spine, which has one to five joints with various names. Ours are the first, the
+// middle and the last joint of the file's spine.
 function matchSpine(joints, source) {
   const found = [];
   let at = joints[source.get("neck") ?? source.get("head")]?.parent ?? -1;
@@ -219,9 +224,11 @@ function matchSpine(joints, source) {
 
 const transposed = (m) => [0, 3, 6, 1, 4, 7, 2, 5, 8].map((i) => m[i]);
 
-// Bones point where the file's bones point. A joint's rest frames are related by the rotation that turns our rest direction into the
-// file's, carried down from the pelvis, whose is fixed by the hips' line and the up direction of the spine. Where nobody can stand
-// like the rest pose, twists are 0 on average over the frames.
+// Converts a clip to our joints, so that our bones point where the file's bones point. The rest
+// frames of a joint are related by the rotation that turns our rest direction into the file's. It
+// is carried down from the pelvis, whose rotation is fixed by the line of the hips and the up
+// direction of the spine. If nobody can stand in the rest pose, twists are set to 0 on average over
+// the frames.
 function retargeted(clip, scene) {
   const lacking = RULES.NEEDED.filter((name) => !scene.names.includes(name));
   if (lacking.length)
@@ -290,7 +297,8 @@ function retargeted(clip, scene) {
 
 const NEXT = new Map(Object.entries(RULES.NEXT));
 
-// { up, note }: BVH does not tell which axis is up, a rest pose in which people stand does.
+// Returns { up, note }. BVH does not say which axis is up, but a rest pose in which people stand
+// shows it.
 function upOfClip(posed, source, top, scale, usual, fps) {
   const trunks = posed.map(({ position }) => normalized(subtract(position[source.get(top)], position[source.get("pelvis")])));
   const { axis, cosine } = nearestAxis([0, 1, 2].map((i) => mean(trunks.map((v) => v[i]))));
@@ -300,14 +308,16 @@ function upOfClip(posed, source, top, scale, usual, fps) {
   return upAxis(points, axis, usual, fps, []);
 }
 
-// From the rest pose to the frames: of the joint, or of those that carry the hips if these agree better with the trunk, turned so
-// that the line of the hips is the file's.
+// Returns the rotations of the pelvis from the rest pose to the frames. They are those of the
+// joint, or of the joints that carry the hips if these agree better with the trunk, turned so that
+// the line of the hips is the file's.
 function pelvisTurns(joints, source, place, posed, top) {
   const [pelvis, left, right] = ["pelvis", "left_hip", "right_hip"].map((name) => source.get(name)), end = source.get(top);
   const restLine = subtract(place[left], place[right]), above = joints[left].parent, beside = joints[right].parent;
   const lines = posed.map(({ position }) => normalized(subtract(position[left], position[right])));
   const meeting = (turn, f) => matrixMultiply(smallestTurn(normalized(matrixApply(turn, restLine)), lines[f]), turn);
-  // angles about the line of the hips from the rest pose's direction of a joint above to the frame's
+  // angles about the line of the hips between two directions of a joint above: that of the rest
+  // pose, turned, and that of the frame
   const tilts = (turns, joint) => turns.map((turn, f) => {
     const across = (v) => subtract(v, scaled(lines[f], dot(v, lines[f])));
     const a = across(matrixApply(turn, subtract(place[joint], place[pelvis])));
@@ -334,7 +344,8 @@ function meanTurn(turns) {
   return matrixFromQuat(quatNormalize(sum));
 }
 
-// The rotation about a bone that takes the mean twist about it out of rotations. The twist of (w, v) about b is 2 arg(w + i v.b).
+// Returns the rotation about a bone that removes the mean twist about the bone from rotations. The
+// twist of (w, v) about b is 2 arg(w + i v.b).
 function untwist(turns, bone) {
   let real = 0, imaginary = 0;
   for (const m of turns) {
@@ -347,14 +358,16 @@ function untwist(turns, bone) {
 
 const feetOf = (source) => RULES.FEET.map((kind) => kind.filter((name) => source.has(name))).filter((kind) => kind.length);
 
-// How high the joints of the file's feet are above the lowest of them in a rest pose that stands.
+// Returns how high each joint of the file's feet is above the lowest of them, in a rest pose that
+// stands.
 function soles(place, source, upright, scale) {
   const names = feetOf(source).flat(), heights = names.map((name) => scale * matrixApply(upright, place[source.get(name)])[1]);
   return new Map(names.map((name, i) => [name, heights[i] - Math.min(...heights)]));
 }
 
-// How high the feet are above the floor in each frame, which is where they are lowest. low: of each joint of the feet, how high it
-// is when the foot stands; null: each kind as high as in its lowest frame.
+// Returns how high the feet are above the floor in each frame. The floor is where feet are lowest.
+// low: height of each joint of the feet when the foot stands; null: each kind of joint has the
+// height of its lowest frame.
 function stepsOf(posed, source, scale, low) {
   const height = ({ position }, name) => scale * position[source.get(name)][1];
   if (!low) {
@@ -369,7 +382,7 @@ function stepsOf(posed, source, scale, low) {
   return feet.map((y) => y - floor);
 }
 
-// The same of our body, above a floor at the height of its lowest joint in T-pose.
+// Returns the same heights for our body, above a floor at the height of its lowest joint in T-pose.
 function stepsOfBody(global, scene, source, moves) {
   const feet = feetOf(source).flat().map((name) => scene.names.indexOf(name));
   const floor = Math.min(...feet.map((j) => scene.rest[j][1]));
@@ -382,7 +395,7 @@ function stepsOfBody(global, scene, source, moves) {
   });
 }
 
-// Rotations and places of all joints in the world.
+// Returns rotations and places of all joints in the world.
 function poseBvh(joints, numbers) {
   const axes = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] }, world = [], position = [];
   let at = 0;
@@ -401,7 +414,8 @@ function poseBvh(joints, numbers) {
   return { world, position };
 }
 
-// The matrix that turns a unit vector into another by the smallest angle; none where that is zero.
+// Returns the matrix that turns one unit vector into another by the smallest angle. It is the
+// identity if they are equal.
 function smallestTurn(from, to) {
   const c = dot(from, to), side = () => normalized(cross(from, Math.abs(from[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
   return matrixFromQuat(c < -0.999999 ? [0, ...side()] : quatNormalize([1 + c, ...cross(from, to)]));

@@ -1,14 +1,16 @@
-// Depth order of the posed Gaussians. This text runs twice: in the page (exact views of tests, and where workers are
-// forbidden), and as a worker, which keeps the page responsive.
+// Depth order of the posed Gaussians. This text runs twice: in the page, for exact views of tests
+// and where workers are forbidden, and in a worker, which keeps the page responsive.
 
-// means: Float32Array (3 g), canonical. joints: Uint8Array (8 g). weights: Uint16Array (8 g), largest first.
+// Makes the functions that sort. means: Float32Array (3 g), canonical. joints: Uint8Array (8 g).
+// weights: Uint16Array (8 g), largest first.
 function makeSorter(count, means, joints, weights) {
   const BITS = 11, BUCKETS = 1 << BITS, LEVELS = (1 << (2 * BITS)) - 1;
   const HIDDEN_BELOW = -1000;  // metres; see AWAY in face.js
   const depths = new Float32Array(count), keys = new Uint32Array(count), half = new Uint32Array(count);
   const low = new Uint32Array(BUCKETS), high = new Uint32Array(BUCKETS);
 
-  // z in the camera of a blended mean is a blend of z: one row of four numbers per joint says all.
+  // Finds the depth of each Gaussian. The z of a blended mean in the camera is a blend of z, so one
+  // row of four numbers per joint is enough.
   function findDepths(rows) {
     let near = Infinity, far = -Infinity;
     for (let i = 0; i < count; i++) {
@@ -29,7 +31,8 @@ function makeSorter(count, means, joints, weights) {
     return [near, far];
   }
 
-  // Radix sort of depths in 2^22 levels, nearest first: less than a micrometre each for a person.
+  // Sorts by depth, nearest first, with a radix sort in 2^22 levels. For a person a level is less
+  // than a micrometre.
   function sort(rows, order) {
     const [near, far] = findDepths(rows);
     const scale = LEVELS / Math.max(far - near, 1e-20);

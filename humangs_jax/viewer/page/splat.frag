@@ -1,6 +1,6 @@
 #version 300 es
-// alpha = min(alpha_max, opacity exp(-d^2 / 2)), nothing below alpha_min. Blended front to back: what is drawn counts
-// for as much as what lies before it lets through.
+// Draws a splat with alpha = min(alpha_max, opacity exp(-d^2 / 2)), or nothing below alpha_min.
+// Blending runs front to back: a splat counts as much as the splats in front of it let through.
 precision highp float;
 
 in vec2 offset;

@@ -1,5 +1,6 @@
 #version 300 es
-// The rectangle around the ellipse where a splat's alpha is at least alpha_min.
+// Places the corners of the rectangle around the ellipse in which a splat's alpha is at least
+// alpha_min.
 precision highp float;
 precision highp usampler2D;
 
@@ -22,6 +23,6 @@ void main() {
   offset = (vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0) * shape.z;
   splat = vec4(color.rgb, shape.w);
   vec2 pixel = placed.xy + offset.x * placed.zw + offset.y * shape.xy;
-  // pixel centres at +0.5, y down: OpenGL's pixel centres are there, too, its y is up
+  // pixel centres are at +0.5 in both; our y points down, that of OpenGL up
   gl_Position = vec4(2.0 * pixel.x / size.x - 1.0, 1.0 - 2.0 * pixel.y / size.y, 0.0, 1.0);
 }

@@ -1,12 +1,13 @@
-// Drawing: Gaussians in depth order -> splats in textures (project.frag) -> blended front to back in 16-bit floats
-// (splat.*) -> over the background (background.*).
+// Drawing: Gaussians in depth order become splats in textures (project.frag), splats are blended
+// front to back in 16-bit floats (splat.*), and the result is laid over the background
+// (background.*).
 
 const MOST_JOINTS = 256;  // of the uniform block in project.frag
 
 function makeRenderer(canvas, scene) {
   const gl = canvas.getContext("webgl2", { antialias: false, depth: false, powerPreference: "high-performance" });
   if (!gl) throw new Error("WebGL 2 is missing.");
-  // without it 8 bits hold what splats add up to: banding, but a picture
+  // without this extension splats are added up in 8 bits, which shows banding but gives a picture
   const floats = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
 
   const { count, header } = scene, how = header.splatting;
@@ -39,7 +40,7 @@ function makeRenderer(canvas, scene) {
   });
   gl.drawBuffers(outputs);
 
-  // two triangles per splat; not instances, which software and some GPUs draw one by one
+  // two triangles per splat; no instances, because software and some GPUs draw instances one by one
   const corners = new Uint32Array(6 * count), rectangles = gl.createVertexArray(), nothing = gl.createVertexArray();
   for (let i = 0; i < count; i++) corners.set([0, 1, 2, 2, 1, 3].map((corner) => 4 * i + corner), 6 * i);
   gl.bindVertexArray(rectangles);
@@ -58,8 +59,8 @@ function makeRenderer(canvas, scene) {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, image, 0);
   }
 
-  // camera: see camera.js. rows: joint transforms, Float32Array (12 j).
-  // look: { background, transparent, ground, floor, shadows, middle }.
+  // Draws an image. camera: see camera.js. rows: joint transforms, Float32Array (12 j). look: {
+  // background, transparent, ground, floor, shadows, middle }.
   function render(camera, rows, look) {
     const { width, height } = camera;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
@@ -121,7 +122,7 @@ function makeRenderer(canvas, scene) {
       bind(gl, 1, means);
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, gl.RGBA, gl.FLOAT, data);
     },
-    // Waits until the GPU has drawn: reads a pixel back.
+    // Waits until the GPU has drawn, by reading a pixel back.
     finish() {
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     },

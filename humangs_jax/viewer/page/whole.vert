@@ -1,5 +1,5 @@
 #version 300 es
-// A triangle over the whole image.
+// Draws a triangle that covers the whole image.
 void main() {
   gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0);
 }
