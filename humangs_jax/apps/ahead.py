@@ -37,8 +37,8 @@ shipped_weights = functools.cache(load_weights)
 
 
 def calls_of_found_people(photos: int) -> Iterator[Call]:
-    """Yields the calls of the fit to people whom the detector will find in this number of photos:
-    photos of one moment, with hands.
+    """Yields the calls of the fit to keypoints that the detector will find in this number of
+    photos. Assumes photos of one moment, and that hands are found.
     """
     yield from calls_of_fit(load_body(), MEDIAPIPE_69, photos)
 

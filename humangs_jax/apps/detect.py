@@ -325,8 +325,8 @@ Masks = Sequence[Float[np.ndarray, "h w"] | Bool[np.ndarray, "h w"]]
 def person_of(
     photos: Sequence[PhotoPeople], given: Keypoints | Masks, sheet: Path
 ) -> tuple[list[PhotoPeople], int]:
-    """Finds the person to whom the given keypoints or masks belong. Returns the photos, in which
-    this person has the same number everywhere, and the number. Where a photo's keypoints or masks
+    """Finds the person that the given keypoints or masks show. Returns the photos, in which this
+    person has the same number everywhere, and the number. Where a photo's keypoints or masks
     contradict the match between photos, they decide.
 
     Arguments: sheet: where to write the sheet of people if this is refused.

@@ -170,7 +170,7 @@ def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]
     were not matched. Returns the rows with the joined person, or the given rows where nothing is
     joined.
 
-    Two people whom one photo shows together stay two. Nobody is joined if somebody else remains
+    Two people that one photo shows together stay two. Nobody is joined if somebody else remains
     large, because a person alone in a photo could then be either.
     """
     alone = {large[0] for large in map(_large, rows) if len(large) == 1}
@@ -244,7 +244,7 @@ def rivals(photos: Sequence[PhotoPeople]) -> list[int]:
 
 def is_unclear(photos: Sequence[PhotoPeople], photo: int, person: int) -> bool:
     """Returns whether a photo in which the person was not found may still show the person. That is
-    so if it has somebody large whom no photo shows together with the person, and where numbers do
+    so if it has somebody large that no photo shows together with the person, and where numbers do
     not mean who is who.
     """
     people = photos[photo].people

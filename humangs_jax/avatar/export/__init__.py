@@ -19,8 +19,8 @@ HERE = "humangs_jax.avatar.export"
 
 @dataclasses.dataclass(frozen=True)
 class ExportFormat(Format):
-    """A format of exported files. code: called as code(path, gaussians); formats of meshes as
-    code(paths, avatar, poses or motion, up, name).
+    """A format of exported files. Its code is called as code(path, gaussians), or for formats of
+    meshes as code(paths, avatar, poses or motion, up, name).
     """
 
     up: Up = "y"
