@@ -1,4 +1,4 @@
-"""BVH files in the conventions of their sources, written from poses of our skeleton."""
+"""Writes poses of our skeleton as BVH files in the conventions of several programs."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -55,8 +55,9 @@ BONES = [
 
 
 def rest_frames(arms_down=0.0, turned=0.0):
-    """Our rest frame -> the file's, by joint: arms lowered, the world turned about y, both in
-    degrees.
+    """Returns the rotation from our rest axes to the file's, for each joint.
+
+    Arms are lowered by `arms_down` and the world is turned about y by `turned`, degrees.
     """
     around, frames = Rotation.from_euler("y", turned, degrees=True), {}
     for name in JOINT_NAMES:
@@ -67,8 +68,9 @@ def rest_frames(arms_down=0.0, turned=0.0):
 
 
 def frames_along_bones(rest, seed=0):
-    """LaFAN's: every bone lies along +x of its joint, twisted as it likes; joints without a bone
-    are as their parents.
+    """Returns LaFAN's rest axes: each bone lies along +x of its joint, with a random twist.
+
+    Joints without a bone have the axes of their parent.
     """
     rng, frames = np.random.default_rng(seed), {}
     children = dict(BONES)
@@ -90,7 +92,7 @@ def frames_along_bones(rest, seed=0):
 
 
 def without_twist(rest, poses):
-    """Poses (m, 55, 3) whose rotations turn no bone about itself."""
+    """Returns poses (m, 55, 3) without the rotations of bones about their own axis."""
     poses = poses.copy()
     for a, b in BONES[1:]:
         bone = rest[INDEX[b]] - rest[INDEX[a]]
@@ -100,7 +102,7 @@ def without_twist(rest, poses):
 
 
 def places_of(rest, poses, moves):
-    """Joints (m, 55, 3) in space: `moves` (m, 3) is where the pelvis is."""
+    """Returns places (m, 55, 3) of the joints; `moves` (m, 3) are those of the pelvis."""
     world, places = {}, {}
     for j, parent in enumerate(PARENTS):
         own = Rotation.from_rotvec(poses[:, j])

@@ -1,4 +1,4 @@
-"""Files that are changed in one place."""
+"""Changes files in one place."""
 
 import json
 import pickle
@@ -23,14 +23,17 @@ def edit_json(path, change):
 
 
 def edit_npz(path, **changes):
-    """Entries that are replaced; functions get the old one, and None removes it."""
+    """Replaces entries of an .npz file.
+
+    A function gets the old entry and returns the new one; None removes it.
+    """
     with np.load(path) as archive:
         values = changed(dict(archive), changes)
     np.savez(path, **values)
 
 
 def edit_pickle(path, **changes):
-    """As `edit_npz`."""
+    """Replaces entries of a pickled dict, as `edit_npz` does."""
     path.write_bytes(pickle.dumps(changed(pickle.loads(path.read_bytes()), changes)))
 
 

@@ -1,4 +1,4 @@
-"""The command line in the process of the tests."""
+"""Runs the command line in the process of the tests."""
 
 import sys
 
@@ -12,7 +12,7 @@ from humangs_jax.rendering.gaussians import Gaussians
 
 
 def run(monkeypatch, capsys, *arguments):
-    """(exit code, stdout, stderr) of the command line, in this process."""
+    """Runs a command in this process; returns (exit code, stdout, stderr)."""
     monkeypatch.setattr(sys, "argv", ["humangs", *map(str, arguments)])
     try:
         cli.main()
@@ -24,7 +24,7 @@ def run(monkeypatch, capsys, *arguments):
 
 
 def save_tiny_avatar(path, joints=None):
-    """An avatar of SMPL-X's joints, on a line unless given, and three Gaussians."""
+    """Saves an avatar of three Gaussians with SMPL-X's joints, which by default lie on a line."""
     joints = np.cumsum(np.full((55, 3), 0.01), axis=0) if joints is None else joints
     gaussians = Gaussians(
         jnp.asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [0.2, 1.7, 0.0]]),

@@ -1,4 +1,4 @@
-"""The programs that a block of a test compiles."""
+"""Counts the programs that a block of a test compiles."""
 
 import contextlib
 
@@ -9,9 +9,9 @@ EVENT = "/jax/core/compile/backend_compile_duration"
 
 @contextlib.contextmanager
 def compiled_programs():
-    """Gives a list, in which the name of each program that is compiled in the block comes to be.
+    """Yields a list to which the name of each program that the block compiles is added.
 
-    Programs that an earlier test has compiled for such arguments are not among them.
+    A program that an earlier test has compiled for the same kind of arguments is not added.
     """
     names = []
 

@@ -55,18 +55,21 @@ settings.register_profile(
 settings.load_profile("humangs")
 
 MOST_MAPPINGS = 35_000
-"""Every compiled program maps memory, and Linux ends a process that has 65,530 mappings: XLA then
-aborts in mid-compilation.
+"""Memory mappings after which compiled programs are dropped.
+
+Each program maps memory. Linux allows a process 65,530 mappings; beyond them XLA aborts in
+mid-compilation.
 """
 MAPPINGS = Path("/proc/self/maps")
 
 CACHE_BYTES = 1 << 30
-"""Size to which the compile cache is cut before a run, oldest use first."""
+"""Size to which the compile cache is cut before a run; files unused for longest go first."""
 
 
 def cache_folder() -> Path:
-    """Compiled programs of this jaxlib on this kind of processor, which JAX's own keys leave
-    out.
+    """Returns the folder of compiled programs of this jaxlib on this kind of processor.
+
+    JAX's own keys name neither.
     """
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     cpu = Path("/proc/cpuinfo")
@@ -142,7 +145,7 @@ def pytest_configure(config):
 
 
 def pytest_ignore_collect(collection_path, config):
-    """With --core-alone: what is no test of the core's rooms, or imports a wing itself."""
+    """Leaves out files with --core-alone that test no room of the core, or import a wing."""
     if not config.getoption("--core-alone"):
         return None
     inside = collection_path.relative_to(Path(__file__).parent).parts
@@ -156,7 +159,7 @@ def pytest_ignore_collect(collection_path, config):
 def pytest_collection_modifyitems(config, items):
     """Keeps one slice of the tests, and with --core-alone those that need no wing.
 
-    A test's slice hangs on its name alone, so that N runs see all.
+    A test's slice depends on its name alone, so that N runs cover all tests.
     """
     if config.getoption("--core-alone"):
         dropped = [item for item in items if item.get_closest_marker("wings")]
@@ -182,7 +185,7 @@ def _plain_compiler():
 
 @pytest.fixture(autouse=True)
 def _nothing_ahead(monkeypatch):
-    """Tests call few of the programs that a command compiles ahead."""
+    """Compiles no programs ahead: tests call few of those of a command."""
     monkeypatch.setattr("humangs_jax.core.processes.Ahead.add", lambda self, calls: None)
 
 
@@ -195,9 +198,7 @@ def _forget_programs():
 
 @pytest.fixture(scope="session")
 def body():
-    """The body that comes with the package; modules that need another one have a fixture of this
-    name.
-    """
+    """Returns the shipped body; modules that need another one define a fixture of this name."""
     from humangs_jax.body.library import load_body
 
     return load_body()
@@ -205,7 +206,7 @@ def body():
 
 @pytest.fixture(scope="session")
 def demo():
-    """The shipped capture."""
+    """Returns the shipped capture."""
     from humangs_jax.data.capture import load_capture
 
     return load_capture("demo_capture")
@@ -213,15 +214,16 @@ def demo():
 
 @pytest.fixture
 def float64():
-    """JAX computes in 64 bits."""
+    """Makes JAX compute in 64 bits."""
     with jax.enable_x64(True):
         yield
 
 
 @pytest.fixture(scope="session")
 def capture_folder(demo, tmp_path_factory):
-    """A copy of the shipped capture: with its four photos, so that the demo's programs are compiled
-    once for both.
+    """Returns a copy of the shipped capture with its four photos.
+
+    As the sizes are the same, programs are compiled once for both.
     """
     from humangs_jax.data.capture import save_capture
 
@@ -232,7 +234,7 @@ def capture_folder(demo, tmp_path_factory):
 
 @pytest.fixture
 def humangs(monkeypatch, capsys):
-    """The command line in this process: humangs(words...) is (exit code, stdout, stderr)."""
+    """Returns a function of words that runs the command line: (exit code, stdout, stderr)."""
     from command_line import run
 
     return lambda *words: run(monkeypatch, capsys, *words)

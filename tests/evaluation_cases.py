@@ -1,4 +1,4 @@
-"""A tiny body and captures of it: what is compared matters, not who."""
+"""A tiny body and captures of it, for tests that compare images."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +9,7 @@ from humangs_jax.losses.perceptual import BACKBONES, Convolution, Lpips, channel
 
 
 def random_lpips(net) -> Lpips:
-    """Drawn by numpy: JAX would compile a program for each of the many shapes."""
+    """Returns random weights, drawn by numpy: JAX would compile a program for each shape."""
     rng = np.random.default_rng(0)
     weights = {}
     for layer in convolutions(BACKBONES[net]):
@@ -22,14 +22,14 @@ def random_lpips(net) -> Lpips:
 
 
 def ellipse(height, width, tall=0.35, wide=0.2, soft=True):
-    """A mask of a person, roughly, with a soft silhouette."""
+    """Returns an elliptic mask, by default with a soft silhouette."""
     y, x = np.mgrid[:height, :width] + 0.5
     distance = np.hypot((y / height - 0.5) / tall, (x / width - 0.5) / wide)
     return (np.clip((1 - distance) * 12, 0, 1) if soft else (distance < 1)).astype(np.float32)
 
 
 def capture_from(images, masks=None, frames=None, names=None) -> Capture:
-    """Photos on white from cameras that stand around the origin."""
+    """Returns a capture of these photos on white, with cameras around the origin."""
     count, height, width = images.shape[:3]
     angles = 2 * np.pi * np.arange(count) / count
     cam_from_world = np.tile(np.eye(4), (count, 1, 1))
@@ -55,8 +55,9 @@ def capture_from(images, masks=None, frames=None, names=None) -> Capture:
 
 
 def random_views(seed, count, height=96, width=80):
-    """(predicted, truth, masks): a person of blocks on white, and the same with noise and shifted
-    by a pixel.
+    """Returns (predicted, truth, masks) of a person of blocks on white.
+
+    The prediction has noise and is shifted by a pixel.
     """
     rng = np.random.default_rng(seed)
     mask = ellipse(height, width)

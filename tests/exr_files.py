@@ -1,4 +1,4 @@
-"""Reading the OpenEXR files that the package writes."""
+"""Reads the OpenEXR files that the package writes."""
 
 import numpy as np
 import OpenEXR
@@ -7,17 +7,17 @@ from humangs_jax.avatar.layers import RGBA, ExrView
 from humangs_jax.geometry.camera import Camera
 
 STANDARD_ATTRIBUTES = {"name", "type", "compression", "owner", "view", "comments"}
-"""Header strings that have a meaning in OpenEXR."""
+"""Strings of the header that OpenEXR defines."""
 
 
 def read_exr(path):
-    """The views of a file, one per part, as float32."""
+    """Returns the views of a file, one of each part, as float32."""
     with OpenEXR.File(str(path), separate_channels=True) as file:
         return [_view(part) for part in file.parts]
 
 
 def camera_of(view):
-    """The camera in the header."""
+    """Returns the camera of the header."""
     return Camera.from_opencv(view.K, view.cam_from_world, view.rgba.shape[1], view.rgba.shape[0])
 
 

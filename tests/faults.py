@@ -2,8 +2,8 @@
 
 python tests/faults.py [PART OF A MODULE'S NAME]
 
-A fault is a text of a module and what stands in its place while the module is imported; no file
-changes. Each is looked for by the tests beside its module's name.
+A fault replaces a text of a module by another text while the module is imported; no file changes.
+`TESTS` says which tests must find the faults of a module.
 """
 
 import importlib.abc
@@ -28,7 +28,7 @@ TESTS = {
     "body.kinematics": ["tests/body/test_kinematics.py"],
     "motion.clips": ["tests/motion/test_motion_skeletons.py"],
 }
-"""Where a fault of a module is looked for."""
+"""Arguments of pytest, by module: the tests that must find its faults."""
 FAULTS = [
     # what is there is lost, or half of it is written
     (ATOMIC, "aside.rename(folder)\n            raise", "raise"),
@@ -75,11 +75,11 @@ FAULTS = [
     ("body.kinematics", "above @ turns[..., joint, :, :]", "turns[..., joint, :, :] @ above"),
     ("motion.clips", "turns[:, joint], moves[:, joint] = turn, move", "turns[:, joint] = turn"),
 ]
-"""(module, text, what stands in its place)."""
+"""Faults: (module, text of the module, text that replaces it)."""
 
 
 class Faulty(importlib.abc.MetaPathFinder, importlib.machinery.SourceFileLoader):
-    """Finds one module, and loads it with a fault in it."""
+    """Imports one module with a fault in it."""
 
     def __init__(self, module, text, other):
         path = ROOT / "humangs_jax" / (module.replace(".", "/") + ".py")
@@ -89,11 +89,11 @@ class Faulty(importlib.abc.MetaPathFinder, importlib.machinery.SourceFileLoader)
         self.source = source.replace(text, other).encode()
 
     def find_spec(self, name, path=None, target=None):
-        """The module, if it is this one."""
+        """Returns the spec of the faulty module, and None for other names."""
         return importlib.util.spec_from_loader(name, self) if name == self.name else None
 
     def get_code(self, name):
-        """Its code, never from a cache."""
+        """Compiles the faulty source; a cached program would lack the fault."""
         return compile(self.source, self.path, "exec")
 
 
@@ -103,13 +103,13 @@ if "HUMANGS_FAULT" in os.environ:  # as a plugin of pytest
 
 
 def pytest_sessionstart():
-    """Puts the fault before the finder of jaxtyping, which came later."""
+    """Moves this finder before that of jaxtyping, which was added later."""
     sys.meta_path.remove(finder)
     sys.meta_path.insert(0, finder)
 
 
 def main():
-    """Runs the tests of each fault; 1 if one is not found."""
+    """Runs the tests for each fault; exits with 1 if one is not found."""
     wanted, missed = sys.argv[1] if len(sys.argv) > 1 else "", 0
     for number, (module, text, other) in enumerate(FAULTS):
         if wanted not in module:

@@ -1,4 +1,4 @@
-"""GLB files of a skinned skeleton in motion, written from poses of our skeleton."""
+"""Writes poses of our skeleton as GLB files of a skinned skeleton in motion."""
 
 import numpy as np
 from bvh_files import INDEX

@@ -1,4 +1,4 @@
-"""Pickles with arrays behind them, as joblib writes them, without joblib."""
+"""Writes pickles with arrays behind them as joblib does, without joblib."""
 
 import io
 import pickle
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Wrapped:
-    """joblib's place of an array."""
+    """joblib's placeholder of an array."""
 
     def __init__(self, array, padding):
         self.subclass, self.shape, self.order, self.dtype = (
@@ -23,7 +23,7 @@ class Wrapped:
 
 
 class JoblibPickler(pickle._Pickler):
-    """Arrays behind their places, as joblib puts them."""
+    """Writes arrays behind their placeholders, as joblib does."""
 
     padding = None
 

@@ -1,4 +1,4 @@
-"""Names of the joints of CMU's skeleton in the schemes of other programs."""
+"""Names of the joints of CMU's skeleton in other programs."""
 
 from bvh_files import CMU
 
@@ -6,8 +6,10 @@ CENTRE = "Hips Spine Chest UpperChest Neck Head"
 
 
 def renamed(limbs, form="{side}{limb}", **middle):
-    """Names of CMU's joints: of limbs by their part, whose sides are put into a form; others as
-    given.
+    """Returns the names of CMU's joints in another program.
+
+    `limbs` are the names of the limbs' joints, `form` says where a name has its side, and `middle`
+    gives the other names.
     """
     parts = dict(
         zip(

@@ -1,5 +1,6 @@
-"""Made-up motions of people on the floor and on their feet, y up, with contacts: what is on the
-floor stays where it is.
+"""Made-up motions of people on the floor and on their feet, y up.
+
+What touches the floor stays where it is.
 """
 
 import functools
@@ -19,7 +20,7 @@ UP = {
     "z": Rotation.from_euler("x", 90, degrees=True),
     "-y": Rotation.from_euler("x", 180, degrees=True),
 }
-"""From our world to one in which another axis is up."""
+"""Rotations from our world to one in which another axis is up."""
 
 
 def _poses(root, **joints):
@@ -30,9 +31,7 @@ def _poses(root, **joints):
 
 
 def _on_the_floor(rotations):
-    """Translations with which the lowest joint is at 0 and stays where it is while it is the
-    lowest.
-    """
+    """Returns translations with which the lowest joint is at height 0 and does not slide."""
     joints, moves = shipped_joints(), np.zeros((FRAMES, 3))
     places = joint_places(joints, rotations, moves)
     lowest = places[..., 1].argmin(axis=1)
@@ -100,7 +99,7 @@ def _upside_down(turns):
 
 @functools.cache
 def motions():
-    """Rotations (m, 55, 3) and translations (m, 3) by what the person does."""
+    """Returns (rotations (m, 55, 3), translations (m, 3)) by what the person does."""
     turning = np.linspace(0, 2 * np.pi, FRAMES)[:, None] * [0, 0, 1.0]
     made = {
         "walking": _walking(),
@@ -115,7 +114,7 @@ def motions():
 
 
 def in_world(rotations, translations, turn):
-    """The same in coordinates turned by a rotation."""
+    """Returns the motion in coordinates turned by a rotation."""
     rotations, pelvis = rotations.copy(), shipped_joints()[0]
     rotations[:, 0] = (turn * Rotation.from_rotvec(rotations[:, 0])).as_rotvec()
     return rotations, turn.apply(translations + pelvis) - pelvis

@@ -1,4 +1,4 @@
-"""Motions as estimators and data sets write them, of one person whose poses are known."""
+"""Writes a known motion of one person as estimators and data sets do."""
 
 import collections
 import json
@@ -19,12 +19,15 @@ from humangs_jax.motion.skeleton import shipped_joints
 
 FRAMES = 6
 SINGLE, MATRICES = 1e-5, 2e-5
-"""Radians and metres: float32; of matrices in float32."""
+"""Errors of radians and metres in float32, and of matrices in float32."""
 HEAD = JOINT_NAMES.index("head")
 
 
 def person(seed=0, frames=FRAMES):
-    """Somebody upright: rotations (m, 55, 3) and places of the pelvis less that at rest."""
+    """Returns (rotations (m, 55, 3), places (m, 3)) of an upright person.
+
+    Places are those of the pelvis, less its place at rest.
+    """
     rng = np.random.default_rng(seed)
     rotations = rng.normal(0, 0.1, (frames, 55, 3))
     return rotations, np.asarray([0, 0.9, 0]) + rng.normal(0, 0.3, (frames, 3))
@@ -44,7 +47,10 @@ def matrices(rotations):
 
 
 def down(rotations, places, up="-y"):
-    """The same in a world of which another axis points up: `turned_upright` the other way."""
+    """Returns the motion in a world in which another axis points up.
+
+    This is the inverse of `turned_upright`.
+    """
     back = Rotation.from_quat(np.roll(UPRIGHT[up], -1)).inv()
     turned = rotations.copy()
     turned[:, 0] = (back * Rotation.from_rotvec(rotations[:, 0])).as_rotvec()
@@ -131,9 +137,7 @@ def array(name, values):
 
 
 def mdm(frames=FRAMES):
-    """24 joints of SMPL by the first two rows of their matrices and the pelvis in space, the frames
-    last.
-    """
+    """Returns MDM's arrays: first two rows of 24 matrices and the pelvis in space, frames last."""
     turns = matrices(np.concatenate([ROTATIONS[:frames, :22], np.zeros((frames, 2, 3))], axis=1))
     thetas = turns[..., :2, :].reshape(frames, 24, 6).transpose(1, 2, 0).astype(np.float32)
     moves = (PLACES[:frames] + PELVIS).T
@@ -159,7 +163,7 @@ def motion_x(rotations=ROTATIONS, places=PLACES):
 
 
 def kimodo(joints=22):
-    """Local and global matrices, and where the pelvis is."""
+    """Returns Kimodo's local and global matrices and the place of the pelvis."""
     local = np.tile(np.eye(3), (FRAMES, joints, 1, 1))
     local[:, :22] = matrices(ROTATIONS[:, :22])
     named = {"local_rot_mats": local, "global_rot_mats": local, "root_positions": PLACES + PELVIS}
@@ -170,14 +174,14 @@ def kimodo(joints=22):
 
 
 def smpl(rotations=ROTATIONS, places=PLACES):
-    """SMPL's 24 joints, rotation matrices as 4D-Humans has them."""
+    """Returns rotation matrices of SMPL's 24 joints as 4D-Humans stores them."""
     hands = np.zeros((len(rotations), 2, 3))
     body = matrices(np.concatenate([rotations[:, 1:22], hands], axis=1))
     return {"global_orient": matrices(rotations[:, :1]), "body_pose": body, "transl": places}
 
 
 def wham(rotations=ROTATIONS, places=PLACES, **more):
-    """The world's pose, and the camera's, which is another."""
+    """Returns WHAM's poses in the world and in the camera, which differ."""
     pose = np.pad(rotations.reshape(len(rotations), 165)[:, :66], ((0, 0), (0, 6)))
     found = {
         "pose_world": pose,
@@ -213,7 +217,7 @@ def prompthmr():
 
 
 def phalp(track=3):
-    """Frames by image; lists of the tracks. Somebody else is there now and then."""
+    """Returns PHALP's frames by image, with lists of the tracks; another person is seen in some."""
     camera = smpl(*down(ROTATIONS, PLACES))
     other = smpl(OTHER, AWAY)
     frames = {}
@@ -244,7 +248,7 @@ def phalp(track=3):
 
 
 def easymocap(rotations=ROTATIONS, places=PLACES, root=None, number=0):
-    """x = R(Rh) x0 + Th about the origin."""
+    """Returns EasyMocap's frames, where x = R(Rh) x0 + Th turns about the origin."""
     turn = Rotation.from_rotvec(rotations[:, 0])
     poses = np.pad(rotations.reshape(len(rotations), -1)[:, 3:66], ((0, 0), (3, 6)))
     own = Rotation.from_rotvec(
@@ -267,7 +271,10 @@ def easymocap(rotations=ROTATIONS, places=PLACES, root=None, number=0):
 
 
 def human3r(people=((4, ROTATIONS, PLACES),)):
-    """A file a frame, in the camera's axes; what is placed is the head."""
+    """Returns a writer of one file for each frame, in the camera's axes.
+
+    The place is that of the head.
+    """
     files = []
     for i in range(FRAMES):
         turn, at = Rotation.from_rotvec([0, 0.1 * i, 0]), np.array([0.1 * i, 0, 0])
@@ -324,7 +331,7 @@ def smplerx(rotations=ROTATIONS, places=PLACES, number=0):
 
 
 def lhm():
-    """A file a frame, whose numbers are no words: 8, 9, 10."""
+    """Returns a writer of one file for each frame, whose names are numbers: 8, 9, 10."""
     names = (
         "root_pose",
         "body_pose",
@@ -509,13 +516,14 @@ FILES = {
         {"person": 1, "frames": 4},
     ),
 }
-"""What writes a file, the joints that it has, and options; places: whether positions are in it;
-frames: of it.
+"""Formats: a writer, the joints that it has, and options.
+
+Of the options, `places` says whether the file has positions, and `frames` how many frames.
 """
 
 
 def mhr(rots=True, frames=FRAMES):
-    """SAM 3D Body's joints of the shipped body, with bones that are turned at rest."""
+    """Returns SAM 3D Body's joints of the shipped body, whose bones are turned at rest."""
     places = joint_places(shipped_joints(), ROTATIONS, PLACES) * [1, -1, -1]
     world = Rotation.from_rotvec(ROTATIONS.reshape(-1, 3)).as_matrix().reshape(FRAMES, 55, 3, 3)
     points, turns = (

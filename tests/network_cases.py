@@ -14,7 +14,7 @@ ALL_TOKENS = TINY.with_runtime(tokens="all")
 
 
 def random_inputs(seed=0, views=2, vertices=20, size=32):
-    """Photos of noise around a cloud of vertices that every view sees."""
+    """Returns photos of noise around vertices that every view sees."""
     rng = np.random.default_rng(seed)
     uniform = lambda low, high, *shape: jnp.asarray(rng.uniform(low, high, shape), jnp.float32)
     K = intrinsics_from_fov(0.8, size, size)
@@ -38,7 +38,10 @@ def random_inputs(seed=0, views=2, vertices=20, size=32):
 
 
 def random_like(shapes, seed=0):
-    """Variables in which every number matters: fresh ones begin with zeros and tiny last layers."""
+    """Returns variables in which every number matters.
+
+    Fresh ones have zeros and tiny last layers.
+    """
     rng = np.random.default_rng(seed)
 
     def draw(path, leaf):
@@ -54,5 +57,5 @@ def random_like(shapes, seed=0):
 
 
 def random_variables(config, seed=0):
-    """Those of a configuration (initialising would cost a compilation)."""
+    """Returns random variables of a configuration, without the compilation of an initialisation."""
     return random_like(expected_variables(config), seed)

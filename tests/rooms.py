@@ -13,11 +13,11 @@ NEEDS_WINGS = re.compile(
     rf"humangs_jax\.({'|'.join((*WINGS, 'apps', 'cli'))})\b"
     r"|from experiments|command_line|motion_cases"
 )
-"""What the text of a test has that looks at the core and a wing, or a command, together."""
+"""Matches text of a test that looks at a wing or a command, so that it needs the wings."""
 
 
 class HiddenWings:
-    """Refuses to import a wing."""
+    """An import hook that refuses to import a wing."""
 
     def find_spec(self, name, path=None, target=None):
         package, _, inside = name.partition(".")

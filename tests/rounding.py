@@ -1,15 +1,14 @@
-"""How far float32 results may be apart: bounds from error analysis, and one switch that tightens
-them all.
+"""How far float32 results may be apart: bounds of an error analysis, with one switch for all.
 
-The rule for a sum (Higham, Accuracy and Stability of Numerical Algorithms, section 4.2): computed
-in any order, with any width of vectors and with or without fused multiplications, a sum of n terms
-is off by at most n u sum |term|, u = 2^-24; if every term has been rounded r times on its way, by
-at most (n + r) u sum |term|. So the bound is relative to the sum of the magnitudes of the terms,
-which cancellation does not make smaller, and not to the result.
+The rule for a sum (Higham, Accuracy and Stability of Numerical Algorithms, section 4.2): a sum of n
+terms, computed in any order, with any width of vectors and with or without fused multiplications,
+is off by at most n u sum |term|, u = 2^-24. If every term has been rounded r times before, it is
+off by at most (n + r) u sum |term|. The bound is therefore relative to the sum of the magnitudes of
+the terms, which cancellation does not make smaller, and not to the result.
 
-`HUMANGS_TOLERANCE_SCALE=0.33` multiplies every bound made here, and (see conftest.py) every rtol
-and atol with which numpy compares float32 arrays: a run with it finds the tests whose error is
-close to their bound.
+`HUMANGS_TOLERANCE_SCALE=0.33` multiplies every bound made here, and every rtol and atol with which
+numpy compares float32 arrays (see conftest.py). A run with it finds the tests whose error is close
+to their bound.
 """
 
 import os
@@ -22,19 +21,18 @@ UNIT = 2.0**-24
 """Largest relative error of one float32 operation."""
 
 LARGEST_ROUNDING = 1e-3
-"""A larger rtol or atol is not about rounding (millimetres of a body, say): the switch leaves it
-alone.
-"""
+"""Largest rtol or atol that the switch changes: larger ones are not about rounding."""
 
 
 def bound(value: float) -> float:
-    """A float32 tolerance, under the switch."""
+    """Returns a float32 tolerance, multiplied by the switch."""
     return SCALE * value
 
 
 def scaled_comparison(compare):
-    """`np.testing.assert_allclose`, `np.allclose` or `np.isclose` with the switch applied where an
-    array is float32.
+    """Returns a comparison of numpy's with the switch applied where an array is float32.
+
+    It is made for `np.testing.assert_allclose`, `np.allclose` and `np.isclose`.
     """
     defaults = (
         {"rtol": 1e-7, "atol": 0.0}

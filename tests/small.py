@@ -16,7 +16,9 @@ def f32(x):
 
 
 def random_gaussians(seed=0, g=20, harmonics=0):
-    """Some centimetres large, a metre apart. harmonics: functions beside the constant one."""
+    """Returns Gaussians of some centimetres, a metre apart; `harmonics` is their number of
+    functions.
+    """
     rng = np.random.default_rng(seed)
     means, quats, scales = (
         rng.normal(size=(g, 3)),
@@ -38,7 +40,7 @@ def random_gaussians(seed=0, g=20, harmonics=0):
 
 
 def small_body(n=6, j=3, s=2, seed=0):
-    """A chain of joints, which move all vertices alike."""
+    """Returns a body of a chain of joints, which move all vertices alike."""
     rng = np.random.default_rng(seed)
     regressor = rng.random((j, n))
     return BodyModel(
@@ -56,7 +58,7 @@ def small_body(n=6, j=3, s=2, seed=0):
 
 
 def small_avatar(seed=0, per_vertex=4, weights=None, betas=(0.3, -1.2)):
-    """Of the small body; weights of skinning are random unless given."""
+    """Returns an avatar of the small body, by default with random skinning weights."""
     body, rng = small_body(seed=seed), np.random.default_rng(seed)
     rest, g = shape_body(body, f32(betas)), per_vertex * len(body.template)
     weights = rng.random((g, len(body.parents))) if weights is None else weights
@@ -74,7 +76,7 @@ def small_avatar(seed=0, per_vertex=4, weights=None, betas=(0.3, -1.2)):
 
 @functools.cache
 def tetrahedron(shape_names=()):
-    """A closed body of five joints and three shape directions."""
+    """Returns a closed body of four vertices, five joints and three shape directions."""
     return BodyModel(
         template=f32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
         shape_directions=jnp.ones((4, 3, 3)),

@@ -1,4 +1,4 @@
-"""`.sog` bundles, written from the published layout."""
+"""Writes `.sog` bundles from the published layout."""
 
 import io
 import json
@@ -12,7 +12,7 @@ LARGEST = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))
 
 
 def pixels(rows, width=7):
-    """(g, c) bytes as a picture of that width."""
+    """Returns bytes (g, c) as a picture of that width."""
     height = -(-len(rows) // width)
     padded = np.zeros((height * width, rows.shape[1]), np.uint8)
     padded[: len(rows)] = rows
@@ -31,7 +31,7 @@ def nearest(values, codebook):
 
 
 def sog_parts(gaussians, kind="WEBP"):
-    """meta.json as a dict, and the pictures by name."""
+    """Returns (content of meta.json, pictures by name)."""
     g = gaussians
     logs = np.sign(g.means) * np.log1p(np.abs(np.asarray(g.means, np.float64)))
     low, high = logs.min(axis=0), logs.max(axis=0)
@@ -92,7 +92,7 @@ def sog_parts(gaussians, kind="WEBP"):
 
 
 def write_sog(path, gaussians, kind="WEBP", change=None, folder=""):
-    """change: of (meta, pictures), in place."""
+    """Writes a bundle; `change` alters meta and pictures in place before."""
     meta, pictures = sog_parts(gaussians, kind)
     if change is not None:
         change(meta, pictures)

@@ -1,4 +1,4 @@
-"""The systems of `experiments.systems` in sizes for tests: every stage, as small as can be."""
+"""The systems of `experiments.systems` at the smallest sizes, with every stage."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ SMALL = {
     "widths": (4, 8),
     "surface_map": SurfaceMap("atlas", 8),
 }
-"""Values of the fields of parts, where a part has such a field."""
+"""Values that fields of parts get, where a part has the field."""
 
 
 def small_system(name: str) -> HumanGSConfig:

@@ -1,4 +1,4 @@
-"""The systems that run again for every target, in sizes for tests, and views of a tube."""
+"""The systems that run again for every target, at small sizes, and views of a tube."""
 
 import dataclasses
 import functools
@@ -55,9 +55,9 @@ def small(name: str) -> HumanGSConfig:
 
 
 def mapped_tube(config: HumanGSConfig):
-    """The tube, with some map of its surface; half of the texels show nothing.
+    """Returns the tube with a random map of its surface; half of the texels show nothing.
 
-    A real one takes seconds to compile.
+    A real map takes seconds to compile.
     """
     body, wanted = tube(), config.architecture.surface_map
     if wanted is None:
@@ -73,7 +73,7 @@ def mapped_tube(config: HumanGSConfig):
 
 
 def views(seed: int = 0, count: int = 2, size: int = SIZE) -> SubjectViews:
-    """Photos of noise of the tube in `POSES` poses, all around it."""
+    """Returns photos of noise of the tube in `POSES` poses, from all around."""
     rng = np.random.default_rng(seed)
     draw = lambda *shape: jnp.asarray(rng.random(shape), jnp.float32)
     rotations = 0.6 * (draw(POSES, 2, 3) - 0.5)

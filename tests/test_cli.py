@@ -50,9 +50,7 @@ def test_every_command_explains_itself(command, humangs):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_help_of_a_switch_that_is_on_says_what_typing_it_does(command, humangs):
-    """`--no-x` is what can be typed: its line says what it does, and the field itself what the
-    switch does.
-    """
+    """A user can type `--no-x`: its help says what that does; the field's, what the switch does."""
     _, out, _ = humangs(command, "--help")
     shown = " ".join(re.sub("[\u2500-\u257f]", " ", out).split())
     source = inspect.getsource(cli._command(command))
@@ -88,9 +86,7 @@ def test_the_options_of_each_way_to_fit_exist():
 
 @pytest.mark.parametrize(("done", "code"), [(3, cli.INTERRUPTED), (5, 0)])
 def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, monkeypatch, capsys):
-    """Ctrl-C: `train` saves and raises, and the exit code tells that it was interrupted, unless all
-    steps were done.
-    """
+    """After Ctrl-C `train` saves and raises; the exit code shows it, unless all steps were done."""
     from humangs_jax.training import loop, sources
 
     def interrupted(*arguments, **options):
@@ -181,7 +177,7 @@ def sample(monkeypatch):
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
 @pytest.mark.parametrize("name", ["für mich", "it's \\ 1", "a\nb", "\udce9t\udce9", "plain"])
 def test_a_path_of_the_next_command_can_be_pasted(name, encoding, monkeypatch):
-    """Whatever the terminal shows: bash gets the bytes of the name."""
+    """bash gets the bytes of the name, whatever the terminal shows."""
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
     text = screen.quoted(Path(name))
     assert text.isprintable() and text.encode(encoding)
@@ -238,7 +234,7 @@ def test_quiet_and_verbose(sample, capsys):
     ("fails", "code"), [("usage", 2), ("data", 1), ("option", 2), ("keys", 130)]
 )
 def test_exit_codes(sample, capsys, fails, code):
-    """An argument of the library that is wrong is an option here."""
+    """A wrong argument of the library is a wrong option of the command."""
     assert cli.execute(["sample", "--fails", fails]) == code
     out, err = capsys.readouterr()
     last = err.splitlines()[-1]
@@ -292,7 +288,7 @@ def test_bars_are_hidden_by_quiet(capsys):
 
 
 def test_a_reader_that_has_gone_ends_a_command_quietly():
-    """As `humangs check X | head -0`: through a real pipe, whose other end is closed at once."""
+    """As in `humangs check X | head -0`, the other end of a real pipe is closed at once."""
     program = subprocess.Popen(
         [sys.executable, "-m", "humangs_jax.cli", "--version"],
         stdout=subprocess.PIPE,
@@ -306,8 +302,8 @@ def test_a_reader_that_has_gone_ends_a_command_quietly():
 
 @pytest.mark.parametrize("verbose", [False, True])
 def test_what_libraries_say_stays_off_the_screen(verbose):
-    """Orbax's warnings go through absl's logger; errors in TensorStore's threads have nobody to
-    report to. Ours are shown.
+    """Orbax warns through absl's logger, and errors in TensorStore's threads have no receiver. Our
+    warnings are shown.
     """
     code = (
         "from humangs_jax.cli.screen import silence; import logging, threading, warnings;"

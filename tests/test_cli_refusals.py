@@ -1,5 +1,6 @@
-"""Command lines that are refused: one line that names file and key, or the option, the exit code,
-and nothing is written.
+"""Refused command lines: one line that names file and key or the option, and the exit code.
+
+Nothing is written.
 """
 
 import dataclasses
@@ -27,7 +28,7 @@ from humangs_jax.motion import save_motion
 
 @pytest.fixture(scope="module")
 def things(tmp_path_factory, capture_folder):
-    """A folder of files that are not what they are taken for, and of a few that are."""
+    """Returns a folder of files that are not what they are taken for, and of a few sound ones."""
     path = tmp_path_factory.mktemp("things")
     shutil.copytree(capture_folder, path / "someone")
     save_capture(path / "bare", dataclasses.replace(load_capture(capture_folder), masks=None))
@@ -290,7 +291,7 @@ def test_the_folder_of_results_is_made(line, things, tmp_path, monkeypatch, huma
 
 
 def places(command):
-    """The options of a command that say where a file goes, with a suffix that it may have."""
+    """Returns a command's options that name output files, with a suffix that each may have."""
     hints = get_type_hints(command, include_extras=True)
     found = {name: marks_in(hint, options.OutputPath) for name, hint in hints.items()}
     return {
@@ -309,7 +310,7 @@ def test_places_in_folders_that_do_not_exist_are_accepted_by_every_command(name,
 
 
 def test_a_capture_that_looks_wrong_is_warned_about(capture_folder, tmp_path, monkeypatch, humangs):
-    """The quick part of `check`; here the command ends after it."""
+    """The quick part of `check` warns; the command ends after it."""
     monkeypatch.setattr(
         many,
         "reconstruct_batch",

@@ -16,7 +16,7 @@ PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
 
 def module_of(file, name):
-    """A file as a module."""
+    """Imports a file as a module."""
     spec = importlib.util.spec_from_file_location(name, file)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -25,7 +25,7 @@ def module_of(file, name):
 
 @pytest.fixture
 def changed(tmp_path):
-    """A folder with the change applied to the losses and their tests."""
+    """Returns a folder with the losses and their tests after the page's change."""
     (change,) = re.findall(r"^```diff\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
     for folder in ("humangs_jax/losses", "tests/losses"):
         shutil.copytree(ROOT / folder, tmp_path / folder)

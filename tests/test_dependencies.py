@@ -1,5 +1,6 @@
-"""pyproject.toml declares what the package and its tests import, and no dependency that the package
-does not import.
+"""pyproject.toml declares all that the package and its tests import.
+
+It declares no dependency that the package does not import.
 """
 
 import re
@@ -25,11 +26,11 @@ NAMES |= dict.fromkeys(
 )  # Python 3.14 has it as compression.zstd
 """Distributions that are not called like their module."""
 UNTESTED = {"torch", "bpy"}
-"""Imported by scripts that made stored references, and by those that Blender runs."""
+"""Distributions of scripts that made stored references, and of those that Blender runs."""
 
 
 def imported(folder):
-    """Distributions of all modules that the files of a folder import, also inside of functions."""
+    """Returns the distributions of modules that a folder's files import, also in functions."""
     found = set()
     for file in folder.rglob("*.py"):
         found |= {first or second for first, second in IMPORT.findall(file.read_text())}

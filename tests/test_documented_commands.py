@@ -1,5 +1,6 @@
-"""Every `humangs` and `python` line of README, docs and notebooks is one that the real parser
-takes; some are run.
+"""The real parser accepts every `humangs` and `python` line of README, docs and notebooks.
+
+Some lines are run.
 """
 
 import contextlib
@@ -40,8 +41,10 @@ PROGRAM = re.compile(r"(?:.*/)?(humangs|python)3?")
 
 
 class Command(NamedTuple):
-    """words: placeholders as they stand. whole: of a block, or the beginning of an item of a list;
-    others may lack arguments.
+    """A command on a page: its words with placeholders.
+
+    `whole` is true in a block and at the beginning of a list item; other commands may lack
+    arguments.
     """
 
     page: str
@@ -53,7 +56,7 @@ class Command(NamedTuple):
 
 
 def text_of(path):
-    """A page; of a notebook its text, and its lines for the shell as a block."""
+    """Returns the text of a page; a notebook's lines for the shell are added as a block."""
     if path.suffix != ".ipynb":
         return path.read_text()
     cells = json.loads(path.read_text())["cells"]
@@ -64,7 +67,7 @@ def text_of(path):
 
 
 def commands_of(path):
-    """The commands in the shell blocks and in the code spans of a page."""
+    """Yields the commands in the shell blocks and in the code spans of a page."""
     text = text_of(path)
     blocks = [block for kind, block in BLOCK.findall(text) if kind in ("", "sh", "bash")]
     lines = [(line, True) for block in blocks for line in re.sub(r"\\\n", " ", block).splitlines()]
@@ -79,8 +82,10 @@ def commands_of(path):
 
 
 def filled(words):
-    """Optional parts as if they were given, the first of several values, and 1 for what is in
-    capitals or is a variable.
+    """Returns the words with values for placeholders.
+
+    Optional parts are given, of several values the first is taken, and 1 stands for variables and
+    words in capitals.
     """
     words = [word.strip("[]").split("|")[0] for word in words if word not in ("...", "…")]
     return [re.sub(r"\$\{?\w+\}?|(?<![\w.])[A-Z][A-Z_]*(?![\w.])", "1", word) for word in words]
@@ -107,12 +112,14 @@ SLOW = (
     "animate avatar.npz",
     "evaluate me --avatar avatar.npz --protocol lhm",
 )
-"""And on the demo's photos, in this order: the first ones make what the others read."""
+"""Commands that are run on the demo's photos, in this order: early ones make inputs of later ones.
+"""
 
 
 def refused(command):
-    """None, or why a line of a page cannot be typed: what the parser says; of a span, a name or an
-    option that does not exist.
+    """Returns why a line of a page cannot be typed, or None.
+
+    For a whole line the parser tells; for a span, a name or an option that does not exist.
     """
     name, *words = filled(command.words[1:])
     if not command.whole:
@@ -191,7 +198,7 @@ def test_a_wrong_line_is_noticed(words):
 
 @pytest.fixture
 def workspace(tmp_path, monkeypatch):
-    """The files that the commands above name: a capture, an avatar, two motions."""
+    """Returns the working folder with the files that commands name: capture, avatar, motions."""
     rest = np.asarray(shape_body(load_body(), jnp.zeros(0)).joints)
     save_tiny_avatar(tmp_path / "avatar.npz", rest)
     (tmp_path / "dance.bvh").write_text(write_bvh(rest, np.zeros((201, len(rest), 3)), CMU))
@@ -201,7 +208,7 @@ def workspace(tmp_path, monkeypatch):
 
 
 def run_all(lines, humangs):
-    """The exit codes; every line must stand on a page."""
+    """Runs lines and checks that they succeed; every line must stand on a page."""
     shown = {" ".join(command.words[1:]) for command in OURS if command.whole}
     assert [line for line in lines if line not in shown] == []
     for line in lines:

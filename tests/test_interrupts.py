@@ -1,6 +1,7 @@
-"""Ctrl-C: exit code 130, one line, and nothing half-written, whatever the process is doing.
+"""Ctrl-C gives exit code 130, one line, and nothing half-written, whatever the process does.
 
-What is written meanwhile: tests/io/test_atomic.py. `train` has its own handler (tests/training).
+tests/io/test_atomic.py tests files that are being written. `train` has another handler
+(tests/training).
 """
 
 import os
@@ -24,12 +25,12 @@ START = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
     " signal.signal(signal.SIGHUP, signal.SIG_DFL); from humangs_jax import cli; "
 )
-"""Shells start what runs in the background without the usual handlers."""
+"""Sets the usual handlers: shells start background processes without them."""
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])}
 
 
 def process(code, folder=None, environment=None, arguments=()):
-    """A Python process whose output is read."""
+    """Starts a Python process whose output can be read."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     environment = ENVIRONMENT if environment is None else environment
     return subprocess.Popen(
@@ -38,7 +39,7 @@ def process(code, folder=None, environment=None, arguments=()):
 
 
 def command(work, more=""):
-    """Code of a command line whose command does this work."""
+    """Returns the code of a command line whose command does this work."""
     run = f"class Own:\n    def run(self):\n{textwrap.indent(textwrap.dedent(work), ' ' * 8)}\n"
     return (
         f"{START}\n{textwrap.dedent(more)}\n{run}cli._parsed = lambda arguments: Own()\ncli.main()"
@@ -46,7 +47,7 @@ def command(work, more=""):
 
 
 def interrupted(program, number=signal.SIGINT):
-    """stdout and stderr of a process that is interrupted when it has begun."""
+    """Interrupts a process after it has begun; returns (stdout, stderr)."""
     assert program.stdout.readline() == "begun\n"
     time.sleep(0.5)  # now it is in there
     program.send_signal(number)
@@ -55,9 +56,8 @@ def interrupted(program, number=signal.SIGINT):
 
 @pytest.mark.slow
 def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
-    """As in a compilation: a long call into C, which gives Python no turn.
-
-    What it was writing goes, too.
+    """A compilation is a long call into C, during which Python does not act. What it was writing is
+    removed.
     """
     writing = """
         import hashlib
@@ -82,7 +82,7 @@ def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_what_is_asked_to_end_tidies_up(name, tmp_path):
-    """As by `timeout`, or with its terminal: the lock of a place goes, too."""
+    """`timeout` or a closed terminal ends it; the lock of a place is removed, too."""
     work = """
         import time
         from humangs_jax.io import atomic
@@ -136,7 +136,7 @@ def test_an_interrupt_that_python_drops_is_repeated():
 
 @pytest.mark.parametrize("code", [0, 2])
 def test_an_interrupt_after_the_work_is_done_changes_nothing(code):
-    """While Python ends."""
+    """The interrupt comes while Python ends."""
     late = """
         import os, sys
         class Late:
@@ -152,7 +152,7 @@ def test_an_interrupt_after_the_work_is_done_changes_nothing(code):
 
 
 def test_an_interrupt_during_an_import_waits_for_it(tmp_path):
-    """Extensions that are interrupted while they begin crash or raise ImportError."""
+    """Extensions that are interrupted in their initialisation crash or raise ImportError."""
     (tmp_path / "slow_to_import.py").write_text(
         "import signal, time; signal.raise_signal(signal.SIGINT)\ntry:\n    time.sleep(0.2)\nexcept"
         " BaseException as error:\n    raise ImportError('half-imported') from"
@@ -190,12 +190,12 @@ WORKS = {
         "1",
     ),
 }
-"""By what they write: those that compute for long."""
+"""Commands that compute for long, by the file that they write."""
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder with an input for every command."""
+    """Returns a folder with an input for every command."""
     folder = tmp_path_factory.mktemp("place")
     save_capture(folder / "me", load_capture("demo_capture"))
     assert cli.execute(["reconstruct", str(folder / "me"), "--out", str(folder / "me.npz")]) == 0
@@ -206,7 +206,7 @@ def place(tmp_path_factory):
 @pytest.mark.parametrize("out", WORKS)
 @pytest.mark.parametrize("seconds", [2.3, 7.5, 12.8])
 def test_a_process_that_is_interrupted_exits_with_130(out, seconds, place, tmp_path):
-    """As in a shell: the whole process, with XLA's threads, which crashed at its end."""
+    """The whole process is interrupted, with XLA's threads, which once crashed at its end."""
     program = process(
         START + "cli.main()", place, arguments=(*WORKS[out], "--out", str(tmp_path / out))
     )

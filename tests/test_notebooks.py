@@ -1,6 +1,6 @@
-"""The committed notebooks say what they show, and run.
+"""The committed notebooks run, and their text agrees with their outputs.
 
-What a notebook keeps to, so that these tests can look:
+Notebooks follow rules that these tests can check:
 
 - A number in digits in the prose stands in an output of the notebook or in its code. With a unit it
   is a result: it stands with that unit in an output. "Some", "about" allow zeros at its end.
@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 TIMEOUT_SECONDS = 1800
 MOST_BYTES = 1_500_000
-"""Of a notebook: no page of the viewer is in it."""
+"""Largest size of a notebook: a page of the viewer in it would be larger."""
 
 UNITS = ("dB", "%", "MiB", "MB", "ms", "s", "mm", "m", "times")
 NUMBER = r"\d{1,3}(?:,\d{3})+|\d+(?:\.\d+)?(?:e[+-]?\d+)?"
@@ -40,44 +40,45 @@ DURATIONS = {
     "About a minute on a CPU with two cores.": (20, 140),
     "A few minutes on a CPU with two cores.": (60, 600),
 }
-"""Seconds of CPU time, between which the committed run lies: two cores take between one and half of
-them.
+"""Bounds in seconds of CPU time of the committed run, by the duration that the notebook states.
+
+Two cores take between half of them and all.
 """
 
 
 def cells(notebook, kind):
-    """Sources of the cells of one kind."""
+    """Returns the sources of the cells of one kind."""
     return ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == kind]
 
 
 def outputs(notebook):
-    """All outputs, in order."""
+    """Returns all outputs in order."""
     return [
         out for cell in notebook["cells"] if cell["cell_type"] == "code" for out in cell["outputs"]
     ]
 
 
 def printed(notebook):
-    """The text of all outputs."""
+    """Returns the text of all outputs."""
     return "\n".join(
         "".join(out["text"]) for out in outputs(notebook) if out["output_type"] == "stream"
     )
 
 
 def images(notebook):
-    """The number of figures."""
+    """Returns the number of figures."""
     kinds = {"image/jpeg", "image/png"}
     return sum(bool(kinds & out.get("data", {}).keys()) for out in outputs(notebook))
 
 
 def prose(notebook):
-    """The text without code and the targets of links."""
+    """Returns the text without code and the targets of links."""
     text = "\n\n".join(cells(notebook, "markdown"))
     return re.sub(r"`[^`]*`|\]\([^)]*\)", " ", text)
 
 
 def rounds_to(value, stated, zeros):
-    """Whether a number is the stated one, given its decimals, or zeros at its end."""
+    """Returns whether a number rounds to the stated one, by its decimals or by zeros at its end."""
     plain = stated.replace(",", "")
     decimals = len(plain.partition(".")[2])
     if zeros and "." not in plain:
@@ -86,7 +87,7 @@ def rounds_to(value, stated, zeros):
 
 
 def unfounded(notebook):
-    """What the prose states that neither outputs nor code have."""
+    """Returns what the prose states and neither outputs nor code have."""
     text, shown, code = prose(notebook), printed(notebook), "\n".join(cells(notebook, "code"))
     numbers = lambda where, unit="": [
         float(found.replace(",", ""))
@@ -107,7 +108,7 @@ def unfounded(notebook):
 
 @pytest.fixture(params=NOTEBOOKS, ids=lambda path: path.stem)
 def notebook(request):
-    """The content of a committed notebook."""
+    """Returns the content of a committed notebook."""
     return json.loads(request.param.read_text())
 
 

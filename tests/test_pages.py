@@ -1,4 +1,4 @@
-"""Links of pages and notebooks lead to files and headings; pages use the field's words."""
+"""Links of pages and notebooks lead to files and headings; pages use the words of the field."""
 
 import json
 import re
@@ -18,15 +18,13 @@ GENERATED = ("docs/benchmarks/", "docs/knobs.md", "docs/api/")
 
 
 def written(text: str) -> str:
-    """A page without what scripts write into it, and without code."""
+    """Returns a page without code and without what scripts write into it."""
     text = re.sub(r"<!-- (table|formats): .*?<!-- end -->", "", text, flags=re.DOTALL)
     return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
 
 
 def broken_links(root: Path, name: str) -> list[str]:
-    """Links of a page or notebook to files and headings that are not there; addresses are not
-    looked up.
-    """
+    """Returns a page's or notebook's links to missing files and headings; it opens no address."""
     text = (root / name).read_text()
     if name.endswith(".ipynb"):
         text = "\n\n".join(
@@ -51,7 +49,7 @@ def broken_links(root: Path, name: str) -> list[str]:
 
 
 def headings(text: str) -> set[str]:
-    """The names by which headings of a page are linked."""
+    """Returns the names by which headings of a page are linked."""
     titles = re.findall(
         r"^#+ (.*)$", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE), re.MULTILINE
     )
@@ -97,7 +95,7 @@ def test_pages_use_the_words_of_the_field():
 
 
 DOCS_WORDS = 16_400
-"""Of all pages that are written by hand, without code and what scripts write: read in an hour."""
+"""Most words of all pages without code and generated parts: they are read in an hour."""
 
 
 def test_the_pages_by_hand_are_short():

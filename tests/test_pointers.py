@@ -1,4 +1,4 @@
-"""What docstrings and comments point at exists: `module.name`, `Class.field`, names of files."""
+"""What docstrings and comments refer to exists: `module.name`, `Class.field`, names of files."""
 
 import ast
 import functools
@@ -37,13 +37,13 @@ SUFFIXES = {
     "py",
 }
 VARIABLES = {"self", "cls", "hg", "state", "x", "model", "views", "lin0"}
-"""Words that stand for objects of any class, parts of configurations and of files."""
+"""Words that stand for objects of any class, parts of configurations, or parts of files."""
 FILES_OF_OTHERS = {"three.js", "compute_metrics.py", "simple_trainer.py"}
 FILE = re.compile(r"(?<![\w*{}/.-])([\w/]+\.(?:py|js|frag))\b")
 
 
 def comments(path: Path) -> list[str]:
-    """Docstrings and comments of a file."""
+    """Returns the docstrings and comments of a file."""
     text = path.read_text()
     if path.suffix not in (".py", ".pyi"):
         return re.findall(r"//.*|/\*.*?\*/", text, re.DOTALL)
@@ -58,7 +58,7 @@ def comments(path: Path) -> list[str]:
 
 
 def pointers(path: Path) -> list[str]:
-    """Dotted names between single backticks."""
+    """Returns dotted names between single backticks."""
     quoted = [
         each for text in comments(path) for each in re.findall(r"(?<!`)`([^`\n]+)`(?!`)", text)
     ]
@@ -67,9 +67,7 @@ def pointers(path: Path) -> list[str]:
 
 @functools.cache
 def namespaces() -> tuple[dict[str, set[str]], dict[str, set[str]]]:
-    """Names in each module or package, by the last parts of its path; attributes of each class, by
-    its name.
-    """
+    """Returns the names in each module, by the last parts of its path, and attributes by class."""
     modules: dict[str, set[str]] = {}
     classes: dict[str, set[str]] = {}
     bases: dict[str, set[str]] = {}
@@ -96,7 +94,7 @@ def namespaces() -> tuple[dict[str, set[str]], dict[str, set[str]]]:
 
 
 def defined(body: list[ast.stmt]) -> list[str]:
-    """Names that statements define."""
+    """Returns the names that statements define."""
     found: list[str] = []
     for node in body:
         match node:
@@ -131,7 +129,7 @@ def set_on_self(node: ast.ClassDef) -> list[str]:
 
 @functools.cache
 def of_others() -> set[str]:
-    """Names that modules import from elsewhere."""
+    """Returns the names that modules import from elsewhere."""
     found = set(sys.stdlib_module_names)
     for path in ROOT.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -145,10 +143,9 @@ def of_others() -> set[str]:
 
 
 def points_nowhere(name: str) -> bool:
-    """Whether a dotted name begins with a module or class of ours and goes on with what that does
-    not have.
+    """Returns whether a dotted name begins with a module or class of ours that lacks the rest.
 
-    Or with a module that is gone, and goes on with what another one has.
+    A module that no longer exists counts as lacking it, even if another one has the rest.
     """
     modules, classes = namespaces()
     first, *rest = name.split(".")

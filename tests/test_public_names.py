@@ -1,4 +1,4 @@
-"""The names of `import humangs_jax as hg`: all there, and none imported before it is used."""
+"""All names of `import humangs_jax as hg` exist, and none is imported before it is used."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""What a release consists of agrees: version, addresses, dependencies, tools, and what CI runs."""
+"""The parts of a release agree: version, addresses, dependencies, tools, and what CI runs."""
 
 import ast
 import dataclasses
@@ -21,7 +21,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 @pytest.fixture
 def addresses():
-    """The script that carries version and addresses to other files."""
+    """Returns the script that writes version and addresses to other files."""
     spec = importlib.util.spec_from_file_location("addresses", ROOT / ".ci" / "addresses.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -63,7 +63,9 @@ def test_a_maintainer_fills_in_one_place(addresses, tmp_path, monkeypatch):
 
 
 def requirements(lines):
-    """Lower-case name -> version, of lines like "jax >=0.11.2" and "Pillow>=11.0; marker"."""
+    """Returns {lower-case name: version} of lines such as "jax >=0.11.2" and "Pillow>=11.0;
+    marker".
+    """
     split = [re.match(r"([\w.-]+)\s*([^;]*)", line) for line in lines]
     return {each[1].lower(): each[2].replace(" ", "") for each in split}
 
@@ -103,7 +105,7 @@ def test_workflows_run_scripts_that_are_there():
 
 
 def test_notebook_and_page_of_others_machines_use_what_is_there():
-    """Neither is part of the package, and both want a released one."""
+    """Neither is part of the package, and both need a released one."""
     cells = json.loads((ROOT / "colab" / "humangs_jax.ipynb").read_text())["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     assert not any(cell.get("outputs") for cell in cells)

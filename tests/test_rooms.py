@@ -1,4 +1,4 @@
-"""The core stands without its wings."""
+"""The core can be imported without its wings."""
 
 import subprocess
 import sys
@@ -9,7 +9,7 @@ import rooms
 
 ROOT = Path(__file__).parents[1]
 MOST_LEFT_OUT = 36
-"""Files of tests in the core's rooms that look at a wing or a command, too."""
+"""Most files of tests in the core's rooms that also look at a wing or a command."""
 
 ALONE = """
 import pathlib, sys

@@ -1,4 +1,4 @@
-"""The check of a capture: its sheet and report, and the quick look at mistakes."""
+"""The check of a capture: its sheet, its report, and the warnings of a quick look."""
 
 import dataclasses
 import functools
@@ -29,8 +29,9 @@ SIZE = 64
 
 @functools.cache
 def boxes():
-    """A torso and two arms as boxes, each moved by another joint; 1 m tall, 1.2 m wide,
-    unequal in front and behind.
+    """Returns a body of a torso and two arms, each a box that one joint moves.
+
+    It is 1 m tall and 1.2 m wide, and its front and back differ.
     """
 
     def box(low, high):
@@ -63,7 +64,7 @@ def cameras(views=3, width=SIZE, height=SIZE):
 
 @functools.cache
 def photos():
-    """Images and masks of the boxes, by three cameras."""
+    """Returns (images, masks) of the boxes, seen by three cameras."""
     white = np.ones((SIZE, SIZE, 3), np.float32)
     pose, seen = rest_pose(boxes()), cameras()
     drawn = [draw_body(boxes(), jnp.zeros(0), pose, seen[i], white)[1] for i in range(3)]
@@ -270,7 +271,7 @@ MADE = {
     ),
     "a world with z up": lambda m: m @ Z_UP,
 }
-"""What people do to a right cam_from_world, and the words for it."""
+"""Common mistakes in a camera matrix, by the words with which they are reported."""
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -288,7 +289,7 @@ def test_right_captures_have_no_warnings(right):
 @pytest.mark.parametrize("masks", [True, False])
 @pytest.mark.parametrize("mistake", MADE)
 def test_wrong_cameras_are_explained(mistake, masks, right):
-    """Without masks only where nothing else puts the body into the frame."""
+    """Without masks a mistake is named only if no other one puts the body into the frame."""
     wrong = np.stack(
         [MADE[mistake](np.asarray(matrix, float)) for matrix in right.cameras.cam_from_world]
     )
@@ -316,7 +317,7 @@ def test_a_body_in_millimetres_is_explained(right):
 
 
 def test_the_points_lie_on_the_body(right):
-    """Skinning by numpy is that of the body model, up to its corrections of poses."""
+    """Skinning in numpy gives the body model's vertices, up to its corrections for poses."""
     frame = int(right.frames[0])
     points = surface_points(right.body, right.betas, right.poses, right.frames, 6000)[frame]
     vertices = np.asarray(person_vertices(right.body, jnp.asarray(right.betas), right.pose(frame)))

@@ -1,4 +1,4 @@
-"""Photos without a calibration whose EXIF describes another frame are named."""
+"""Photos without a calibration are named if their EXIF describes a frame of another size."""
 
 from PIL import Image
 

@@ -18,8 +18,9 @@ SIZE = (400, 300)
 
 
 def hall(focal=120.0, middles=((60, 80), (200, 150), (330, 210)), masks=True):
-    """A person of some 40 pixels at another place of each photo of 400 x 300; pixels hold their own
-    coordinates.
+    """Returns a capture of a person who is some 40 pixels high in photos of 400 x 300.
+
+    The person is at another place of each photo. The value of a pixel is its position.
     """
     body, (width, height) = boxes(), SIZE
     cameras = orbit(

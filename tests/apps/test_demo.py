@@ -16,15 +16,20 @@ PRODUCTS = {
     *("novel_views.exr", "novel_views.png", "refined.png", "report.json"),
 }
 LEAST = {"psnr": 25.4, "ssim": 0.924, "psnr_fg": 17.6, "baseline_psnr": 18.6}
-"""What the README claims of the held-out views (25.7 dB, 0.930, 18.0 dB, 18.9 dB), less 0.3 dB and
-0.005: that is more than processors and XLA's versions differ by, and less than any change of the
-method that matters."""
+"""Least scores of the held-out views.
+
+They are those of the README (25.7 dB, 0.930, 18.0 dB, 18.9 dB) less 0.3 dB and 0.005: results of
+processors and versions of XLA differ by less, and a change of the method that matters makes more.
+"""
 
 FRAME_SIZE = 64
 
 
 def video_frames(path):
-    """(m, h, w, 3) bytes by ffmpeg itself: imageio's reader leaves file handles open."""
+    """Returns the frames of a video, bytes (m, h, w, 3).
+
+    ffmpeg itself reads them, because imageio's reader leaves file handles open.
+    """
     import imageio_ffmpeg
 
     command = [

@@ -1,4 +1,4 @@
-"""`humangs detect`: who is chosen, what is written, and the warnings where that is not clear."""
+"""`humangs detect`: which person is chosen, what is written, and when it warns."""
 
 import dataclasses
 import shutil
@@ -36,7 +36,7 @@ DEMO = Path(detect.__file__).parents[1] / "assets" / "demo_capture"
 
 
 def found(mark, area, corner=(5, 10)):
-    """A person whose pixels are all `mark`."""
+    """Returns a person with a crop at `corner` whose landmarks all have the coordinate `mark`."""
     points = np.concatenate([np.full((33, 2), float(mark)), np.ones((33, 1))], axis=1)
     return PersonInPhoto(
         SeenPerson(points, np.zeros((33, 3)), 1.0), np.full((8, 4), 255, np.uint8), corner, area
@@ -150,14 +150,15 @@ def test_without_litert_it_is_one_line(tmp_path, capsys, monkeypatch):
 # ---------------------------------------------------------------
 
 SIDE, FOCAL = 600, 700.0
-"""Pixels of the photos, and of their focal length."""
+"""Side and focal length of the photos, pixels."""
 BODY = np.random.default_rng(3).normal(0, [0.15, 0.45, 0.1], (33, 3))
 OTHER_BODY = np.random.default_rng(4).normal(0, [0.15, 0.45, 0.1], (33, 3))
 
 
 def camera_at(degrees, turned=0.0, distance=3.5):
-    """cam_from_world of a camera around the origin that looks at it. turned: about its own x,
-    degrees.
+    """Returns cam_from_world of a camera that looks at the origin from `distance` metres.
+
+    `degrees` is its angle around the vertical, `turned` a turn about its x axis.
     """
     look, tilt = (
         Rotation.from_euler(axis, angle, degrees=True).as_matrix()
@@ -179,7 +180,7 @@ def moved(body, *step):
 
 
 def seen_at(name, matrix, *bodies, areas=(9e3, 8e3)):
-    """A photo of some bodies by a camera."""
+    """Returns a photo in which a camera sees these bodies."""
     people = []
     for body, area in zip(bodies, areas, strict=False):
         local = body @ matrix[:3, :3].T + matrix[:3, 3]
@@ -294,7 +295,7 @@ def test_two_people_are_followed_in_the_photos_of_one_camera(tmp_path):
 
 
 def test_rivals_who_are_matched_to_nobody_are_asked_about_and_get_no_black_mask(tmp_path):
-    """Moments from different sides: neither space nor the photo says who is who."""
+    """The photos show different moments from different sides: nothing tells who is who."""
     cameras = [camera_at(0), camera_at(180)]
     photos = [
         seen_at(f"{f}", matrix, BODY - 0.8, OTHER_BODY + 0.8) for f, matrix in enumerate(cameras)
@@ -310,7 +311,7 @@ def test_rivals_who_are_matched_to_nobody_are_asked_about_and_get_no_black_mask(
 
 
 def test_somebody_else_for_certain_is_not_the_person(tmp_path):
-    """The last view shows only the other one, who is beside the person in the others."""
+    """The last view shows only the person who stands beside the chosen one in the others."""
     views = [camera_at(angle) for angle in (0, 80, 200)]
     photos = [
         seen_at(f"c{v}", matrix, BODY, moved(OTHER_BODY, 0.7, 0, 0.4))
@@ -353,7 +354,7 @@ def test_masks_and_keypoints_choose_in_each_photo_whatever_the_matching_says(kin
 
 
 def looked_at(center, side):
-    """What the landmark network says of a crop: an ellipse."""
+    """Returns what the landmark network finds in a crop: an elliptic mask."""
     u, v = np.meshgrid(*[np.linspace(-1, 1, 256)] * 2)
     mask = (u**2 / 0.3 + v**2 / 0.8 < 1).astype(np.float32)
     crop = Crop(np.asarray(center, float), side, 0.1)

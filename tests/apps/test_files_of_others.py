@@ -1,6 +1,4 @@
-"""Files that others wrote are never replaced unasked, whichever command would give its own the same
-name.
-"""
+"""No command replaces a file that another program wrote, even if its own has the same name."""
 
 import json
 from pathlib import Path
@@ -22,7 +20,7 @@ GREY = np.full((30, 40, 3), 0.5)
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """The working folder, and a detector that finds one person in the photos `a` and `b`."""
+    """Returns the working folder; a detector finds one person in the photos `a` and `b`."""
     monkeypatch.chdir(tmp_path)
     for name in "ab":
         Path("photos").mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""How many programs the commands compile: each costs some ten milliseconds or more, every time."""
+"""The number of programs that commands compile: each costs some ten milliseconds or more."""
 
 import json
 import subprocess
@@ -10,14 +10,13 @@ from experiments.first_run import write_photos
 from humangs_jax.core.processes import spare_cores
 
 MOST = {"demo": 48, "animate": 8, "start": 100}
-"""By command: about a quarter more than there were when this was written."""
+"""The most programs of a command: about a quarter more than there were when this was written."""
 AHEAD = {"jit(fit_frames)", "jit(solve_round)", "jit(_reconstruct)"}
-"""Programs of `start` that take longest, which threads compile while other work is done, where a
-machine has cores to spare."""
+"""The slowest programs of `start`: threads compile them ahead where a machine has spare cores."""
 
 
 def ran(*words):
-    """The programs of a command in a process of its own."""
+    """Runs a command in another process and returns the programs that it compiled."""
     command = [sys.executable, "-m", "experiments.programs", *map(str, words)]
     found = subprocess.run(command, capture_output=True, text=True, check=False)
     assert found.returncode == 0, found.stderr[-2000:]
@@ -27,7 +26,7 @@ def ran(*words):
 
 
 def programs_of(*words):
-    """Names of the programs of a command, and who asked for them."""
+    """Returns the names of the programs of a command, with the function that asked for each."""
     return [f"{program['name']} by {program['asked']}" for program in ran(*words)]
 
 

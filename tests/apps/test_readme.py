@@ -1,6 +1,4 @@
-"""The Python of README.md and of the pages, executed as it stands: with what a page takes for
-given, on small inputs.
-"""
+"""The Python code of README.md and of the pages runs as it stands, on small inputs."""
 
 import dataclasses
 import json
@@ -23,9 +21,9 @@ from humangs_jax.data.capture import save_capture
 
 ROOT = Path(__file__).parents[2]
 LEAST_PSNR = 25.7
-"""dB of a photo that the network was given, rendered again: 26.0 when this was written."""
+"""Least PSNR of a rendered input photo, dB; it was 26.0 when this was written."""
 README_WORDS = 700
-"""Of README.md, with its code, table and citation: it is read in three minutes."""
+"""Most words of README.md with code, table and citation: it is read in three minutes."""
 MODULES = {
     "hg": hg,
     "jax": jax,
@@ -35,9 +33,9 @@ MODULES = {
 }
 
 WHOLE = ("docs/how_it_works.md", "docs/splatting.md", "docs/ablations.md")
-"""Pages that begin with nothing."""
+"""Pages whose code needs no names from elsewhere."""
 ON_FILES = ("docs/capture_format.md",)
-"""Quick ones, with three Gaussians."""
+"""Pages whose code runs quickly on an avatar of three Gaussians."""
 ON_A_PERSON = (
     *(
         "docs/data.md",
@@ -54,7 +52,7 @@ ON_A_PERSON = (
         "docs/viewer.md",
     ),
 )
-"""With the shipped person at 256 px."""
+"""Pages whose code runs on the shipped person at 256 pixels."""
 LEFT_OUT = {
     "docs/change.md": "trains on people that it names, and on a source of the reader's",
     "docs/datasets.md": "reads data sets, and a body, of others",
@@ -75,7 +73,7 @@ SMALLER = {
     "docs/tradeoff.md": {"frame_ms=33.0": "frame_ms=60_000.0"},
     "docs/video.md": {"width=540, height=720": "width=54, height=72"},
 }
-"""What of a page is exchanged: the same at a size for tests."""
+"""Texts that are replaced in the code of a page, so that it runs at a size for tests."""
 
 
 def blocks(page):
@@ -83,7 +81,10 @@ def blocks(page):
 
 
 def run(page, names=None):
-    """The names that all blocks of Python of a page leave. names: that are there before."""
+    """Runs all blocks of Python of a page and returns the names that they leave.
+
+    `names` are defined before.
+    """
     names = dict(names or {})
     small = SMALLER.get(page, {})
     assert all(any(text in block for block in blocks(page)) for text in small), "of an earlier text"
@@ -96,7 +97,7 @@ def run(page, names=None):
 
 @pytest.mark.parametrize("whole", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_blocks_of_the_readme_run(whole, monkeypatch, tmp_path, body):
-    """As they stand; or on small photos, with three Gaussians in place of the network's."""
+    """The code runs unchanged, or on small photos with three Gaussians instead of the network's."""
     if not whole:
         load = hg.load_capture
         save_tiny_avatar(tmp_path / "tiny.npz", np.asarray(shape_body(body, jnp.zeros(0)).joints))
@@ -129,7 +130,7 @@ def test_every_page_with_python_is_run():
 
 @pytest.fixture
 def files(tmp_path, monkeypatch, body):
-    """In the working folder: the motions that pages name."""
+    """Returns the working folder, with the motions that pages name."""
     rest = np.asarray(shape_body(body, jnp.zeros(0)).joints)
     still = np.zeros((3, 55, 3))
     (tmp_path / "dance.bvh").write_text(write_bvh(rest, np.zeros((3, len(rest), 3)), CMU))
@@ -153,9 +154,7 @@ def files(tmp_path, monkeypatch, body):
 
 
 def check_described_capture(text):
-    """The lines of Python wrote a capture whose capture.json has the keys of the one that is
-    described, and its camera.
-    """
+    """Checks the capture that a page's code wrote: the keys and the camera that the page shows."""
     capture, file = hg.load_capture("me"), Path("me/capture.json")
     assert capture.view_count == 4 and capture.body.name == "makehuman"
     written, content = (
@@ -189,7 +188,7 @@ def test_the_blocks_of_a_page_run(page, tmp_path, monkeypatch):
 
 @pytest.fixture(scope="module")
 def person():
-    """What pages take for given: the shipped person, network and avatar."""
+    """Returns the names that pages use without defining them: person, network, avatar."""
     variables, config = hg.load_weights()
     capture = hg.load_capture("demo_capture").resized(256)
     avatar = hg.reconstruct(variables, config, capture)

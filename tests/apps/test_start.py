@@ -1,4 +1,4 @@
-"""`humangs start`: what a folder has, what it reports as missing, and the way to the page."""
+"""`humangs start`: what it finds in a folder, what it reports as missing, and what it makes."""
 
 import dataclasses
 import shutil
@@ -39,9 +39,7 @@ from tests.refinement.refinement_cases import toy_avatar, toy_capture
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """Photos, calibration, masks and keypoints of the demo's person, as other programs write
-    them.
-    """
+    """Returns a folder of photos, calibration, masks and keypoints as other programs write them."""
     folder = tmp_path_factory.mktemp("mine") / "photos"
     write_material(folder, load_capture("demo_capture"), np.full((4, 133, 2), 100.0))
     return folder
@@ -49,7 +47,7 @@ def photos(tmp_path_factory):
 
 @pytest.fixture
 def mine(photos, tmp_path, monkeypatch):
-    """A copy that a test may change, in the working folder; without the package's own detector."""
+    """Returns a copy of the folder that a test may change; the package's detector is off."""
     monkeypatch.setattr(blazepose, "available", lambda: False)
     shutil.copytree(photos, tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
@@ -68,8 +66,8 @@ def test_everything_is_found(mine):
 
 
 def test_other_layouts_are_found(mine):
-    """Photos beside the rest, a folder for each camera, COLMAP's workspace, OpenPose's file with
-    another name.
+    """Found are photos beside the other files, a folder for each camera, COLMAP's workspace, and
+    OpenPose's file under another name.
     """
     for path in (mine / "images").iterdir():
         (mine / path.stem).mkdir()
@@ -182,7 +180,7 @@ def test_keypoints_have_to_be_of_photos_without_lens_distortion(mine, capsys):
 
 @pytest.fixture
 def detected(mine, monkeypatch):
-    """What the detector finds is known, and the run ends before the fit: what that is given."""
+    """Replaces the detector and the fit; returns the list of the arguments that the fit gets."""
     capture, told = load_capture("demo_capture"), []
     points = np.nan_to_num(landmarks_in(capture, MEDIAPIPE_33.names))
     shown = []
@@ -241,7 +239,7 @@ def test_what_is_missing_is_found_in_the_photos_and_what_is_given_wins(
 
 @pytest.mark.slow  # finds the cameras
 def test_photos_alone_are_enough(mine, detected, capsys):
-    """Cameras, masks and keypoints are those of the person; only LiteRT is needed."""
+    """Cameras, masks and keypoints come from the detected person; only LiteRT is needed."""
     without(mine, *TOOLS)
     assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.7"]) == cli.BAD_DATA
     out, err = capsys.readouterr()
@@ -313,7 +311,9 @@ def test_without_the_detector_a_height_does_not_hide_how_to_install_it(mine, cap
 
 
 def test_a_body_that_other_options_made_is_not_taken(mine, detected, capsys):
-    """The same command goes on from the body; one with another height would have had no effect."""
+    """The same command continues with the fitted body; another height would have no effect on it,
+    and is refused.
+    """
     without(mine, "cameras")
     first = FromPhotos(mine, Path("me"), height=1.7)
     Path("me").mkdir()
@@ -352,8 +352,8 @@ def test_two_people_are_refused_with_the_sheet_that_numbers_them(
 
 
 def test_a_video_becomes_photos_beside_the_capture(tmp_path, monkeypatch, capsys):
-    """Once: a second run goes on with these, and what was added to them; another video under that
-    name is refused.
+    """A second run uses the photos of the first and those that were added. Another video of the
+    same name is refused.
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(blazepose, "available", lambda: False)
@@ -445,7 +445,7 @@ def test_masks_that_are_there_may_be_left_out(mine, capsys):
 
 
 def test_a_notebook_reads_the_same_steps(mine, detected):
-    """Each is printed as `humangs start` shows it; what is wrong is an error with the argument."""
+    """A step prints what `humangs start` shows, and an error names the argument."""
     shutil.rmtree(mine)
     truth = load_capture("demo_capture")
     write_material(mine, truth, landmarks_in(truth))
@@ -515,12 +515,12 @@ def body():
 
 @pytest.fixture(scope="module")
 def toy(body):
-    """A capture of an avatar, and what is reconstructed of it: by how much the avatar is off."""
+    """Returns a capture of an avatar without errors."""
     return toy_capture(body, toy_avatar(body, 0.0), views=4)
 
 
 def reconstructed(monkeypatch, body, wrong):
-    """wrong: by how much the avatar of a capture is off."""
+    """Replaces the reconstruction by an avatar that is off by `wrong` of the capture."""
     monkeypatch.setattr(start, "SIZE", 64)
     made = lambda _, __, photos: toy_avatar(body, wrong(photos.capture))
     monkeypatch.setattr(start, "reconstruct", made)
@@ -583,9 +583,7 @@ def test_no_photo_alone_rejects_a_body(gains, asked, better, toy, monkeypatch):
 
 
 def test_the_photo_that_is_held_out_of_a_person_who_turns_is_the_one_with_the_nearest_other():
-    """Turning the person before one camera is going round the person with it, whichever frame a
-    view shows.
-    """
+    """Turning the person before one camera is the same as moving the camera around the person."""
     angles = np.radians([0.0, 90.0, 200.0, 215.0])
     around = orbit(
         jnp.zeros(3), 3.0, jnp.asarray(-angles), 0.1, jnp.diag(jnp.asarray([8.0, 8.0, 1.0])), 8, 8

@@ -99,7 +99,7 @@ BY_PRESET = {
 
 
 def tuned(monkeypatch, masks=(), **budget):
-    """`tune` on a machine on which the presets cost what `BY_PRESET` says."""
+    """Returns what `tune` chooses on a machine on which the presets cost what `BY_PRESET` says."""
     names = {id(settings): name for name, settings in PRESETS.items()}
     monkeypatch.setattr(tuning, "measure", lambda settings, *_: BY_PRESET[names[id(settings)]])
     capture = object.__new__(Capture)  # nothing of it is measured

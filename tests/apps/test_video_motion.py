@@ -1,4 +1,4 @@
-"""The motion of a video: who is followed, interrupted runs, and what is written."""
+"""The motion of a video: which person is followed, interrupted runs, and what is written."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +19,7 @@ COUNT = 12
 
 
 def seen_at(x, side=16.0):
-    """A person whose hips are at this column."""
+    """Returns a detected person whose hips are at column `x`."""
     hips = np.asarray([x, 16.0])
     return Landmarks(
         pixels=np.tile(hips, (33, 1)),

@@ -1,4 +1,4 @@
-"""Photos of a video: when they were taken, and who is followed."""
+"""Photos that are taken from a video: at which times, and of which person."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ COUNT = 40
 
 
 def seen_person(world):
-    """What the landmark network says of a person with these landmarks."""
+    """Returns what the landmark network finds of a person with these 3D landmarks."""
     crop = Crop(np.full(2, 16.0), 32.0, 0.0)
     hips = np.full(2, 16.0)
     return Landmarks(
@@ -30,7 +30,10 @@ def seen_person(world):
 
 @pytest.fixture
 def clip(tmp_path, monkeypatch):
-    """A video of noise, and a made-up detector that sees a person in it who turns once around."""
+    """Returns (path of a video of noise, list of calls of the network).
+
+    A made-up detector sees a person in it who turns once around.
+    """
     frames = np.random.default_rng(0).uniform(0, 1, (COUNT, 32, 32, 3))
     write_video(tmp_path / "me.mp4", list(frames), 10)
     world = turning(np.linspace(0, 2 * np.pi, COUNT, endpoint=False))

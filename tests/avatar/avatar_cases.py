@@ -1,6 +1,4 @@
-"""A person of two balls, one above the other: surface, normals and parts are known in closed
-form.
-"""
+"""A person of two balls, whose surface, normals and parts are known in closed form."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,16 +10,15 @@ from humangs_jax.rendering.gaussians import Gaussians
 CENTRES = np.asarray([[0.0, 0.5, 0.0], [0.0, 1.3, 0.0]])
 RADIUS = 0.35
 SPLAT = 0.0125
-"""Standard deviation of its Gaussians, metres; vertices are 0.017 apart, so that little shines
-through.
+"""Standard deviation of its Gaussians, metres. Vertices are 0.017 m apart: little shines through.
 """
 NAMES = ("pelvis", "left_shoulder", "right_shoulder")
 
 
 def two_balls(subdivisions=4):
-    """Ball 0 follows joint 0, ball 1 joint 1, each about its centre; joint 2 moves nothing.
+    """Returns an avatar of two balls, one above the other, with a Gaussian on each vertex.
 
-    A Gaussian per vertex.
+    Joint 0 turns the lower ball about its centre, joint 1 the upper one, and joint 2 moves nothing.
     """
     ball = trimesh.creation.icosphere(subdivisions, RADIUS)
     n = len(ball.vertices)

@@ -90,7 +90,7 @@ def test_what_a_file_cannot_hold_is_refused_and_short_numbers_become_float32(tmp
 
 
 def unlike(avatar, **changes):
-    """The avatar with other arrays, of its Gaussians or its own."""
+    """Returns the avatar with other arrays, its own or those of its Gaussians."""
     own = {name: value for name, value in changes.items() if hasattr(avatar, name)}
     drawn = {name: value for name, value in changes.items() if name not in own}
     return replace(avatar, gaussians=replace(avatar.gaussians, **drawn), **own)

@@ -1,4 +1,4 @@
-"""Cameras of a file around an avatar: still, or as a path over a motion."""
+"""Cameras of a file around an avatar: fixed ones, or a path along a motion."""
 
 import json
 
@@ -20,9 +20,9 @@ from humangs_jax.motion import save_motion
 
 TARGET = jnp.asarray([0.0, 0.9, 0.0])
 BLENDER = np.diag([1.0, -1, -1, 1])
-"""From OpenCV's axes of a camera to OpenGL's."""
+"""Turns OpenCV's camera axes into OpenGL's."""
 Z_UP = np.asarray([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""From a world with y up to one with z up."""
+"""Turns a world with y up into one with z up."""
 
 
 def around(azimuths, size=(40, 32), fov=0.6, distance=4.0):
@@ -31,7 +31,7 @@ def around(azimuths, size=(40, 32), fov=0.6, distance=4.0):
 
 
 def write_transforms(path, cameras, names=None, sizes=None):
-    """As Blender's exporters do: z up, camera-to-world with OpenGL's axes."""
+    """Writes cameras as Blender's exporters do: z up, camera to world, OpenGL's axes."""
     frames = []
     for i, camera in enumerate(cameras):
         world_from_cam = Z_UP @ np.asarray(camera.world_from_cam, float) @ BLENDER
@@ -184,7 +184,7 @@ def test_the_camera_travels_along_its_path_during_the_motion(folder, humangs):
 
 
 def test_the_person_of_a_path_stands_as_in_an_export():
-    """Feet on 0, at x = z = 0: a path made around an exported file fits."""
+    """The feet are at height 0 and the person at x = z = 0, so a path made for an export fits."""
     avatar = two_balls(1)
     means = np.asarray(animate(avatar, standing(avatar)).means)
     assert abs(means[:, 1].min()) < 0.02

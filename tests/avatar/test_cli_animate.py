@@ -1,4 +1,4 @@
-"""`humangs animate`, `render`, `view`: what is written is what was asked for."""
+"""`humangs animate`, `render` and `view` write what was asked for."""
 
 import dataclasses
 import os
@@ -18,7 +18,7 @@ from humangs_jax.motion import save_motion
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A folder with an avatar and a motion of a second, in which commands run."""
+    """Returns the working folder, with an avatar and a motion of a second."""
     import jax.numpy as jnp
 
     monkeypatch.chdir(tmp_path)

@@ -1,15 +1,14 @@
-"""Gradients through all of it: photos -> network -> skinned Gaussians -> images -> loss, in
-float64.
+"""Gradients from photos through network, skinning and rendering to the loss, in float64.
 
-Differentiable are the network's parameters, the photos, the cameras, posed and canonical vertices
-and position maps that come with them, and pose, shape and camera of every target. Depth maps and
-foreground only decide; and `prepare_inputs`, which rasterizes, is not differentiated: training
-stops gradients there.
+Differentiated are the network's parameters, the photos, the cameras, the posed and canonical
+vertices and position maps of the inputs, and pose, shape and camera of every target. Depth maps and
+foreground only decide. `prepare_inputs`, which rasterizes, is left out: training stops gradients
+there.
 
 The loss has jumps and kinks: a splat's alpha crosses 1/255 on a pixel, two splats change places, a
-unit of a ReLU turns on, a position leaves a texel. A jump within a step spoils its difference, so
-differences to both sides and smaller steps are tried as well: none of them rescues a wrong
-gradient.
+unit of a ReLU turns on, a position leaves a texel. A jump within a step spoils its difference.
+Differences to both sides and smaller steps are therefore tried as well; none of them lets a wrong
+gradient pass.
 """
 
 import dataclasses
@@ -36,18 +35,20 @@ from humangs_jax.training.forward import draw_targets, white_backgrounds
 
 VERTICES, JOINTS, VIEWS, TARGETS, SIZE, TARGET_SIZE = 200, 55, 2, 2, 32, 24
 CHANGES = (1e-8, 1e-9, 1e-10, 5e-11)
-"""What a step is to change the loss by. The loss is about 0.4, its rounding a few 1e-17. The last
-one is for kinks that lie close to the point: there only one side is smooth, and its error falls
-with the step (1e-5 at 1e-10)."""
-AGREEMENT = 5e-6
-"""Of the expected derivative: what rounding leaves of a change of 1e-10."""
-SMALLEST_DERIVATIVE = 1e-6
-"""Where everything moves by its own size.
+"""Changes of the loss that the steps aim at.
 
-The neural texture's is 1e-5; something cut off would have none.
+The loss is about 0.4, its rounding a few 1e-17. The last one is for kinks close to the point: only
+one side is smooth there, and its error falls with the step (1e-5 at 1e-10).
+"""
+AGREEMENT = 5e-6
+"""Largest difference, relative to the derivative: what rounding leaves of a change of 1e-10."""
+SMALLEST_DERIVATIVE = 1e-6
+"""Least derivative where everything moves by its own size.
+
+That of the neural texture is 1e-5; a part that is cut off has none.
 """
 SEEN = (0.05, 0.5)
-"""Mean coverage of the images: there is somebody to see."""
+"""Least and largest mean coverage of the images, so that a person is seen."""
 FLOAT32_COSINE = 0.999
 DTYPES = (jnp.float32, jnp.float64)
 PARAMETER_GROUPS = ("texture", "tokenizer", "transformer", "upsampler", "decoder")
@@ -55,16 +56,18 @@ OTHERS = ("images", "input_geometry", "target_pose", "target_cameras")
 GEOMETRY = ("cameras", "posed_vertices", "canonical_vertices", "position_maps")
 FLAGS = ("remat", "train", "scan", "bare")
 INSIDE = 0.93
-"""Of the texture: 3.255 texels from its middle."""
+"""Texture position of pixels beside the body: 3.255 texels from the middle."""
 POSE = ("rotations", "translations", "betas")
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """style: as the published network (mixed convention, rotation skinning, offsets without bound,
-    Gouraud maps) or as the small one (photo colors corrected, affine skinning, bounded offsets).
-    train: statistics of the batch.
-    bare: neither class token nor upsampler, but a head that corrects skinning weights.
+    """What the network and its inputs are.
+
+    Style "published" has the conventions of the published network: mixed pixel grid, rotation
+    skinning, unbounded offsets, Gouraud maps. The other style has those of the small network:
+    corrected photo colors, affine skinning, bounded offsets. `train` uses the statistics of the
+    batch. `bare` has neither class token nor upsampler, and a head that corrects skinning weights.
     """
 
     style: str
@@ -82,7 +85,7 @@ class Case:
 
     @property
     def config(self) -> TrainConfig:
-        """Tiny, otherwise as in training."""
+        """The configuration of training, with a tiny network."""
         model = tiny()
         published = self.style == "published"
         encoder, reader, decoder = paper_parts(model.architecture)
@@ -138,9 +141,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def as_dtype(tree, dtype):
-    """In numpy, as all sums over points are here: jax would compile an operation for every shape of
-    a leaf.
-    """
+    """Returns the tree in numpy; JAX would compile an operation for every shape of a leaf."""
     cast = lambda x: x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x
     return jax.tree.map(lambda x: cast(np.asarray(x)), tree)
 
@@ -161,7 +162,7 @@ def cameras(count, size, distance, azimuth):
 
 
 def random_views(seed, count, size, betas):
-    """Noise in a pose: images far from what they are to show give every pixel a say."""
+    """Returns views of noise in a pose, far from the targets, so that each pixel counts."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:size, :size] / size - 0.5
     masks = np.broadcast_to((x / 0.25) ** 2 + (y / 0.45) ** 2 < 1, (count, size, size)).astype(
@@ -178,7 +179,7 @@ def random_views(seed, count, size, betas):
 
 
 def random_variables(config):
-    """Variables in which every number matters, of Gaussians that are as large as their distance."""
+    """Returns variables in which every number matters; Gaussians are as large as their distance."""
     rng = np.random.default_rng(0)
     shapes = expected_variables(config)
 
@@ -214,8 +215,9 @@ def group_of(path):
 
 @functools.cache
 def in_a_hurry():
-    """Options with which XLA compiles ten times the code that it saves running; one of them is gone
-    in jax 0.12.
+    """Returns options with which XLA compiles fast.
+
+    Compilation costs ten times what optimised code would save. jax 0.12 lacks one of the options.
     """
     options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
     try:
@@ -227,7 +229,7 @@ def in_a_hurry():
 
 @functools.cache
 def subject(position_map):
-    """(network's inputs, targets) of one person."""
+    """Returns (inputs of the network, targets) of one person."""
     betas = jnp.asarray(np.random.default_rng(5).normal(size=4))
     prepare = jax.jit(prepare_inputs, static_argnames="config", compiler_options=in_a_hurry())
     config = tiny().with_conventions(position_map=position_map)
@@ -237,10 +239,10 @@ def subject(position_map):
 
 
 def starting_point(inputs, targets, params):
-    """Everything that is differentiable, by group.
+    """Returns everything that is differentiated, by group.
 
-    Pixels beside the body have a position on the very border of the texture, where a step out of it
-    is not a step in: they are moved inside, between texels.
+    Pixels beside the body have a position on the border of the texture, where steps in and out
+    differ. They are moved inside, between texels.
     """
     positions = jnp.where((inputs.depth_maps >= 0)[..., None], inputs.position_maps, INSIDE)
     return {
@@ -255,7 +257,10 @@ def starting_point(inputs, targets, params):
 
 @functools.cache
 def compiled(case, dtype):
-    """f(point, fixed) -> ((loss, facts), gradients), a point, and what is fixed there."""
+    """Returns a compiled function, a point and what is fixed.
+
+    The function maps (point, fixed) to ((loss, facts), gradients).
+    """
     config = case.config
     variables = random_variables(config.model)
     inputs, targets = subject(config.model.conventions.position_map)
@@ -264,6 +269,7 @@ def compiled(case, dtype):
         (point, (inputs, targets, variables["batch_stats"]), body()), dtype
     )
 
+    # what is differentiated replaces its part of the inputs, targets and variables
     def loss(point, fixed):
         inputs, targets, batch_stats = fixed
         inputs = replace(inputs, images=point["images"], **point["input_geometry"])
@@ -287,7 +293,7 @@ def compiled(case, dtype):
 
 
 def by_group(point):
-    """Paths of the leaves of a point: of the network's parts, and of what else is varied."""
+    """Returns the paths of a point's leaves by group: a part of the network, or another input."""
     found = {}
     for path, _ in jax.tree_util.tree_leaves_with_path(point):
         name = path[0].key
@@ -300,7 +306,7 @@ def root_mean_square(x):
 
 
 def random_direction(point, paths, rng):
-    """Moves those leaves, each by about its own size, and nothing else."""
+    """Returns random moves of the leaves at `paths`, each of about its leaf's size, 0 elsewhere."""
 
     def draw(path, leaf):
         return rng.normal(size=leaf.shape) * root_mean_square(leaf) * (path in paths)

@@ -1,5 +1,6 @@
-"""Files for other people's viewers: one world for all, read back by our own reader
-(test_splat_files) and by npm's tools.
+"""Files for viewers of other programs have one world, and come back unchanged.
+
+Our own reader (test_splat_files) and npm's tools read them.
 """
 
 import os
@@ -52,13 +53,11 @@ SPZ_LOSSES = {
     **{"SCALE": 0.02, "ROTATION": 0.08, "OPACITY": 0.51 / 255},
     "SH_DEGREE_0_COEF_0": 0.51 / 255 / 0.15,
 }
-"""What the bits of `.spz` leave: scales of up to 0.6 m in steps of 6 %, which covariances have
-twice.
+"""Errors that the bits of `.spz` leave: scales of up to 0.6 m have steps of 6 %, and covariances
+twice that.
 """
 TOOLS = Path(os.environ.get("HUMANGS_NPM", "."))
-"""Folder where `npm install @playcanvas/splat-transform` was run; the environment variable
-HUMANGS_NPM.
-"""
+"""Folder in which `npm install @playcanvas/splat-transform` was run: the variable HUMANGS_NPM."""
 TRANSFORM = shutil.which(
     "splat-transform",
     path=f"{TOOLS / 'node_modules' / '.bin'}{os.pathsep}{os.environ.get('PATH', '')}",
@@ -76,7 +75,7 @@ def test_a_world_is_turned_as_a_whole_and_up_is_where_it_is_said(up, matrix):
 
 
 def off_by(a, b):
-    """Largest differences of covariances (relative to the largest), opacities and colors."""
+    """Returns the largest differences of covariances (relative), opacities and colors."""
     exact = np.asarray(covariances(a))
     return [
         np.abs(np.asarray(covariances(b)) - exact).max() / np.abs(exact).max(),
@@ -90,9 +89,7 @@ def off_by(a, b):
     st.integers(0, 2**32 - 1), st.sampled_from(sorted(MATRICES)), st.floats(-8, 2), st.floats(-2, 4)
 )
 def test_one_person_comes_back_from_every_file(tmp_path_factory, seed, up, thickness, distance):
-    """Any Gaussians: metres to micrometres thick, near and a kilometre away, opaque and faint, in
-    any world.
-    """
+    """Gaussians are micrometres to metres thick, up to a kilometre away, opaque and faint."""
     folder = tmp_path_factory.mktemp("files")
     rng, before = np.random.default_rng(seed), random_gaussians(seed)
     opacities = jnp.asarray(rng.choice([0.0, 1e-3, 0.5, 1.0], 20), jnp.float32)
@@ -145,7 +142,7 @@ def test_the_lowest_gaussian_that_is_seen_stands_on_the_floor():
 
 
 def read_glb(path):
-    """JSON, and the arrays of its only primitive."""
+    """Returns (document, arrays of its only primitive by name)."""
     document, binary = parse_glb(path.read_bytes())
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     return document, {
@@ -175,8 +172,8 @@ def test_viewers_that_do_not_know_the_extension_show_colored_points(tmp_path):
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_viewers_that_add_their_own_low_pass_draw_what_we_draw(tmp_path_factory, seed):
-    """A viewer of 3DGS adds 0.3 pixels^2 to what is in the file, our renderer 0.1 to scales that
-    contain the rest.
+    """A viewer of 3DGS adds 0.3 square pixels to the file's covariances, our renderer 0.1 to scales
+    that contain the rest.
     """
     file, depth = tmp_path_factory.mktemp("files") / "a.ply", 2.0
     camera = Camera.from_opencv(
@@ -202,7 +199,7 @@ def test_viewers_that_add_their_own_low_pass_draw_what_we_draw(tmp_path_factory,
 
 
 def small_file(folder):
-    """An avatar file of upright people's Gaussians: heads above feet."""
+    """Writes an avatar whose Gaussians are upright people, heads above feet; returns its path."""
     gaussians = random_gaussians()
     Avatar(
         replace(gaussians, opacities=jnp.full(20, 0.9)),
@@ -327,7 +324,7 @@ def test_numbers_that_files_cannot_hold_are_not_written(name, tmp_path):
 
 
 def transformed(source, target):
-    """What a program that is not ours makes of a file."""
+    """Converts a file with splat-transform."""
     done = subprocess.run(
         [str(TRANSFORM), "-w", str(source), str(target)],
         capture_output=True,
@@ -355,9 +352,7 @@ def _covariances(xyzw, scales):
 @needs_npm
 @pytest.mark.parametrize("name", ["a.ply", "a.spz"])
 def test_splat_transform_makes_our_glb_of_our_files(name, tmp_path):
-    """Worlds, scales, rotations, opacities and colors of both files are the same to a program that
-    is not ours.
-    """
+    """Another program finds the same worlds, scales, rotations, opacities and colors in both."""
     gaussians = random_gaussians()
     write = {"a.ply": write_ply, "a.spz": write_spz}[name]
     form = chosen_format(Path(name).suffix)

@@ -1,5 +1,5 @@
-"""The body as a mesh: its colors, skin and motion, read back by trimesh, by our own reader and by
-Khronos's validator.
+"""The body as a mesh: colors, skin and motion, as trimesh, our reader and Khronos's validator see
+them.
 """
 
 import functools
@@ -38,21 +38,20 @@ from humangs_jax.motion.skeleton import shipped_joints
 from humangs_jax.rendering.gaussians import Gaussians
 
 VALIDATOR = Path(os.environ.get("HUMANGS_NPM", ".")) / "node_modules" / "gltf-validator"
-"""Where `npm install gltf-validator` was run: the environment variable HUMANGS_NPM."""
+"""Folder of `npm install gltf-validator`, below the variable HUMANGS_NPM."""
 BLENDER = os.environ.get("HUMANGS_BLENDER", "")
-"""A Python that has Blender's module (`pip install bpy`): the environment variable HUMANGS_BLENDER.
-"""
+"""A Python with Blender's module (`pip install bpy`): the variable HUMANGS_BLENDER."""
 TEXTURE = 256
 
 
 def color_at(points):
-    """A smooth color of space."""
+    """Returns a color that varies smoothly in space."""
     return 0.5 + 0.4 * np.sin(3 * points + [0, 1, 2])
 
 
 @functools.cache
 def avatar():
-    """A person like an egg, with our joints in it: two flat Gaussians on each vertex."""
+    """Returns an egg-shaped person with our joints and two flat Gaussians on each vertex."""
     sphere = trimesh.creation.icosphere(subdivisions=3)
     f32 = lambda x: jnp.asarray(x, jnp.float32)
     vertices, joints = sphere.vertices * [0.4, 0.9, 0.3] + [0, -0.4, 0], shipped_joints()
@@ -84,7 +83,7 @@ def textured():
 
 
 def mesh():
-    """With a texture of one color."""
+    """Returns the body's mesh with a texture of one color."""
     one = avatar()
     vertices, weights = np.asarray(one.rest_vertices), np.asarray(one.skinning_weights)[::2]
     normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
@@ -100,7 +99,9 @@ def dance(frames=3):
 
 
 def test_the_outermost_gaussians_give_the_skin_its_color():
-    """A red sheet over a blue one over the skin, and nothing elsewhere but the nearest."""
+    """A red sheet lies over a blue one over the skin. Where there is none, the nearest Gaussian
+    counts.
+    """
     one = avatar()
     sheets = Gaussians(
         jnp.asarray([[0, 0, 0.01], [0, 0, 0.02], [1, 0, 0]], jnp.float32),
@@ -145,9 +146,7 @@ def test_vertices_have_the_weights_of_their_gaussians_also_after_refinement():
 
 @pytest.mark.slow
 def test_the_texture_is_what_was_on_the_body(tmp_path):
-    """Colors at the vertices as trimesh looks them up in the file are those of the place; the file
-    has the mesh standing on 0.
-    """
+    """trimesh's colors at the vertices are those of their places; the mesh stands at height 0."""
     write_mesh_glb(tmp_path / "a.glb", avatar(), textured())
     read = trimesh.load(tmp_path / "a.glb", process=False).geometry["body"]
     places = textured().vertices
@@ -249,8 +248,8 @@ def test_a_motion_that_was_exported_is_read_again(tmp_path):
 
 
 def test_numbers_of_turns_never_jump_between_frames(tmp_path):
-    """Some players interpolate numbers: two whole turns, each wrapped at half a turn, so that the
-    sign flips twice.
+    """Some players interpolate the numbers: two whole turns, each wrapped at half a turn, so that
+    the sign flips twice.
     """
     angles = (np.linspace(0, 4 * np.pi, 25) + np.pi) % (2 * np.pi) - np.pi
     rotations = np.zeros((25, 55, 3))
@@ -325,9 +324,7 @@ def test_trimesh_reads_our_obj(tmp_path, monkeypatch, capsys):
 )
 @pytest.mark.slow
 def test_khronos_validator_finds_nothing(tmp_path):
-    """No issue at all with the mesh; with the Gaussians only that it does not know the
-    extension.
-    """
+    """It has no issue with the mesh; of the Gaussians it only says that it lacks the extension."""
     write_mesh_glb(tmp_path / "mesh.glb", avatar(), mesh(), dance(), "dance", "z")
     write_glb(tmp_path / "gaussians.glb", avatar().gaussians)
     found = {}
@@ -379,9 +376,7 @@ bpy.ops.export_anim.bvh(
 )
 @pytest.mark.slow
 def test_blender_shows_our_frames_and_we_read_its_files(tmp_path):
-    """Vertices of a frame in Blender are ours with z up; its .glb and .bvh of our motion are that
-    motion.
-    """
+    """Blender shows our vertices with z up; its .glb and .bvh files hold our motion."""
     one = avatar()
     rest = RestBody(one.rest_vertices, one.rest_joints)
     motion = grounded(dance(4), rest, PARENTS)

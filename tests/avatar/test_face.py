@@ -1,6 +1,4 @@
-"""Avatars with a face: what an expression moves, shows and hides, and that nothing changes
-without one.
-"""
+"""Avatars with a face: what an expression moves, shows and hides. Without one nothing changes."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +24,7 @@ SKIN = 0.6
 
 
 def person(count=None, per_vertex=1):
-    """An avatar on the shipped body, all of one color."""
+    """Returns (body, avatar): the shipped body, in one color."""
     body = load_body() if count is None else decimate(load_body(), count)
     rest = shape_body(body, jnp.zeros(0))
     g = per_vertex * len(body.template)

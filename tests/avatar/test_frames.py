@@ -1,6 +1,4 @@
-"""Frames of an animation: where the cameras stand, which frames there are, what is behind the
-person, how buffers are planned.
-"""
+"""Frames of an animation: cameras, numbers of frames, backgrounds, and sizes of buffers."""
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +16,9 @@ from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import Rendering, render
 
 ROUNDING = 1e-6
-"""float32; other buffers are other programs."""
+"""Rounding of float32 between programs with buffers of other sizes."""
 PIXEL_ROUNDING = 2e-2
-"""Pixels: float32 of positions some metres away."""
+"""Pixels: rounding of float32 positions some metres away."""
 
 
 def blobs(count=80):
@@ -73,7 +71,7 @@ def test_each_camera_has_its_exposure():
 
 
 def pixels(cameras, points):
-    """(v, p, 2) where each camera sees the points of its frame."""
+    """Returns pixels (v, p, 2) at which each camera sees the points of its frame."""
     K, world = np.asarray(cameras.K, float), np.asarray(cameras.cam_from_world, float)
     seen = np.einsum("vij,vpj->vpi", world[:, :3, :3], points) + world[:, None, :3, 3]
     assert (seen[..., 2] > 0).all()
@@ -82,7 +80,7 @@ def pixels(cameras, points):
 
 
 def walker(metres=3.0, frames_per_second=30, seconds=3.0):
-    """A box 1.7 m high that walks along x, bobbing and swaying at the pace of steps."""
+    """Returns points (m, 8, 3) of a box 1.7 m high that walks along x and sways with its steps."""
     count = int(seconds * frames_per_second)
     time = np.arange(count) / frames_per_second
     path = np.stack(
@@ -243,8 +241,8 @@ def test_times_outside_of_the_motion_are_named(times):
 
 
 def test_what_is_behind_the_person():
-    """A color shows through; without one the image has straight alpha, which gives the same over
-    that color.
+    """A background color shows through. Without one the image has straight alpha, which gives the
+    same over that color.
     """
     rng = np.random.default_rng(0)
     alpha = np.concatenate([[0.0, 1.0], rng.random(10)]).reshape(3, 4).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Layers of views against a person of two balls, whose surface, normals and parts are known."""
+"""Layers of views, on a person of two balls whose surface, normals and parts are known."""
 
 import jax
 import jax.numpy as jnp
@@ -20,16 +20,17 @@ from humangs_jax.rendering.splatting import Rendering
 TURN, MOVE = np.asarray([0.0, 0.3, 0.5]), np.asarray([0.2, -0.1, 0.4])
 ALL = ("rgba", "z", "position", "normal", "part")
 SURFACE = 4 * SPLAT
-"""Metres: splats of this size that are nearer cover those beside them, the more the steeper the
-surface.
+"""Largest error of the surface, metres: a nearer splat covers those beside it, on steep surfaces
+the more.
 """
 NORMAL = 0.1
-"""1 - cosine; a pixel sees splats of vertices some degrees apart."""
+"""Largest error of a normal, 1 - cosine: a pixel sees splats of vertices some degrees apart."""
 
 
 def turned_pose():
-    """The root turned and moved, the upper ball turned about its own centre, which changes its
-    normals not at all.
+    """Returns a pose with the root turned and moved, and the upper ball turned about its centre.
+
+    The second turn does not change the ball's normals.
     """
     rotations = np.stack([TURN, [0.4, 0.0, 0.0], np.zeros(3)]).astype(np.float32)
     return BodyPose(jnp.asarray(rotations), jnp.asarray(MOVE, jnp.float32))
@@ -85,9 +86,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_drawn(tmp_path):
 
 
 def test_exr_colors_are_premultiplied(tmp_path, monkeypatch):
-    """A compositing program shows what was rendered when it adds (1 - alpha) times the
-    background.
-    """
+    """Compositing programs add (1 - alpha) times the background, which gives what was rendered."""
     avatar, shot = two_balls(1), FrameSettings(width=3, height=1, background="#336699")
     alpha = np.asarray([[0.0, 0.5, 1.0]], np.float32)
     rendering = Rendering(
@@ -119,9 +118,7 @@ def test_exr_colors_are_premultiplied(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_layers_of_the_two_balls(tmp_path):
-    """Drawn, written, read: the ray through each pixel says where surface, normal and part must
-    be.
-    """
+    """The ray through a pixel says which surface, normal and part the file must have there."""
     avatar, pose, shot = (
         two_balls(),
         turned_pose(),
@@ -183,8 +180,8 @@ def test_layers_of_the_two_balls(tmp_path):
 
 @pytest.mark.slow
 def test_what_no_frame_shows_can_be_left_out():
-    """A ball inside of a ball is never seen; the images stay those of all Gaussians to half a level
-    of 8 bits.
+    """A ball inside another one is never seen; without it images differ by at most half an 8-bit
+    level.
     """
     avatar = two_balls(3)
     n = len(avatar.rest_vertices) // 2

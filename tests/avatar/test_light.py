@@ -1,4 +1,4 @@
-"""Two balls, whose normals turn through all directions: their light and their albedo are known."""
+"""The light and the albedo of two balls, whose normals turn through all directions, are known."""
 
 import jax
 import jax.numpy as jnp
@@ -26,15 +26,15 @@ from humangs_jax.io.reading import FileError
 
 SUN = jnp.asarray([0.15, 0.3, -0.1, 0.05, -0.05, 0.02, 0.05, -0.04])
 PHOTOS = jnp.asarray([[0.0, 0.4, 0.0], [0.3, 0.0, 0.1], [0.0, 0.0, 0.0]])
-"""Axis-angle of the joints in the photos; the balls' own joints turn them about their centres."""
+"""Axis-angle rotations of the joints in the photos; the balls turn about their centres."""
 TURNED = BodyPose(jnp.asarray([[0.0, 2.0, 0.0], [0.0, 0.0, 1.5], [0.0, 0.0, 0.0]]), jnp.zeros(3))
 ESTIMATED = 0.01
-"""Of colors up to 1; measured 0.003: the ridge, and dyes that meet on one ball."""
+"""Largest error of colors up to 1; measured 0.003, from the ridge and from dyes that meet."""
 ROUNDING = 2e-6
 
 
 def in_pose(rotations, count=2):
-    """Views of one pose; nothing but poses and their number is read."""
+    """Returns views of one pose, of which only the poses and their number are read."""
     blank, poses = jnp.zeros((count, 1, 1, 3)), jnp.tile(rotations, (count, 1, 1))
     cameras = orbit(jnp.zeros(3), 3.0, jnp.zeros(count), 0.0, jnp.eye(3), 1, 1)
     return SubjectViews(blank, blank[..., 0], cameras, poses, jnp.zeros((count, 3)), jnp.zeros(2))
@@ -47,13 +47,13 @@ def normals_in(avatar, pose):
 
 
 def lit(avatar, albedo, pose):
-    """The avatar with the colors that its albedo has in the sun."""
+    """Returns the avatar with the colors that its albedo has in the sun."""
     colors = albedo * jnp.exp(light_terms(normals_in(avatar, pose)) @ SUN)[:, None]
     return replace(avatar, gaussians=replace(avatar.gaussians, colors=colors))
 
 
 def albedo_of(avatar):
-    """Three dyes with sharp edges."""
+    """Returns an albedo of three dyes with sharp edges."""
     height = avatar.rest_vertices[:, 1:2]
     dyes = jnp.asarray([[0.5, 0.3, 0.2], [0.2, 0.3, 0.5], [0.4, 0.4, 0.4]])
     return jnp.where(height < 0.45, dyes[0], jnp.where(height < 1.3, dyes[1], dyes[2]))

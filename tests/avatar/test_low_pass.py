@@ -25,9 +25,7 @@ from humangs_jax.rendering.splatting import render
 
 PIXEL = 0.0086
 ROUNDING = 3e-4
-"""Relative, of scales of a tenth of a pixel: float32 keeps 1e-7 of the variance that the low-pass
-has.
-"""
+"""Relative error of scales of a tenth of a pixel: float32 keeps 1e-7 of the low-pass's variance."""
 
 
 def flat_avatar():
@@ -97,8 +95,8 @@ def test_files_keep_the_size_of_the_pixels(tmp_path):
 
 
 def test_fine_things_weigh_the_same_in_small_images():
-    """A Gaussian thinner than a pixel: its opacity times its area, in metres, is that of the images
-    that it was fitted to.
+    """Opacity times area of a Gaussian thinner than a pixel stays that of the images it was fitted
+    to.
     """
     fine = 0.002
     one = Gaussians(
@@ -133,7 +131,7 @@ def test_fine_things_weigh_the_same_in_small_images():
 
 
 def test_nothing_is_dimmed_in_the_photos_that_give_the_size_of_the_pixels():
-    """Also if their pixels are not square."""
+    """This also holds if their pixels are not square."""
     rest, blank = BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)), jnp.zeros((1, 48, 48, 3))
     K = intrinsics_from_fov(0.7, 48, 48) * jnp.asarray([[0.5], [1.0], [1.0]]) + jnp.zeros(
         (3, 3)
@@ -173,7 +171,7 @@ def test_dimmed_splats_are_drawn_as_defined():
 
 @pytest.mark.slow
 def test_dimming_is_differentiable_at_any_size(float64):
-    """Needles, points without extent, and footprints that overflow."""
+    """Sizes include needles, points without extent, and footprints that overflow."""
     camera = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, 32, 32), 32, 32)[
         0
     ]

@@ -29,7 +29,7 @@ def small(demo):
 
 @pytest.fixture
 def people(tmp_path, monkeypatch, network, small):
-    """Captures of two, three and four photos in the folder `people`, and weights; b is spoiled."""
+    """Returns a folder with three captures of two to four photos, and weights; b is damaged."""
     monkeypatch.chdir(tmp_path)
     save_weights(tmp_path / "tiny.safetensors", *network)
     for name, photos in {"a": 2, "b": 2, "c": 3, "d": 4}.items():
@@ -79,7 +79,7 @@ def test_a_folder_of_captures_goes_on_with_what_is_missing_and_mixes_nothing(peo
 
 @pytest.mark.slow
 def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(network, small):
-    """The second cannot be read; the third can be read, and fails in every batch."""
+    """The second capture cannot be read. The third can be read, and fails in every batch."""
 
     def unreadable():
         raise OSError("thirteen")

@@ -1,6 +1,4 @@
-"""Formats of Gaussians that are read only: PlayCanvas' SOG and gsplat's checkpoints, from files
-by hand.
-"""
+"""Formats of Gaussians that are read only: PlayCanvas' SOG, and checkpoints of gsplat."""
 
 import numpy as np
 import pytest
@@ -74,7 +72,7 @@ def test_wrong_bundles_are_one_line(case, tmp_path):
 
 
 def checkpoint_of(g):
-    """What simple_trainer.py saves."""
+    """Returns the arrays that gsplat's simple_trainer.py saves."""
     o = np.asarray(g.opacities)
     parts = {
         "means": np.asarray(g.means),

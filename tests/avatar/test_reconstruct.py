@@ -64,7 +64,7 @@ def network():
 
 
 def avatars_of(batch):
-    """The avatars of a batch in which nothing is wrong."""
+    """Returns the avatars of a batch and checks that no capture failed."""
     found = list(batch)
     assert not [each.error for each in found if each.error is not None]
     return [each.avatar for each in found]
@@ -129,7 +129,7 @@ def test_reconstruct_and_render_lower_for_every_platform(body, network):
 
 
 def made(body, means, size, betas=(0.0,) * 4):
-    """An avatar of round Gaussians, one per vertex."""
+    """Returns an avatar of round Gaussians, one on each vertex."""
     count = len(means)
     gaussians = Gaussians(
         means,
@@ -248,8 +248,8 @@ def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
 
 @pytest.mark.slow
 def test_pose_correctives_move_what_the_network_reads_and_not_gaussians(body, network):
-    """As in the release: vertices are sampled where the whole body model puts them, Gaussians move
-    by blend skinning alone.
+    """As in the release, the network reads at the vertices of the whole body model, and Gaussians
+    move by blend skinning alone.
     """
     _, config = network
     directions = (
@@ -274,9 +274,7 @@ def test_pose_correctives_move_what_the_network_reads_and_not_gaussians(body, ne
 
 @pytest.mark.slow
 def test_light_shines_from_above_in_a_capture_of_another_world(body):
-    """Drawing and fitting an avatar with light give the same in a capture whose z axis points
-    up.
-    """
+    """Fitting and drawing light give the same in a capture with z up."""
     photos = capture(body, SIZE, SIZE)
     bent = replace(
         photos.poses, rotations=photos.poses.rotations.at[:, 16].set(jnp.asarray([0.0, 0.0, -1.2]))
@@ -300,7 +298,7 @@ def test_light_shines_from_above_in_a_capture_of_another_world(body):
 
 
 def test_people_who_lie_before_upright_cameras_are_left_lying(body):
-    """The person alone says nothing about the world; that of captures has y up."""
+    """A pose alone does not tell which way is up; captures have y up."""
     photos = capture(body, SIZE, SIZE)
     roots = np.zeros((photos.view_count, 3))
     roots[:, 0] = -np.pi / 2
@@ -308,9 +306,7 @@ def test_people_who_lie_before_upright_cameras_are_left_lying(body):
 
 
 def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
-    """The masks say where the person is; the pixel at which a camera shows a point has the same
-    color before and after.
-    """
+    """The pixel at which a camera sees a point has the same color before and after cutting."""
     photos = capture(body, 48, 36)
     photos.masks[:] = 0
     photos.masks[0, 10:26, 4:12], photos.masks[1, 20:48, 20:30] = (
@@ -470,7 +466,7 @@ def test_the_body_is_decimated_to_what_the_weights_want(body, network):
 
 
 def capture_of(body, seed, views):
-    """Photos of noise, a pose in each."""
+    """Returns a capture of noise with one pose for each photo."""
     subject = subject_views(seed, views)
     return capture_from_arrays(
         np.asarray(subject.images),
@@ -502,7 +498,7 @@ def test_a_batch_of_people_with_different_numbers_of_views(body, network):
 
 
 def outward(photos):
-    """The capture with its body a centimetre thicker."""
+    """Returns the capture with its body a centimetre thicker."""
     rest = shape_body(photos.body, jnp.asarray(photos.betas))
     normals = np.asarray(vertex_normals(rest.vertices, photos.body.faces))
     return dataclasses.replace(photos, displacement=0.01 * normals)
@@ -641,9 +637,7 @@ def test_what_cannot_be_one_batch_is_named(body, network):
 
 @pytest.mark.slow
 def test_stacked_captures_are_a_batch_for_vmap(body, network):
-    """The line of the README gives what `reconstruct_batch` gives, bit by bit: it is the same
-    program.
-    """
+    """The README's line gives what `reconstruct_batch` gives, bit by bit."""
     variables, config = network
     config = config.with_conventions(body_vertices=300, light=True).with_runtime(token_capacity=0)
     captures = [capture_of(body, seed, views) for seed, views in enumerate((2, 1))]

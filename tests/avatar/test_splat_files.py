@@ -1,6 +1,4 @@
-"""Gaussians of other people's files: those that we write come back, and files by hand from the
-published layouts are read.
-"""
+"""Files of Gaussians: ours come back as written; files by other programs' layouts are read."""
 
 import gzip
 import json
@@ -32,7 +30,7 @@ STEPS = {
 
 
 def scene(count=0, g=20, seed=0) -> Gaussians:
-    """In the order in which `.splat` has them: the largest first."""
+    """Returns Gaussians in the order of `.splat`, the largest first."""
     gaussians = random_gaussians(seed, g, count)
     order = jnp.argsort(-gaussians.opacities * gaussians.scales.prod(axis=1))
     return replace(gaussians, scales=gaussians.scales[order], opacities=gaussians.opacities[order])
@@ -55,7 +53,7 @@ CASES = [(suffix, count) for suffix in STEPS for count in COUNTS if suffix != ".
 
 @pytest.mark.parametrize(("suffix", "count"), CASES)
 def test_what_is_saved_comes_back_and_stays(suffix, count, tmp_path):
-    """A second time nothing changes: the steps of the format are taken once."""
+    """Saving the read Gaussians again changes nothing: the format rounds once."""
     path, again = tmp_path / f"a{suffix}", tmp_path / f"b{suffix}"
     before = scene(count)
     hg.save_gaussians(path, before)
@@ -74,7 +72,7 @@ def test_what_is_saved_comes_back_and_stays(suffix, count, tmp_path):
 
 @pytest.mark.parametrize("suffix", STEPS)
 def test_worlds_with_y_up_come_back_and_stand_upright_everywhere(suffix, tmp_path):
-    """The head of a person who is exported is above the feet for viewers of every format."""
+    """In viewers of every format the head of an exported person is above the feet."""
     before = scene()
     hg.save_gaussians(tmp_path / f"a{suffix}", before, y_up=True)
     assert_close(hg.load_gaussians(tmp_path / f"a{suffix}", y_up=True), before, STEPS[suffix])
@@ -96,7 +94,7 @@ def test_deformations_and_a_low_pass_are_in_the_scales(tmp_path):
 
 
 def ply(gaussians, kind="<f4", form="binary_little_endian", extra=(), faces=False):
-    """3DGS, as its authors' program lays it out."""
+    """Returns a .ply file in the layout of 3DGS's authors."""
     g = gaussians
     rest = (
         np.zeros((len(g.means), 0))
@@ -123,7 +121,7 @@ def ply(gaussians, kind="<f4", form="binary_little_endian", extra=(), faces=Fals
 
 
 def packed(parts, widths):
-    """Parts from 0 to 1 in words, the first in the highest bits."""
+    """Returns numbers from 0 to 1 packed into 32-bit words, the first in the highest bits."""
     word = np.zeros(len(parts), np.uint32)
     for part, width in zip(parts.T, widths, strict=True):
         word = word << np.uint32(width) | np.rint(part * (2**width - 1)).astype(np.uint32)
@@ -131,7 +129,7 @@ def packed(parts, widths):
 
 
 def smallest_three(quats):
-    """Index of the largest component, which is not negative, and the others in their order."""
+    """Returns the index of the largest component, which is made positive, and the other three."""
     quats = np.asarray(quats) / np.linalg.norm(quats, axis=1, keepdims=True)
     largest = np.argmax(np.abs(quats), axis=1)
     quats = quats * np.sign(quats[np.arange(len(quats)), largest])[:, None]
@@ -229,7 +227,7 @@ def spz(gaussians, version):
 
 
 def spz_four(parts, count=20, degree=0, bits=12, flags=0, records=b"", sizes=None, toc=None):
-    """Version 4: a plain header, records of others, a table, and a zstd frame for each array."""
+    """Returns a file of version 4: header, records, table, and a zstd frame for each array."""
     frames = [zstd.compress(part) for part in parts]
     sizes = [len(part) for part in parts] if sizes is None else sizes
     table = b"".join(
@@ -241,7 +239,7 @@ def spz_four(parts, count=20, degree=0, bits=12, flags=0, records=b"", sizes=Non
 
 
 def glb(gaussians, node=None, change=lambda content: None, short=False):
-    """glTF 2.0 with the attributes of the extension; rotations in 16 bits where `short` says so."""
+    """Returns a glTF 2.0 file with the extension's attributes; `short` stores 16-bit rotations."""
     g = gaussians
     quats = np.asarray(g.quats) / np.linalg.norm(g.quats, axis=1, keepdims=True)
     columns = {
@@ -307,7 +305,7 @@ def glb(gaussians, node=None, change=lambda content: None, short=False):
 
 SHORT = (1e-6, 1e-3, 1e-6, 1e-6, 1e-6)
 PACKED = (2e-3, 0.03, 0.51 / 255, 0.51 / 255, 8 / 512)
-"""Positions over some 5 m in 10 bits, harmonics from -4 to 4 in 8."""
+"""Errors of 10-bit positions over some 5 m and of 8-bit harmonics from -4 to 4."""
 BY_HAND = {
     "float": (ply, STEPS[".ply"]),
     "double": (lambda g: ply(g, "<f8"), STEPS[".ply"]),
@@ -355,7 +353,7 @@ def test_splat_is_read_by_its_suffix(tmp_path):
 
 
 def test_gaussians_of_a_glb_lie_where_its_nodes_are(tmp_path):
-    """Half a turn about z, twice as large, one higher; beside it another one that stays."""
+    """One node turns by half about z, doubles the size and lifts by one; another one stays."""
     node = {"rotation": [0, 0, 1, 0], "scale": [2, 2, 2], "translation": [0, 1, 0]}
     (tmp_path / "a.glb").write_bytes(
         glb(scene(3), node, lambda content: content["nodes"].append({"mesh": 0}))
@@ -504,7 +502,7 @@ def test_what_a_file_cannot_hold_is_not_written(tmp_path):
 
 
 def test_version_4_is_written_and_read(tmp_path):
-    """The table names each array, no more; both versions hold the same numbers."""
+    """The table names each array and no more; versions 3 and 4 hold the same numbers."""
     for count in COUNTS:
         for version in (3, 4):
             hg.save_gaussians(tmp_path / f"{version}.spz", scene(count), version=version)
@@ -532,9 +530,7 @@ def test_what_a_spz_says_and_is_not_used_is_told(tmp_path, caplog):
 
 @pytest.mark.parametrize("suffix", STEPS)
 def test_gaussians_that_are_not_finite_are_left_out_and_counted(suffix, tmp_path, caplog):
-    """A NaN in a mean, an infinite scale and a quaternion of NaN, as far as the format can hold
-    them.
-    """
+    """A mean and a quaternion have a NaN, and a scale is infinite, as far as the format allows."""
     if suffix == ".spz":
         pytest.skip("holds finite numbers alone")
     bad = scene()

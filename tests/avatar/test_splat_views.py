@@ -1,4 +1,4 @@
-"""`humangs render` of Gaussians of any program: from a circle, and from the cameras of a file."""
+"""`humangs render` of Gaussians of any program, from a circle or from the cameras of a file."""
 
 import json
 import sys
@@ -19,11 +19,11 @@ from humangs_jax.geometry.camera import project
 from humangs_jax.io.images import read_image
 
 STEP = 0.51 / 255
-"""Half a step of 8 bits."""
+"""Half a step of 8 bits, with a margin for rounding."""
 
 
 def ball(g=60, seed=0):
-    """Of 1 m around (1, 2, 3), colored by direction."""
+    """Returns Gaussians on a ball of radius 1 m around (1, 2, 3), colored by direction."""
     rng = np.random.default_rng(seed)
     d = rng.normal(size=(g, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -81,7 +81,7 @@ def test_a_circle_shows_the_whole_scene_upright(tmp_path, monkeypatch, capsys):
 
 
 def person_like(far=0):
-    """Centres in a box of a person with its arms out, fewer in the feet, and some far away."""
+    """Returns Gaussians with the outline of a person with arms out, and `far` of them elsewhere."""
     rng = np.random.default_rng(0)
     body = rng.uniform(-1, 1, (2000, 3)) * [0.25, 0.5, 0.15] + [0, 1.2, 0]
     arms, feet = (
@@ -101,18 +101,19 @@ def person_like(far=0):
 
 
 AXES = {"ply": "RDF", "splat": "RDF", "spz": "RUB", "glb": "LUF"}
-"""What x, y and z are in these files, by Niantic's converters: right or left, up or down, front or
-back (https://github.com/nianticlabs/spz#coordinate-system)."""
+"""Directions of x, y and z in the formats, by Niantic's converters: right or left, up or down,
+front or back (https://github.com/nianticlabs/spz#coordinate-system).
+"""
 
 
 def looking(camera):
-    """The direction in which a camera looks."""
+    """Returns the direction in which a camera looks."""
     return np.asarray(camera.cam_from_world)[2, :3]
 
 
 @pytest.mark.parametrize("name", AXES)
 def test_the_first_view_of_every_format_shows_a_person_upright_and_from_the_front(name, tmp_path):
-    """As converters and viewers of these formats take their axes."""
+    """The axes are those that converters and viewers of the formats use."""
     person = small_avatar()
     export(tmp_path / f"me.{name}", person)
     loaded = hg.load_gaussians(tmp_path / f"me.{name}")
@@ -131,7 +132,7 @@ def test_the_first_view_of_every_format_shows_a_person_upright_and_from_the_fron
 
 @pytest.mark.parametrize("up", ["-y", "y", "z"])
 def test_another_axis_may_be_up_in_every_format(up, tmp_path):
-    """Feet on 0, and the head where up is."""
+    """The feet are at height 0 and the head is above them."""
     axis = {"-y": [0, -1, 0], "y": [0, 1, 0], "z": [0, 0, 1]}[up]
     for name in AXES:
         export(tmp_path / f"me.{name}", small_avatar(), up=up)

@@ -40,7 +40,7 @@ def normals(body, rest):
 
 
 def gaussians_on(rest, colors):
-    """`PER_VERTEX` Gaussians on each vertex, in its color."""
+    """Returns `PER_VERTEX` Gaussians on each vertex, in the vertex's color."""
     count = PER_VERTEX * len(rest)
     return Gaussians(
         jnp.repeat(rest, PER_VERTEX, axis=0),
@@ -61,17 +61,16 @@ def dominant(body, *words):
 
 
 def seen_from_the_front(body, rest, normals, paint):
-    """The Gaussians with guesses, where a frontal photo shows red clothes, hair on the crown and
-    the skin of a face.
-    """
+    """Returns the Gaussians after guessing what a photo from the front does not show."""
     regions = body_regions(body, rest)
     shown = jnp.maximum(normals[:, 2], 0)
     return guessed(gaussians_on(rest, paint), rest, normals, shown, regions)
 
 
 def painted(body, rest, normals):
-    """Red clothes, dark hair on the crown, skin on the face and the hands; grey where no frontal
-    photo shows anything.
+    """Returns colors of the vertices as a photo from the front shows them.
+
+    Clothes are red, hair is dark, face and hands are skin; what is not shown is grey.
     """
     regions, front = body_regions(body, rest), np.asarray(normals[:, 2]) > 0.03
     head, hands = np.asarray(regions.head), dominant(body, "wrist", "index", "thumb", "pinky")
@@ -136,7 +135,7 @@ def test_cloth_stands_off_the_back_as_far_as_off_the_front(body, rest, normals):
 
 
 def line(*places):
-    """Regions of vertices on a line, all of them free and sources."""
+    """Returns regions of vertices on a line, all of which are free and are sources."""
     features = jnp.asarray(places, jnp.float32)[:, None]
     yes = jnp.ones(len(places), bool)
     return Regions(~yes, yes, yes, features, -features)
@@ -166,8 +165,9 @@ def test_guesses_have_gradients():
 
 
 def capture_from(body, azimuths, covered=None):
-    """A person photographed from some directions, degrees, 0 in front. covered: where masks end,
-    a share of the height.
+    """Returns a capture of a person who is photographed from `azimuths`, degrees, 0 in front.
+
+    Masks end at the share `covered` of the height.
     """
     size, count = 64, len(azimuths)
     K = intrinsics_from_fov(np.pi / 3, size, size)

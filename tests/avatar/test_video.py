@@ -9,15 +9,13 @@ from humangs_jax.avatar.video import check_video, video_size, write_video
 from humangs_jax.io.images import read_image
 
 H264_ERROR = 0.02
-"""Mean absolute difference after compression of a smooth image; a wrong color matrix gives 0.03 and
-more.
-"""
+"""Mean absolute error of a compressed smooth image; a wrong color matrix gives at least 0.03."""
 PALETTE_ERROR = 0.02
-"""256 colors for all frames."""
+"""Mean absolute error with 256 colors for all frames."""
 
 
 def moving_square(count, height=48, width=64):
-    """A smooth colored background, a saturated square that moves."""
+    """Returns frames of a saturated square that moves over a smooth background."""
     y, x = np.mgrid[:height, :width]
     frames = np.stack(
         [np.stack([x / width, y / height, np.full(x.shape, 0.5)], -1) for _ in range(count)]
@@ -35,7 +33,7 @@ def ffmpeg(*arguments):
 
 
 def read_back(path, height=48, width=64):
-    """By ffmpeg itself (imageio's reader leaves file handles open)."""
+    """Returns the frames of a video as ffmpeg reads them (imageio's reader leaves files open)."""
     data = ffmpeg(
         "-v",
         "error",
@@ -172,7 +170,7 @@ def test_what_cannot_be_written_is_refused_before_it_is_drawn(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "frames"])
 def test_frames_are_taken_one_by_one(tmp_path, name):
-    """The same file as of an array, and an error in the middle leaves nothing."""
+    """A generator gives the same file as an array, and an error in the middle leaves no file."""
     frames, alive = moving_square(12), []
 
     def drawn():
@@ -227,7 +225,7 @@ def test_gif_keeps_its_speed_and_loops(tmp_path, fps, count):
 
 @pytest.mark.parametrize("background", [1.0, 0.0, 0.37])
 def test_gif_background_is_exact(tmp_path, background):
-    """Median cut takes the mean of its boxes: white became 252 beside a person of many colors."""
+    """Median cut averages its boxes: white was 252 beside a person of many colors."""
     from PIL import Image
 
     frames = np.full((4, 48, 64, 3), background)

@@ -1,4 +1,4 @@
-"""Small made-up bodies and an independent oracle for them."""
+"""Small made-up bodies, and a body model written independently of the package's."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +10,9 @@ PARENTS = (-1, 0, 5, 0, 3, 0, 2)  # joint 2's parent has a higher index
 
 
 def made_up_body(seed=0, n=25, s=4, pose_directions=True, dtype=None):
-    """Random numbers with the invariants of a body; no plausible shape.
+    """Returns a body of random numbers that has the invariants of a body, but no plausible shape.
 
-    dtype: None for that of `jax.enable_x64`.
+    A dtype of None stands for that of `jax.enable_x64`.
     """
     rng = np.random.default_rng(seed)
     j = len(PARENTS)
@@ -38,7 +38,7 @@ def random_pose(seed, joints=len(PARENTS)):
 
 
 def world_frames(joints, parents, rotations):
-    """4x4 frame of each joint, by walking up from it: no batching, no precedence."""
+    """Returns the 4x4 frame of each joint, multiplied up to the root one joint at a time."""
     frames = []
     for j in range(len(parents)):
         frame, joint = np.eye(4), j
@@ -53,7 +53,7 @@ def world_frames(joints, parents, rotations):
 
 
 def oracle(body, betas, rotations, translation):
-    """Vertices, joints and joint transforms in float64, vertex by vertex and joint by joint."""
+    """Returns vertices, joints and joint transforms in float64, computed one by one."""
     get = lambda name: np.asarray(getattr(body, name), np.float64)
     rest = get("template").copy()
     for i, beta in enumerate(betas):
@@ -87,7 +87,7 @@ def oracle(body, betas, rotations, translation):
 
 
 def edge_counts(faces):
-    """How often each directed edge occurs."""
+    """Returns how often each directed edge occurs."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     return {
         tuple(edge): count
@@ -96,7 +96,10 @@ def edge_counts(faces):
 
 
 def is_closed(faces):
-    """Every directed edge once, and its opposite too: a watertight surface with one orientation."""
+    """Returns whether every directed edge occurs once, and so does its opposite.
+
+    Such a surface is watertight and has one orientation.
+    """
     counts = edge_counts(faces)
     return set(counts.values()) == {1} and all((int(b), int(a)) in counts for a, b in counts)
 

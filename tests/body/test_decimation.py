@@ -17,7 +17,7 @@ def small(request, body):
 
 
 def places(small, body):
-    """Index in the full body of each vertex of the small one."""
+    """Returns the index in the full body of each vertex of the small one."""
     where = {tuple(v): i for i, v in enumerate(np.asarray(body.template).tolist())}
     return np.asarray([where[tuple(v)] for v in np.asarray(small.template).tolist()])
 
@@ -80,7 +80,7 @@ def test_texture_corners_belong_to_their_vertices_and_stay_in_their_charts(small
 
 
 def test_vertices_spread_over_the_skin(body):
-    """The face, the ears and the hands are crowded; half of the vertices must not stay there."""
+    """Face, ears and hands are crowded in the full body; half of the vertices must leave them."""
     owner = lambda b: np.asarray(b.skinning_weights).argmax(1)
     crowded = [12, 15, 20, 21, *range(25, 55)]
     share = lambda b: np.isin(owner(b), crowded).mean()
@@ -101,7 +101,7 @@ def test_the_whole_size_changes_nothing_and_others_are_refused(body):
 
 
 def sphere(rings=12, radius=1.0, open_below=False):
-    """Vertices and faces of a sphere, or of its upper part with a rim."""
+    """Returns vertices and faces of a sphere, or of its upper part, which has a rim."""
     columns = 2 * rings
     angles = np.linspace(0, np.pi, rings + 1)[1:-1]
     angles = angles[: len(angles) // 2 + 1] if open_below else angles
@@ -191,8 +191,8 @@ def test_what_is_hidden_goes_first():
 
 
 def test_texture_seams_stay_closed():
-    """A vertex with two texture vertices moves along the seam only, so both of its charts find a
-    partner.
+    """A vertex with two texture vertices moves along the seam only, so that its two charts still
+    meet.
     """
     vertices, faces = sphere(rings=8)
     right = vertices[faces].mean(1)[:, 0] > 0

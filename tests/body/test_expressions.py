@@ -1,6 +1,4 @@
-"""Expressions of bodies: the 52 shapes of the shipped one, those of SMPL-X, and what other
-resolutions keep of them.
-"""
+"""Expressions of bodies: the 52 shapes of the shipped one, SMPL-X's, and other resolutions."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,4 @@
-"""Joints in a pose."""
+"""Places and rotations of joints in a pose."""
 
 import jax.numpy as jnp
 import numpy as np

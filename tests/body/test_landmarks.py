@@ -45,7 +45,7 @@ def small(body):
 
 @pytest.fixture(scope="module")
 def whole(body):
-    """All landmarks that the module knows, and where they are at rest."""
+    """Returns (model of all known landmarks, their places at rest by name)."""
     model = landmark_model(body, COCO_WHOLEBODY_133.names)
     return model, dict(zip(model.names, at_rest(model), strict=True))
 
@@ -67,7 +67,7 @@ BENT = BodyPose(
     REST.rotations.at[JOINT_NAMES.index("left_elbow")].set(jnp.asarray([0, -np.pi / 2, 0])),
     jnp.zeros(3),
 )
-"""The left elbow is bent by a right angle, to the front; the body stands where it stood."""
+"""A pose with the left elbow bent forward by a right angle."""
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_places_beside_a_vertex_move_with_its_bones_and_those_of_missing_joints_
 
 
 def test_left_and_right_are_mirror_images(body, whole):
-    """Of the shipped body, which has every landmark of our detector."""
+    """The shipped body has every landmark of our detector."""
     model = landmark_model(body, MEDIAPIPE_33.names, MEDIAPIPE_33.places)
     assert all(model.known)
     for points in (whole[1], dict(zip(model.names, at_rest(model), strict=True))):
@@ -112,7 +112,7 @@ def test_left_and_right_are_mirror_images(body, whole):
 
 @pytest.mark.parametrize("kind", [MEDIAPIPE_33, COCO_17], ids=lambda kind: kind.name)
 def test_mirror_images_share_one_offset_with_x_turned_round(body, kind):
-    """Points of the face, too: the corners of the eyes and of the mouth are pairs."""
+    """Points of the face are pairs, too: the corners of the eyes and of the mouth."""
     model = landmark_model(body, kind.names, kind.places)
     groups = {model.names[landmark]: (group, side) for landmark, group, side in model.placed}
     assert len({group for group, _ in groups.values()}) == len(
@@ -131,7 +131,7 @@ def test_mirror_images_share_one_offset_with_x_turned_round(body, kind):
 
 def test_the_sides_of_all_points_of_the_face():
     """300-W counts jaw, brows, nostrils and upper lips from the person's right to the left, and
-    lower lips back.
+    lower lips from left to right.
     """
     left = {*range(9, 17), *range(22, 27), 34, 35, *range(42, 48), 52, 53, 54, 55, 56, 63, 64, 65}
     middle = {8, *range(27, 31), 33, 51, 57, 62, 66}

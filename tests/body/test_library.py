@@ -1,4 +1,4 @@
-"""The shipped body, and the package's own body file."""
+"""The shipped body, and files of bodies in the package's format."""
 
 import itertools
 from importlib import resources

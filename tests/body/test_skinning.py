@@ -17,7 +17,7 @@ def test_what_is_no_tree_is_refused(parents):
 
 
 def test_points_between_two_limbs_go_with_both_and_points_on_them_with_their_own():
-    """Two upright rows of vertices, a joint each, 20 cm apart."""
+    """Two upright rows of vertices stand 20 cm apart; each has a joint."""
     heights = np.linspace(0, 1, 400)
     row = lambda x: np.stack([np.full(400, x), heights, np.zeros(400)], axis=1)
     vertices, joints = np.concatenate([row(-0.1), row(0.1)]), np.repeat(np.eye(2), 400, axis=0)
@@ -37,7 +37,7 @@ def test_points_between_two_limbs_go_with_both_and_points_on_them_with_their_own
 
 @pytest.mark.parametrize("distance", [0.05, 0.1])
 def test_the_kernel_of_blended_leg_weights_is_as_wide_as_the_distance(distance):
-    """Vertices along x, those with x > 0 of the other leg: its share at x is the normal
+    """Vertices lie along x; those with x > 0 belong to the other leg. Its share at x is the normal
     distribution function of x / distance.
     """
     x = np.linspace(-1, 1, 8000)

@@ -19,7 +19,7 @@ ATOL = 1e-6  # float32 numbers of a metre, read and multiplied once
 
 
 def made_up_file(n=9, columns=20, seed=0):
-    """Arrays of a model file as they are stored: root parent 2^32 - 1, unsigned indices,
+    """Returns a model file's arrays: root's parent is 2^32 - 1, indices are unsigned, numbers
     float64.
     """
     rng = np.random.default_rng(seed)
@@ -55,7 +55,7 @@ PARTS = ("global_orient", "body_pose", "jaw_pose", "leye_pose", "reye_pose")
 
 
 def compare_body(model: Path, arrays: Path) -> list[tuple[str, int, float, float, float]]:
-    """Rows (convention, pose index, vertex, joint and pose difference)."""
+    """Returns rows (convention, pose index, vertex error, joint error, pose error)."""
     expected = np.load(arrays, allow_pickle=False)
     counts = {
         "shape_count": expected["betas"].shape[1],

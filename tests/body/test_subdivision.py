@@ -54,9 +54,7 @@ def test_impossible_lengths_are_refused(coarse, longest):
 
 
 def test_spacing_says_how_much_closer_vertices_are(body):
-    """A flat square of two triangles: all edges halved twice, then spacing is a quarter inside and
-    at the rim.
-    """
+    """All edges of a square of two triangles are halved twice: the spacing is a quarter."""
     square = np.asarray([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
     n = len(square)
     flat = replace(

@@ -1,6 +1,4 @@
-"""A scene of known cameras and points, and writers of each calibration format as the tools write
-it.
-"""
+"""A scene of known cameras and points, and writers of calibrations in every format."""
 
 import json
 
@@ -18,8 +16,9 @@ Y_UP_FROM_Z_UP = np.asarray([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def scene(views=VIEWS):
-    """K (v, 3, 3) with pixel centres at +0.5 and cam_from_world (v, 4, 4), y up, metres, all
-    looking at TARGET.
+    """Returns (K (v, 3, 3), cam_from_world (v, 4, 4)) of cameras that look at TARGET.
+
+    Pixel centres are at +0.5, y is up, lengths are metres.
     """
     K, poses = [], []
     for i in range(views):
@@ -47,7 +46,10 @@ def project(K, pose, p):
 
 
 def in_source(poses, scale=1.0, turn=None):
-    """cam_from_world for a world in units of `scale` metres, whose points are `turn` @ ours."""
+    """Returns the matrices for a world of other units and axes.
+
+    A unit is `scale` metres; a point of that world is `turn` times ours.
+    """
     poses = poses.copy()
     if turn is not None:
         poses[:, :3, :3] = poses[:, :3, :3] @ turn.T
@@ -112,9 +114,9 @@ def write_colmap(folder, K, poses, names, model="PINHOLE", extra=(), seen=None, 
 
 
 def matrix_yaml(key, matrix, decimals=None):
-    """As cv2.FileStorage writes it: data wrapped over lines.
+    """Returns a matrix as cv2.FileStorage writes it, with data on several lines.
 
-    With decimals: as EasyMocap does, on one line.
+    With `decimals` the data are on one line, as EasyMocap writes them.
     """
     matrix = np.atleast_2d(matrix)
     if decimals is None:
@@ -128,7 +130,7 @@ def matrix_yaml(key, matrix, decimals=None):
 
 
 def integer_centers(K):
-    """K for pixel centres at whole numbers."""
+    """Returns K for pixel centres at whole numbers."""
     K = K.copy()
     K[..., :2, 2] -= 0.5
     return K
@@ -150,7 +152,7 @@ def write_easymocap(folder, K, poses, names, decimals=9, dist=(0.0,) * 5):
 
 
 def write_opencv_yaml(file, K, poses, names):
-    """A map for each camera."""
+    """Writes a YAML file of OpenCV with a map for each camera."""
     text = "%YAML:1.0\n---\n# of a rig\n"
     for name, k, pose in zip(names, integer_centers(K), poses, strict=True):
         inside = (
@@ -162,7 +164,7 @@ def write_opencv_yaml(file, K, poses, names):
 
 
 def write_opencv_json(file, K, poses, names):
-    """As cv2.FileStorage writes JSON."""
+    """Writes JSON as cv2.FileStorage does."""
     entry = lambda m: {
         "type_id": "opencv-matrix",
         "rows": len(m),
@@ -197,7 +199,7 @@ def write_calibration_full(file, K, poses, names, **changes):
 
 
 def write_transforms(file, K, poses, names, **changes):
-    """As instant-ngp, with the intrinsics in each frame (they differ)."""
+    """Writes transforms.json as instant-ngp does, with the intrinsics in each frame."""
     flip = np.diag([1.0, -1, -1, 1])
     frames = [
         {

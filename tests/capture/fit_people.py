@@ -1,8 +1,7 @@
-"""People before known cameras for the tests of fits, without the generator: quick to make, and of
-every kind of pose.
+"""People before known cameras for tests of fits, in many kinds of pose, without the generator.
 
-A toy body, what is fitted to it compiles quickly; chosen poses of the shipped body; random poses
-with their keypoints; and what a detector sees in photos without a calibration.
+There are a toy body, whose fit compiles quickly; chosen poses of the shipped body; random poses
+with their keypoints; and detections in photos without a calibration.
 """
 
 import functools
@@ -36,7 +35,7 @@ TOY_JOINTS = np.asarray([[0, 0, 0], [0, 0.5, 0], [0, 1.0, 0], [0.5, 1.0, 0]], np
 
 
 def toy_model():
-    """Four joints and eight landmarks: the joints, and a point beside each."""
+    """Returns a model of four joints and eight landmarks: the joints and a point beside each."""
     beside = TOY_JOINTS + np.asarray([0.05, 0.1, 0.15], np.float32)
     points = SurfacePoints(jnp.asarray(beside), jnp.zeros((4, 3, 1)), None, jnp.eye(4))
     names = tuple(f"joint{i}" for i in range(4))
@@ -80,7 +79,7 @@ POSES = {
     "lying": {"pelvis": (-np.pi / 2, 0, 0), "left_shoulder": (0, 0, -1.0)},
     "facing away": {"pelvis": (0, 3.0, 0), "left_elbow": (0, -1.0, 0)},
 }
-"""Rotation vectors of the left side; the right side mirrors them."""
+"""Rotation vectors of the left side; those of the right side are mirrored."""
 
 
 def rotations_of(pose):
@@ -126,8 +125,9 @@ def _truth(model, betas, rotations, translations, turn, views):
 
 
 def observe(poses, *, seed=0, views=VIEWS, noise=0.0, outliers=0.0, model=None):
-    """True joints (m, j, 3), betas, and observations of one person in poses (m), with noise and
-    outliers in pixels.
+    """Returns (true joints (m, j, 3), betas, observations) of one person in m poses.
+
+    `noise` is in pixels; `outliers` is the share of landmarks that are far off.
     """
     model, rng = model_of() if model is None else model, np.random.default_rng(seed)
     rotations = np.stack([rotations_of(pose) for pose in poses])
@@ -260,8 +260,9 @@ def turned(vector):
 
 
 def posed(pose="standing", seed=0, change=0.0):
-    """Landmarks (k, 3) of the shipped body, metres. change: std of random turns of all joints but
-    the first, radians.
+    """Returns landmarks (k, 3) of the shipped body, metres.
+
+    `change` is the standard deviation of random turns of all joints but the first, radians.
     """
     rng = np.random.default_rng(seed)
     rotations = rotations_of(pose) + change * rng.normal(size=rotations_of(pose).shape)
@@ -270,8 +271,9 @@ def posed(pose="standing", seed=0, change=0.0):
 
 
 def cameras_around(views, seed=0):
-    """cam_from_world (c, 4, 4) in float64 of cameras somewhere around the origin, nearly level,
-    that see the person whole.
+    """Returns cam_from_world (c, 4, 4), float64, of level cameras that see the whole person.
+
+    They are nearly level, and somewhere around the origin.
     """
     rng = np.random.default_rng(seed)
     matrices = []
@@ -295,9 +297,17 @@ def cameras_around(views, seed=0):
 
 
 def seen_by(landmarks, matrices, *, seed=0, pixels=0.0, world=0.0, turn=0.0, size=1.0, focal=FOCAL):
-    """What a detector sees. landmarks: (k, 3), or (c, k, 3) of photos of several moments. pixels,
-    world: std of its noise, pixels and metres; turn: std of the turn of a view's 3D landmarks,
-    degrees; size: factor on them.
+    """Returns what a detector finds in photos of a person.
+
+    Args:
+        landmarks: (k, 3), or (c, k, 3) for photos of several moments.
+        matrices: cam_from_world of the photos.
+        seed: of the noise.
+        pixels: standard deviation of pixels.
+        world: standard deviation of the 3D landmarks, metres.
+        turn: standard deviation of the turn of a view's 3D landmarks, degrees.
+        size: factor on the 3D landmarks.
+        focal: focal length, pixels.
     """
     rng, views = np.random.default_rng(seed), len(matrices)
     landmarks = np.broadcast_to(landmarks, (views, *landmarks.shape[-2:]))
@@ -328,8 +338,9 @@ def seen_by(landmarks, matrices, *, seed=0, pixels=0.0, world=0.0, turn=0.0, siz
 
 
 def errors_of(found, matrices):
-    """Rotations (c,) in degrees and centres (c,) in metres against the truth, after the similarity
-    that fits best; one camera: its distance.
+    """Returns (rotation errors (c,) in degrees, centre errors (c,) in metres, scale).
+
+    They remain after the similarity that fits best; of a single camera the distance is compared.
     """
 
     mine = np.asarray([camera.cam_from_world for camera in found.cameras], float)

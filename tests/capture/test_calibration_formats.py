@@ -1,4 +1,4 @@
-"""Each format, written the way its tool does from known cameras, is read back as these cameras."""
+"""Cameras that are written in each format, as its tool does, are read back unchanged."""
 
 import json
 import re
@@ -16,7 +16,7 @@ from humangs_jax.data.capture_checks import CaptureError
 from tests.capture import calibration_files as written
 
 PIXELS = 1e-3
-"""Largest reprojection error of what is written with all digits."""
+"""Largest reprojection error of numbers that are written with all digits."""
 FILES, NAMES = written.FILES, written.NAMES
 
 
@@ -25,8 +25,8 @@ def views_of(out):
 
 
 def error_of(out, K, poses):
-    """Largest distance in pixels between points seen by the imported cameras and by the true
-    ones.
+    """Returns the largest distance in pixels between points of the imported and of the true
+    cameras.
     """
     views = views_of(out)
     p = written.points()
@@ -39,7 +39,7 @@ def error_of(out, K, poses):
 
 
 def rig(folder, writer, name, K, poses, names=NAMES, **how):
-    """A calibration by one of the writers, and photos beside it: (source, images)."""
+    """Writes a calibration and photos beside it; returns (source, images)."""
     writer(folder / name, K, poses, names, **how)
     written.write_photos(folder / "photos", FILES)
     return folder / name, folder / "photos"
@@ -60,7 +60,7 @@ FORMATS = {
         [f"./images/{name}" for name in NAMES],  # a suffix is found
     ),
 }
-"""The writer, the source, the turn from our world into one with the format's axis up, and names."""
+"""Writer, source, turn from our world to one with the format's up, and names, by format."""
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -353,8 +353,9 @@ def test_faults_of_transforms_name_the_key(tmp_path, edit, problem):
 
 
 def at_moments(tmp_path, keys, poses=None):
-    """Six photos in a transforms.json, each with its own of `keys`. poses: which camera each has;
-    default: three, twice.
+    """Imports six photos of a transforms.json whose frames have these keys.
+
+    `poses` says which camera each has; by default three cameras twice.
     """
     names = [f"{i}.png" for i in range(6)]
     K, all_poses = written.scene(3 if poses is None else 6)

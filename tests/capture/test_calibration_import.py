@@ -1,4 +1,4 @@
-"""What is written, what is refused, and what is warned of when cameras are imported."""
+"""What the import of cameras writes, refuses and warns of."""
 
 import json
 import re
@@ -20,7 +20,7 @@ FILES, NAMES = written.FILES, written.NAMES
 
 @pytest.fixture
 def rig(tmp_path):
-    """Calibration and photos: (source, images, out)."""
+    """Writes a calibration and photos; returns (source, images, out)."""
     written.write_calibration_full(tmp_path / "rig.json", *written.scene(), NAMES)
     written.write_photos(tmp_path / "photos", FILES)
     return tmp_path / "rig.json", tmp_path / "photos", tmp_path / "out"
@@ -153,7 +153,7 @@ def test_photos_and_masks_are_undistorted(rig, tmp_path):
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_alpha_is_a_mask_when_undistorted_or_stays_beside_masks(rig, tmp_path, masked):
-    """The mask says what the person is; what alpha leaves out is white all the same."""
+    """Beside masks, the mask shows the person, and pixels without alpha are white."""
     distort_rig(rig[0], [0.1, 0, 0, 0, 0])
     edit_json(rig[0], lambda values: values["a"].update(distCoeff=[0.0] * 5))  # one lens without
     pixels = np.zeros((written.HEIGHT, written.WIDTH, 4), np.uint8)
@@ -311,7 +311,7 @@ def test_a_bare_photo_of_16_bits_stays_what_it_is(rig):
 PERSON = np.zeros((written.HEIGHT, written.WIDTH), np.uint8)
 PERSON[8:40, 20:40] = 255
 SOFT = (np.arange(written.WIDTH) % 3).astype(np.uint8)
-"""Levels that are no labels."""
+"""Levels of a mask that are no labels."""
 
 
 def write_masks(folder, masks):
@@ -372,7 +372,7 @@ def test_alpha_in_some_photos_is_refused_and_an_empty_one_is_named(rig):
 
 
 def named_masks(tmp_path, key, names):
-    """A transforms.json that names masks, and its photos."""
+    """Writes a transforms.json that names masks, and its photos; returns (source, images, out)."""
     written.write_transforms(
         tmp_path / "transforms.json", *written.scene(), [f"images/{file}" for file in FILES]
     )

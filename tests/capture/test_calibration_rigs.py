@@ -1,6 +1,4 @@
-"""Cameras of motion capture programs and data sets, written from known cameras and read back; lens
-distortion.
-"""
+"""Cameras of motion capture programs and data sets come back as written; lens distortion."""
 
 import json
 import shutil
@@ -28,7 +26,7 @@ FILES = Path(__file__).parents[1] / "data" / "files"
 
 
 def test_cameras_of_panoptic_are_read_as_written(tmp_path):
-    """Also with keys of other programs, which mean something else."""
+    """Keys that mean something else in other programs do no harm."""
     content = written.panoptic()
     content["cameras"] = [
         each | {"distance": 2.0, "model": "fisheye"} for each in content["cameras"]
@@ -42,7 +40,7 @@ def test_cameras_of_panoptic_are_read_as_written(tmp_path):
 
 
 def edited(folder, name, old, new):
-    """A file of another tool with another text in one place."""
+    """Copies another tool's file with one text replaced."""
     copy = Path(shutil.copy(FILES / name, folder))
     edit_text(copy, old, new)
     return copy
@@ -70,7 +68,7 @@ def test_a_field_of_view_of_qualisys_moves_the_centre_and_the_lens_of_shelf_is_i
 
 @pytest.mark.parametrize("place", ["frame", "file"])
 def test_a_whole_K_of_a_frame_or_of_the_file(place, tmp_path):
-    """As DNA-Rendering's views are written for nerfstudio."""
+    """DNA-Rendering's views are written so for nerfstudio."""
     file = tmp_path / "transforms.json"
     written.write_transforms(file, K, POSES, written.FILES)
     values = json.loads(file.read_text())
@@ -154,7 +152,7 @@ def test_dots_land_where_the_pinhole_says():
     "focal, coefficients", [(400, [-0.1, 0.03, 1e-3, -1e-3, 0]), (60, [-0.3, 0, 0, 0, 0])]
 )
 def test_a_person_is_undistorted_as_the_whole_photo_is(focal, coefficients):
-    """Also where the lens folds, and with nobody in the photo."""
+    """This also holds where the lens folds, and in a photo without a person."""
     K, coefficients = (
         np.asarray([[focal, 0, 66.0], [0, focal, 50], [0, 0, 1]]),
         np.asarray(coefficients),
@@ -184,7 +182,10 @@ def test_distortion_is_opencvs():
 
 
 def of_folds(*folds):
-    """A lens whose slope d/dr (r + k1 r^3 + k2 r^5 + k3 r^7) is a product of (1 - r^2 / fold)."""
+    """Returns a lens whose slope is 0 at these radii squared.
+
+    The slope d/dr (r + k1 r^3 + k2 r^5 + k3 r^7) is the product of (1 - r^2 / fold).
+    """
     slope = np.polynomial.Polynomial([1.0])
     for fold in folds:
         slope *= np.polynomial.Polynomial([1, -1 / fold])

@@ -1,6 +1,4 @@
-"""Units of calibrations, cameras that stand relative to others, and files that are no
-calibration.
-"""
+"""Units of calibrations, cameras relative to other cameras, and files that are no calibration."""
 
 import json
 
@@ -17,7 +15,7 @@ K, POSES = written.scene()
 
 
 def imported(tmp_path, unit, writer=written.write_calibration_full, name="rig.json", **options):
-    """A rig whose numbers are in units of so many metres."""
+    """Imports cameras of a file whose unit is `unit` metres."""
     writer(tmp_path / name, K, written.in_source(POSES, unit), NAMES)
     written.write_photos(tmp_path / "photos", FILES)
     return import_cameras(
@@ -60,8 +58,9 @@ def test_a_scale_that_is_given_is_taken_and_metres_need_no_words(tmp_path):
 
 
 def multical(relations):
-    """The scene as multical writes it; relations: camera -> the one in whose axes it stands, None
-    for the world.
+    """Returns the scene as multical writes it.
+
+    `relations` names for each camera the one in whose axes it stands, or None for the world.
     """
     index = NAMES.index
     lens = lambda i: {

@@ -1,6 +1,4 @@
-"""Synchronised videos become the frames of a capture; of one video, sharp frames that show
-something new become photos.
-"""
+"""Synchronised videos become a capture; of one video, sharp and different frames become photos."""
 
 import numpy as np
 import pytest
@@ -23,7 +21,7 @@ from tests.capture import calibration_files as written
 
 NAMES, FRAMES = ("a", "b"), 5
 LEVELS = 4 / 255
-"""Of a grey frame that H.264 has compressed."""
+"""Largest error of a grey frame after compression by H.264."""
 
 
 def grey(camera, frame):
@@ -31,7 +29,7 @@ def grey(camera, frame):
 
 
 def write_rig(folder, masks=False):
-    """Calibration with a lens and a video of 64 x 48 for each camera, every frame of one grey."""
+    """Writes a calibration with a lens, and a video of grey frames of 64 x 48 for each camera."""
     K, poses = written.scene(len(NAMES))
     written.write_calibration_full(folder / "rig.json", K, poses, NAMES)
     shape = written.HEIGHT, written.WIDTH, 3
@@ -131,7 +129,7 @@ SIZE = 120, 160
 
 
 def scene(seed):
-    """Levels of random squares: sharp edges everywhere."""
+    """Returns grey levels of random squares, which have sharp edges everywhere."""
     coarse = np.random.default_rng(seed).uniform(30, 220, (SIZE[0] // 10, SIZE[1] // 10))
     return np.kron(coarse, np.ones((10, 10)))
 
@@ -149,7 +147,7 @@ def noisy(frame, seed, levels=6):
 
 
 def test_sharp_frames_of_every_scene_are_chosen():
-    """Three scenes of 64 frames, of which every fourth is sharp: some windows have none."""
+    """Of three scenes of 64 frames every fourth frame is sharp; some windows have no sharp one."""
     frames = [scene(i // 64) if i % 4 == 2 else blurred(scene(i // 64)) for i in range(192)]
     sharpness, thumbnails = looked_at(noisy(frame, i) for i, frame in enumerate(frames))
     chosen = choose_frames(sharpness, thumbnails, PHOTOS)

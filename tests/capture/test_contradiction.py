@@ -1,4 +1,4 @@
-"""Calibrations that contradict the person in the photos, and what they agree without."""
+"""Calibrations that contradict the person in the photos, and what photos agree on without them."""
 
 import dataclasses
 
@@ -13,12 +13,12 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.photos import load_photos
 
 PITCH = np.radians(20)
-"""How far the cameras look down: cameras that are level agree upside down, too."""
+"""Angle by which the cameras look down: level cameras agree upside down, too."""
 
 
 @pytest.fixture(scope="module")
 def photos():
-    """The demo's, as if their cameras looked down."""
+    """Returns the demo's photos as if their cameras looked down."""
     photos, down = load_photos("demo_capture"), np.eye(4)
     down[1:3, 1:3] = [[np.cos(PITCH), -np.sin(PITCH)], [np.sin(PITCH), np.cos(PITCH)]]
     return changed(photos, down @ np.asarray(photos.cameras.cam_from_world))
@@ -26,7 +26,7 @@ def photos():
 
 @pytest.fixture(scope="module")
 def keypoints(demo, photos):
-    """What a detector that errs by 1.2 % of the person's size sees of the demo's body."""
+    """Returns keypoints of the demo's body with errors of 1.2 % of the person's size."""
     model = landmark_model(demo.body, MEDIAPIPE_33.names)
     places, _ = pose_landmarks(model, jnp.asarray(demo.betas), demo.pose(0))
     matrices, K = (np.asarray(x) for x in (photos.cameras.cam_from_world, photos.cameras.K))
@@ -47,7 +47,7 @@ def keypoints(demo, photos):
 
 
 def towards_ray(places):
-    """Rotations that make the rays to places the z axes, as a detector sees them."""
+    """Returns rotations whose z axis is the ray to each place, as a detector sees them."""
     z = places / np.linalg.norm(places, axis=-1, keepdims=True)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
@@ -62,7 +62,7 @@ def changed(photos, matrices=None, K=None):
 
 
 def upside_down(photos):
-    """The calibration of images whose y axis points up: pixels and axes of the cameras."""
+    """Returns the calibration for images and cameras whose y axis points up."""
     other = np.diag([1.0, -1.0, 1.0, 1.0])
     K = np.asarray(photos.cameras.K).copy()
     K[:, 1, 2] = photos.images.shape[1] - K[:, 1, 2]
@@ -70,7 +70,7 @@ def upside_down(photos):
 
 
 def of_others(photos):
-    """Cameras that stand elsewhere around the person, as those of other photos."""
+    """Returns cameras at other places around the person, as if they were those of other photos."""
     turns = np.tile(np.eye(4), (4, 1, 1))
     for turn, angle in zip(turns, np.radians([0, 50, -70, 110]), strict=True):
         turn[:3, :3] = [
@@ -116,7 +116,7 @@ def test_photos_agree_without_the_cameras_of_other_photos(photos, keypoints):
 
 
 def test_nothing_is_named_where_photos_do_not_agree_without_the_calibration(photos, keypoints):
-    """Or where the detector has given no depths to find cameras by."""
+    """Nor is anything named where the detector gives no depths to find cameras by."""
     other = of_others(photos)
     flat = dataclasses.replace(keypoints, world=None)
     assert find_contradiction(other, flat) is None  # the person may have moved as well

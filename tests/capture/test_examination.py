@@ -26,7 +26,7 @@ NOSE, LEFT_WRIST, RIGHT_WRIST = (
     COCO_17.names.index(name) for name in ("nose", "left_wrist", "right_wrist")
 )
 RAYLEIGH = {0.5: 1.177, 0.9: 2.146}
-"""Quantiles of the length of a vector whose two components have a standard deviation of 1."""
+"""Quantiles of the length of a vector of two components with standard deviation 1."""
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_exchanged_sides_are_named_before_what_they_cause(good):
 
 
 def test_exchanged_hands_are_told_and_explain_the_sides_of_their_view_and_no_cameras(monkeypatch):
-    """Other exchanges are given, which costs less than to find them."""
+    """The other exchanges are given, because finding them takes long."""
     names = ("left_wrist", "right_wrist", "left_hand_root", "right_hand_root", "nose")
     capture, keypoints = person(0, 1, 2, kind=KeypointSet("wrists", names, (1, 0, 3, 2, 4)))
     cameras, other = Swap("cameras", ("m0v0", "m0v1")), Swap("sides", ("m0v0",))
@@ -165,7 +165,7 @@ def test_frames_and_views_without_keypoints(good):
 
 @pytest.mark.slow
 def test_frames_without_views(good):
-    """A capture may have more poses than its views show, before the last and after it."""
+    """A capture may have poses that no view shows, also after the last one that is shown."""
     capture, keypoints = good
     some = [0, 1, 2, 3, 8, 9, 10, 11]
     chosen = with_points(keypoints, lambda points, confidences: None)
@@ -246,7 +246,7 @@ def test_keypoints_and_records_of_something_else(good):
 
 
 def drawn(sheet, color):
-    """Pixels that are nearly of a color: (row, column) each."""
+    """Returns (row, column) of the pixels that nearly have a color."""
     return np.argwhere(np.abs(sheet - np.asarray(color)).max(-1) < 0.08)
 
 
@@ -254,7 +254,7 @@ def drawn(sheet, color):
 def test_discs_are_where_the_keypoints_are_those_of_outliers_are_hollow_and_lines_lead_to_the_body(
     tmp_path,
 ):
-    """One view at twice its size, with a left wrist, and a right one that is an outlier."""
+    """One view is drawn at twice its size; of the wrists the right one is an outlier."""
     capture, keypoints = person(30, 1, 1)
     keypoints = dataclasses.replace(keypoints, confidences=np.zeros_like(keypoints.confidences))
     keypoints.points[0, [LEFT_WRIST, RIGHT_WRIST]] = (32, 16), (224, 16)

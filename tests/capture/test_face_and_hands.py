@@ -1,4 +1,4 @@
-"""Where faces and hands are looked for, and how hands become keypoints."""
+"""Where faces and hands are searched, and how hands become keypoints."""
 
 import numpy as np
 import pytest
@@ -24,13 +24,13 @@ LEFT, RIGHT = (MEDIAPIPE_69.names.index(f"{side}_hand_root") for side in ("left"
 
 
 def turned(points, degrees, middle=(100.0, 100.0)):
-    """Points of a photo that was turned clockwise."""
+    """Returns the points of a photo after it was turned clockwise."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return (points - middle) @ np.asarray([[c, s], [-s, c]]) + middle
 
 
 def upright_body():
-    """An upright face, and a left hand that points up."""
+    """Returns landmarks of an upright face and of a left hand that points up."""
     body = np.zeros((33, 2))
     body[[2, 5]] = [[120, 90], [80, 90]]  # eyes: the person's left is on the right
     body[[9, 10]] = [[110, 130], [90, 130]]
@@ -107,7 +107,7 @@ def test_hands_change_sides_where_left_and_right_were_exchanged():
 
 
 def test_a_photo_without_anybody_has_no_face_and_no_hands():
-    """The networks that ship with the package, on noise."""
+    """The networks that ship with the package find nothing in noise."""
     parts, noise = FaceAndHands(), np.random.default_rng(0).uniform(0, 1, (256, 256, 3))
     body = upright_body()
     assert parts.face(noise.astype(np.float32), body) is None

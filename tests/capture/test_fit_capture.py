@@ -22,7 +22,10 @@ FRAMES = tuple(POSES)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A capture folder without body.npz; five frames, four views each, in no order."""
+    """Returns (capture folder without body.npz, its keypoints, true joints).
+
+    It has five frames of four views each, in random order.
+    """
     joints, _, seen = observe(FRAMES, noise=2.0)
     order = np.random.default_rng(0).permutation(len(FRAMES) * 4)
     frames, views = order // 4, order % 4
@@ -87,7 +90,7 @@ def test_written_in_place_and_read_again(folder, fitted, tmp_path):
 
 @pytest.mark.slow
 def test_a_fit_in_place_is_written_whole_or_not_at_all(folder, fitted, tmp_path, monkeypatch):
-    """Cameras that were moved belong to the body that was found with them."""
+    """The fit moved cameras and body together: one without the other is wrong."""
     path = copied(folder[0], tmp_path)
     write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
     before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}

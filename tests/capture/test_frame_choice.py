@@ -1,4 +1,4 @@
-"""Frames of a video are chosen evenly over the directions, sharp, and of usual poses."""
+"""Chosen frames of a video show all directions evenly, are sharp, and have usual poses."""
 
 import numpy as np
 import pytest
@@ -15,8 +15,9 @@ FRAMES = 64
 
 
 def turning(directions, bent=()):
-    """Landmarks in a camera's axes of a person who faces each of the directions; the right arm is
-    raised in the frames `bent`.
+    """Returns landmarks in camera axes of a person who faces these directions.
+
+    The right arm is raised in the frames `bent`.
     """
     rest = np.random.default_rng(0).normal(0, 0.3, (len(NAMES), 3))
     for part, height in (("shoulder", -0.5), ("hip", 0.0)):
@@ -35,7 +36,7 @@ def turning(directions, bent=()):
 
 
 def gaps(directions):
-    """Degrees between neighbours on the circle."""
+    """Returns degrees between neighbours on the circle."""
     around = np.sort(np.mod(directions, 2 * np.pi))
     return np.degrees(np.diff(np.append(around, around[0] + 2 * np.pi)))
 
@@ -47,7 +48,7 @@ def test_the_direction_of_a_body_is_found_from_its_landmarks():
 
 @pytest.mark.parametrize("turns", [1.0, 2.3])
 def test_frames_are_even_over_the_directions_although_the_person_turns_unevenly(turns):
-    """Who waits in front and hurries past the back gives many frames of the front."""
+    """The person waits in front and hurries past the back: most frames show the front."""
     steps = np.linspace(0, 1, FRAMES)
     directions = 2 * np.pi * turns * (steps + 0.12 * np.sin(2 * np.pi * steps))
     chosen = choose_by_direction(directions, np.ones(FRAMES), 8)

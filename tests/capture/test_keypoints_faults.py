@@ -1,4 +1,4 @@
-"""What is wrong with keypoint files, and what is only odd."""
+"""Faults in keypoint files, and oddities that are only reported."""
 
 import json
 
@@ -19,7 +19,7 @@ def entry(image="front", confidence=0.75, shift=0.0, count=17, **more):
 
 
 def with_number(index, value, image="front"):
-    """An entry with one of its numbers replaced: 0 is the nose's x, 1 its y, 2 its confidence."""
+    """Returns an entry with one number replaced: 0 is the nose's x, 1 its y, 2 its confidence."""
     each = entry(image)
     each["keypoints"][index] = value
     return each
@@ -42,7 +42,7 @@ def annotations(size=SIZE, **more):
 
 
 def test_frames_that_were_matched_in_order_are_told(tmp_path):
-    """OpenPose and ffmpeg on one video: the former counts from 0, the latter from 1."""
+    """OpenPose counts the frames of a video from 0 and ffmpeg from 1."""
     content = [entry(f"clip_{i:012d}", shift=i) for i in range(3)]
     (tmp_path / "k.json").write_text(json.dumps(content))
     keypoints = read_keypoints(tmp_path / "k.json", [f"clip_{i + 1:06d}" for i in range(3)], *SIZE)
@@ -108,8 +108,8 @@ def test_several_people_are_refused(tmp_path):
 
 @pytest.mark.parametrize(("count", "set_size"), [(16, 133), (5, 133), (17, 133), (16, 17)])
 def test_people_whose_hands_and_faces_were_not_found_are_people(tmp_path, count, set_size):
-    """16 points of the body are 12 % of COCO-WholeBody's: the more confident of two such people was
-    taken in silence.
+    """16 points of the body are 12 % of COCO-WholeBody's. Without a warning, the more confident of
+    two such people was taken.
     """
     people = [entry(count=set_size, confidence=confidence) for confidence in (0.7, 0.9)]
     for person in people:

@@ -1,6 +1,4 @@
-"""Each format as its tool writes it, from known points, read back exactly; names of views, and sets
-of points.
-"""
+"""Known points come back exactly from each format; names of views, and sets of points."""
 
 import dataclasses
 import json
@@ -39,8 +37,9 @@ CAMERA_NAMES = (
 
 
 def known(count, views=3, seed=0):
-    """(v, k, 3): pixels in eighths and confidences in sixteenths, which float32 and JSON keep
-    exactly.
+    """Returns points (v, k, 3) that float32 and JSON keep exactly.
+
+    Pixels are whole eighths, confidences whole sixteenths.
     """
     rng = np.random.default_rng(seed)
     points = rng.integers(8, 8 * 200, (views, count, 2)) / 8
@@ -58,7 +57,7 @@ def read(path, names=NAMES, **options):
 
 
 def check(keypoints, values, keypoint_set, missing=()):
-    """The tools' first pixel has its centre at 0, ours at 0.5."""
+    """Checks points that were read: the tools' first pixel has its centre at 0, ours at 0.5."""
     assert keypoints.set is keypoint_set
     np.testing.assert_array_equal(keypoints.points, values[..., :2] + 0.5)
     np.testing.assert_array_equal(keypoints.confidences, values[..., 2])
@@ -89,7 +88,7 @@ def openpose(*people):
 
 
 def annots(values, filename, number=0):
-    """As EasyMocap writes them; hands beside BODY_25."""
+    """Returns EasyMocap's content of a file, with hands beside BODY_25."""
     hands = (
         {"handl2d": values[25:46].tolist(), "handr2d": values[46:].tolist()}
         if len(values) == 67
@@ -120,7 +119,7 @@ def frames(values, first=0):
 
 
 def demo(content):
-    """As MMPose's demo scripts write it."""
+    """Returns the content of a file of MMPose's demo scripts."""
     return {"meta_info": {"dataset_name": "coco"}, "instance_info": content}
 
 
@@ -172,7 +171,7 @@ FOLDERS = {
         lambda v: {f"cam{i}": frames(v[2 * i : 2 * i + 2]) for i in (0, 1)},
     ),
 }
-"""The set, the views, and the files of a folder from the points."""
+"""The set of points, the views, and the files that are written from the points, by format."""
 
 
 @pytest.mark.parametrize("kind", FOLDERS)
@@ -289,7 +288,7 @@ def test_our_own_file_round_trips_exactly(tmp_path, keypoint_set):
 
 
 def people_file(path):
-    """A file of `humangs detect`: the second person is not in the second image."""
+    """Writes a file of `humangs detect`; the second person is not in the second image."""
     rng = np.random.default_rng(2)
     person = lambda: SeenPerson(
         np.concatenate(
@@ -470,7 +469,7 @@ PAGES = [
         "24 right_hip, 28 right_ankle, 30 right_heel, 32 right_foot_index",
     ),
 ]
-"""Numbers of points on the tools' pages."""
+"""Sets of points, and numbers and names of some points on the pages of the tools."""
 
 
 @pytest.mark.parametrize(("keypoint_set", "points"), PAGES)
@@ -561,17 +560,17 @@ STANDING = {
     **{"right_big_toe": (128, 205), "right_small_toe": (124, 204), "right_heel": (133, 202)},
     **{"neck": (150, 64), "mid_hip": (150, 116), "upper_neck": (150, 56), "head_top": (150, 20)},
 }
-"""Pixels of a person who looks into the camera and raises the right hand."""
+"""Pixels of a person who faces the camera and raises the right hand."""
 
 
 def standing(order, seen=lambda name: True):
-    """The flat list of OpenPose, in an order, of the points that are seen."""
+    """Returns OpenPose's flat list of the seen points, in one of the orders."""
     points = [(*STANDING[name], 0.8) if seen(name) else (0, 0, 0) for name in ORDERS[order]]
     return [float(number) for point in points for number in point]
 
 
 def assert_named(keypoints, seen=lambda name: True):
-    """Points have the places of their names."""
+    """Checks that points have the places of their names."""
     for view in range(len(keypoints.points)):
         for name, point, confidence in zip(
             keypoints.set.names, keypoints.points[view], keypoints.confidences[view], strict=True
@@ -628,7 +627,7 @@ def test_an_order_that_is_not_clear_is_the_usual_one_and_said(tmp_path):
 
 
 def test_frames_of_nodes_are_a_list_of_objects_with_a_canvas(tmp_path):
-    """ControlNet's nodes write such files; hands that were not found are null."""
+    """ControlNet's nodes write such files, with null for hands that were not found."""
     person = {
         "pose_keypoints_2d": standing("OpenPose's COCO"),
         "hand_left_keypoints_2d": None,

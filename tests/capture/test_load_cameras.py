@@ -1,4 +1,4 @@
-"""`load_cameras`: cameras of other tools in their own world, with lenses and points."""
+"""`load_cameras` reads cameras of other tools in their own world, with lenses and points."""
 
 import jax
 import jax.numpy as jnp

@@ -52,7 +52,7 @@ def jerk(joints, fps):
 
 @pytest.mark.slow
 def test_a_walk_is_found_in_the_keypoints_of_one_camera_whose_noise_it_does_not_have():
-    """Several windows, and frames in which nobody is seen."""
+    """There are several windows, and frames in which nobody is seen."""
     truth, world, keypoints, fps = walker(150)
     keypoints.confidences[70:76] = 0
     ends = [int(f(np.asarray(BODY.template)[:, 1])) for f in (np.argmin, np.argmax)]

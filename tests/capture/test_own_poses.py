@@ -1,4 +1,4 @@
-"""A pose for each photo: found where the person moved, and not where nobody did."""
+"""Each photo gets a pose if the person moved between the photos, and only then."""
 
 import dataclasses
 
@@ -26,11 +26,11 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from tests.capture.test_silhouette_fit import SIZE, VIEWS, default_body, truth
 
 NOISE = 1.0
-"""Pixels of the keypoints, half a percent of the person's height."""
+"""Noise of the keypoints, pixels: half a percent of the person's height."""
 
 
 def bent(degrees, seed=0):
-    """The poses of the photos: the one that all share, joints of limbs and head bent a little."""
+    """Returns poses of the photos: the shared one with joints of limbs and head bent a little."""
     capture = with_own_poses(truth())
     names = capture.body.joint_names
     moving = [
@@ -45,8 +45,9 @@ def bent(degrees, seed=0):
 
 
 def photographed(poses, seed=1):
-    """Masks of the body in the pose of each photo, and noisy keypoints; the body in the shared
-    one.
+    """Returns (capture with the body in the shared pose, noisy keypoints).
+
+    Masks and keypoints are those of each photo's pose.
     """
     capture, body = truth(), default_body()
     model = landmark_model(body, COCO_17.names)

@@ -1,6 +1,4 @@
-"""People found in the photos of the demo capture, whose bodies are known; steps of BlazePose on
-small inputs.
-"""
+"""People found in the demo's photos, whose bodies are known, and steps of BlazePose."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,16 +31,18 @@ def networks():
 
 
 PARTS = {"shoulder": 11, "elbow": 13, "wrist": 15, "hip": 23, "knee": 25, "ankle": 27}
-"""Where the left one is; the right one comes next."""
+"""Number of the left landmark; the right one follows."""
 NAMES = tuple(f"{side}_{part}" for part in PARTS for side in ("left", "right"))
 MEDIAN_ERROR, LARGEST_ERROR, LEAST_OVERLAP = 0.035, 0.1, 0.9
-"""Of joints, shares of the person's height; of the mask, intersection over union. Measured over all
-views and turns: at most 0.028 and 0.075, and at least 0.915. A landmark is not the joint's centre:
-some 2 cm lie between them."""
+"""Bounds on joint errors as shares of the person's height, and on the mask's overlap.
+
+Over all views and turns at most 0.028 and 0.075 and at least 0.915 were measured. A landmark is
+some 2 cm from the joint's centre.
+"""
 
 
 def expected(capture, view):
-    """Joints in the photo and the person's height, pixels."""
+    """Returns (joints in the photo, the person's height), pixels."""
     model = landmark_model(capture.body, NAMES)
     points, _ = pose_landmarks(
         model, jnp.asarray(capture.betas), capture.pose(int(capture.frames[view]))
@@ -105,14 +105,15 @@ def test_nobody_in_noise_and_in_the_dark(networks):
 
 
 class Drifting(Networks):
-    """They see one person, well in a crop of the right size; larger crops far off drift towards it
-    with wrong points.
+    """A landmark network that sees one person, well in a crop of the right size.
+
+    Larger crops far away drift towards the person, with wrong points.
     """
 
     hips, side = np.asarray([200.0, 300.0]), 240.0
 
     def __init__(self):
-        """Without files."""
+        """Needs no files of weights."""
 
     def detect(self, photo, window):
         if window.side < max(photo.shape):
@@ -154,7 +155,7 @@ def test_the_smallest_windows_are_looked_at_only_where_nobody_is_large(
 
 
 def test_whoever_stands_half_behind_somebody_is_found_without_what_is_covered(networks, demo):
-    """Painted over, the first leaves the other one to be seen."""
+    """The first person is painted over, so that the other one can be found."""
     front = demo.masks[0]
     step = round(0.7 * np.ptp(np.flatnonzero((front > 0.5).any(0))))
     image, mask = (np.roll(each[2], step, axis=1) for each in (demo.images, demo.masks))
@@ -188,8 +189,9 @@ PERSON, ROOM = np.asarray([0.7, 0.5, 0.4], np.float32), np.asarray([0.2, 0.3, 0.
 
 
 def scene(scale):
-    """Photo, true coverage, and the mask of a network that has one pixel for `scale` of the photo;
-    a body with a thin arm.
+    """Returns (photo, true coverage, mask of a network) of a body with a thin arm.
+
+    The network's mask has one pixel for `scale` pixels of the photo.
     """
     y, x = np.mgrid[: 60 * scale, : 60 * scale] / scale
     true = (
@@ -237,7 +239,7 @@ def test_a_photo_without_edges_leaves_the_place_of_the_edge():
 # -----------------------------------------------------------------------------------------------
 
 ROUNDING = 1e-9
-"""Of float64 pixels up to some thousands."""
+"""Rounding of float64 pixels up to some thousands."""
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 2, -3.0])

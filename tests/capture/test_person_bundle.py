@@ -23,18 +23,15 @@ from humangs_jax.capture.fitting.person_bundle import (
 from humangs_jax.capture.fitting.person_moments import evidence_of
 
 SCALE, DIFFERENCE = 6.0, 1e-6
-"""Robust scale of pixels, standard deviations; half the distance of central differences, metres and
-radians.
-"""
+"""Robust scale of pixels, and half the distance of central differences in metres and radians."""
 RELATIVE = 1e-6
-"""Of derivatives against differences in float64: the square of the distance, times third
-derivatives.
-"""
+"""Relative error of differences in float64: the distance squared times third derivatives."""
 
 
 def problem(views=3, seed=0, known=2):
-    """Evidence of noisy photos, of which all but `known` tell no focal length, and a rig that is
-    some way from the minimum.
+    """Returns (evidence, rig) of noisy photos; the rig is some way from the minimum.
+
+    The focal lengths of the first `known` photos are known.
     """
     rng = np.random.default_rng(seed)
     seen = seen_by(
@@ -55,7 +52,7 @@ def problem(views=3, seed=0, known=2):
 
 
 def random_step(evidence, rig, rng, size):
-    """A step in a random direction; the means of views follow from the rest."""
+    """Returns a random step; the means of views follow from the other changes."""
     c, k = evidence.weights.shape
     step = Step(
         rng.normal(0, size, (k, 3)),
@@ -76,7 +73,9 @@ def scaled(step, factor):
 
 
 def changes(evidence, of, step):
-    """What the derivatives say of a step: of residuals of landmarks in views, and of those that tie
+    """Returns what the derivatives predict for a step.
+
+    The two arrays are changes of the residuals of landmarks in views, and of those that tie
     landmarks.
     """
     seen = np.einsum("ckra,ka->ckr", of.by_landmark, step.landmarks) + np.einsum(
@@ -119,8 +118,9 @@ def test_the_depth_of_a_landmark_behind_the_camera_does_not_move_its_pixel():
 
 
 def dense(evidence, rows, of):
-    """All residuals and their derivatives as one matrix, a loop for each block: landmarks, views,
-    focal lengths.
+    """Returns all derivatives as one matrix and all residuals as one vector.
+
+    Loops go over the blocks of landmarks, views and focal lengths.
     """
     c, k = evidence.weights.shape
     g = len(rows.focal)

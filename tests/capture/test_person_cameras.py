@@ -32,13 +32,14 @@ from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import Camera, stack_cameras
 
 EXACT_DEGREES, EXACT_METRES = 0.1, 0.01
-"""Of exact landmarks: float32, and priors (size, level cameras) that are not quite those of the
-test's person.
+"""Largest errors with exact landmarks.
+
+They come from float32 and from priors on size and level cameras, which do not quite hold here.
 """
 NOISE = {"pixels": 4.0, "world": 0.04, "turn": 10.0, "size": 0.93}
-"""What the detector is off on photos of 1,920 pixels."""
+"""Errors of the detector on photos of 1,920 pixels."""
 NOISY_DEGREES, NOISY_METRES = 3.5, 0.25
-"""Means over the cameras with that noise; a man's photos gave 1.6 to 2.5 degrees and 6 to 14 cm."""
+"""Largest mean errors with that noise; photos of a man gave 1.6 to 2.5 degrees and 6 to 14 cm."""
 
 
 @pytest.mark.parametrize(("views", "pose"), [(4, "crouching"), (3, "standing"), (8, "standing")])
@@ -143,7 +144,7 @@ def test_a_photo_of_another_moment_is_left_out_by_name():
 
 
 def cameras_at(*azimuths):
-    """cam_from_world of level cameras around the origin, degrees from the front."""
+    """Returns cam_from_world of level cameras around the origin, degrees from the front."""
     matrices = np.tile(np.eye(4), (len(azimuths), 1, 1))
     for matrix, azimuth in zip(matrices, np.radians(azimuths), strict=True):
         vectors = jnp.asarray([[np.pi, 0, 0], [0, azimuth, 0]], jnp.float32)
@@ -278,15 +279,17 @@ def test_a_person_of_another_height_looks_the_same():
 
 
 TURN, ROLL = 0.35, 0.9
-"""Degrees: what may be left of a turn of 1 degree with keypoints of one moment that err by a pixel,
-of a person who is 120 high; 17 of them know a turn about the camera's own axis to 0.45 degrees
-only."""
+"""Largest remainders of a turn by 1 degree, degrees.
+
+Keypoints of one moment err by a pixel and the person is 120 pixels high. 17 of them know a turn
+about the camera's own axis only to 0.45 degrees.
+"""
 VIEWS = 4
-"""Cameras of people who move."""
+"""Number of cameras of people who move."""
 
 
 def turned(capture, views, vector):
-    """Cameras turned by a rotation vector in their axes, degrees."""
+    """Returns the capture with cameras turned by a vector in their axes, degrees."""
     rotations = np.zeros((capture.view_count, 3), np.float32)
     rotations[views] = np.radians(vector)
     turns = transform.make(
@@ -299,7 +302,7 @@ def turned(capture, views, vector):
 
 
 def off(capture, truth):
-    """(v,) degrees between the cameras of two captures."""
+    """Returns degrees (v,) between the cameras of two captures."""
     between = capture.cameras.cam_from_world[:, :3, :3] @ jnp.swapaxes(
         truth.cameras.cam_from_world[:, :3, :3], -1, -2
     )
@@ -360,8 +363,8 @@ def test_outliers_exchanged_sides_and_another_person_are_no_camera_errors():
 
 
 def test_landmarks_that_the_detector_hardly_sees_turn_no_camera():
-    """An error that all landmarks of a view share is a rotation, too, however small their scatter:
-    the certainty decides.
+    """An error that all landmarks of a view share is a rotation, however little they scatter: their
+    certainty decides.
     """
     truth, keypoints = person(2, 1, 4)
     points = np.array(keypoints.points)

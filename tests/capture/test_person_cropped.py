@@ -1,4 +1,4 @@
-"""Photos that show a part of the person: no legs, no head, hardly anything."""
+"""Photos that show a part of the person: without legs, without head, or hardly anything."""
 
 import dataclasses
 
@@ -31,13 +31,14 @@ LEGS = {
     "knee": ("ankle", "heel", "toe", "foot"),
     "hip": ("knee", "ankle", "heel", "toe", "foot"),
 }
-"""Words of the landmarks that a photo does not show, by where it ends."""
+"""Words of the landmarks that a photo does not show, by the joint at which it ends."""
 FACE = ("nose", "eye", "ear", "mouth")
 
 
 def without(seen, words, views=slice(None)):
-    """What is seen in photos that do not show these landmarks, whose places the detector guesses
-    wrongly.
+    """Returns what is seen in photos that do not show these landmarks.
+
+    The detector guesses wrong places for them.
     """
     hidden = np.asarray([any(word in name for word in words) for name in seen.names])
     visibility, points, world = (
@@ -107,7 +108,7 @@ def test_landmarks_that_are_not_seen_do_not_tell_left_from_right():
 @pytest.mark.slow  # a fit
 @pytest.mark.parametrize("cut", LEGS)
 def test_what_a_photo_does_not_show_rests_and_what_it_shows_is_posed(cut):
-    """Photos of several moments, one each: two whole, two that end at the hip or the knee."""
+    """Of four photos of different moments two are whole and two end at the hip or the knee."""
     rng = np.random.default_rng(0)
     rotations = np.stack([rotations_of("standing")] * 4)
     rotations += 0.1 * rng.normal(size=rotations.shape).astype(np.float32)
@@ -146,7 +147,7 @@ def test_what_a_photo_does_not_show_rests_and_what_it_shows_is_posed(cut):
 
 
 def fit_joints(capture):
-    """Joints of the poses of a capture, metres."""
+    """Returns the joints of each pose of a capture, metres."""
     model = model_of(NAMES)
     poses = [capture.poses[i] for i in range(capture.frame_count)]
     return [pose_landmarks(model, jnp.asarray(capture.betas), pose)[1] for pose in poses]

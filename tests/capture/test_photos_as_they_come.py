@@ -1,5 +1,6 @@
-"""Photos of several sizes, flags and formats in one folder become a capture of one size in which
-pixels keep their places.
+"""Photos of several sizes, EXIF flags and formats become a capture of one size.
+
+Pixels show the same points as before.
 """
 
 import json
@@ -27,8 +28,9 @@ HEIC = Path(__file__).parents[1] / "io" / "phone.heic"
 
 
 def write_phones(folder, masks=False, reach=(0, 0)):
-    """Calibration of the upright photos, and photos of noise. reach: rows and columns of the masks
-    up to the rim.
+    """Writes the calibration of the upright photos, and photos of noise.
+
+    `reach` is the number of rows and columns at the rim that the masks cover.
     """
     K, poses = written.scene(len(SHOWN))
     K[:, :2, 2] = np.asarray(list(SHOWN.values())) / 2 + (1.3, -0.8)
@@ -214,11 +216,12 @@ NAMES = written.NAMES
 POINT = written.TARGET + np.asarray([0.12, 0.1, 0.05])
 LENS = np.asarray([0.05, 0.01, 0.02, -0.03, 0.0])
 OFF = 0.1
-"""Pixels: centroids of spots of 8-bit pixels, looked up bilinearly where a lens is removed."""
+"""Largest error of a spot's centroid, pixels: levels have 8 bits, and removing a lens is bilinear.
+"""
 
 
 def spot(K, pose, lens, size):
-    """A white spot where a camera sees POINT."""
+    """Returns a white spot at the pixel where a camera sees POINT."""
     seen = pose[:3, :3] @ POINT + pose[:3, 3]
     x, y = distort(seen[:2] / seen[2], lens) * np.diag(K)[:2] + K[:2, 2]
     columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
@@ -249,8 +252,9 @@ def phone(
     size=(written.WIDTH, written.HEIGHT),
     **changes,
 ):
-    """A rig whose photos have a flag, and its import. mask: "stored" or "shown", or "flagged" for
-    stored with the flag.
+    """Writes and imports a rig whose photos have an EXIF flag.
+
+    `mask` is "stored", "shown", or "flagged" for stored with the flag.
     """
     K, poses = written.scene()
     K[:, 0, 2], K[:, 1, 2] = size[0] / 2 + 1.3, size[1] / 2 - 0.8
@@ -282,8 +286,9 @@ def phone(
 
 
 def check_agreement(folder):
-    """The spot is where the capture's camera sees the point, in photo and mask; photos are read as
-    written.
+    """Checks that the spot is where the camera sees the point, in photo and mask.
+
+    Photos are read as they are written.
     """
     photos = load_photos(folder)
     for i, name in enumerate(json.loads((folder / "capture.json").read_text())["views"]):
@@ -383,7 +388,7 @@ def turn(K):
 
 
 def by_hand(tmp_path, turned_K):
-    """A capture whose photos have a flag."""
+    """Returns a capture folder in which photos have an EXIF flag."""
     phone(tmp_path, 1)
     for name in NAMES:
         file = tmp_path / "me/images" / f"{name}.png"

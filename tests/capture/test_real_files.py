@@ -1,5 +1,6 @@
-"""Files that other programs wrote (tests/data/files), with the values that their own text, another
-program, or the photos they were made from tell.
+"""Files of other programs (tests/data/files) have the values that are known for them.
+
+The values come from the files' own text, from another program, or from the photos.
 """
 
 import shutil
@@ -16,7 +17,7 @@ from humangs_jax.data.capture_checks import CaptureError
 
 FILES = Path(__file__).parents[1] / "data" / "files"
 DIGITS = 1e-3
-"""Of places, in the unit of each file, as they are written below."""
+"""Largest error of places, in the unit of each file: they are written below with three decimals."""
 OPENPOSE = 32
 """Largest error in pixels of OpenPose's points of a person who is 700 pixels high."""
 
@@ -82,7 +83,7 @@ def test_cameras_of_other_programs_are_where_they_stood(name):
 
 @pytest.mark.parametrize("suffix", ["txt", "bin"])
 def test_a_model_of_colmap_sees_its_points_where_colmap_found_them(suffix, tmp_path):
-    """As text and binary; a word in the wrong place would move them by hundreds of pixels."""
+    """Models are text and binary; a misread number would move points by hundreds of pixels."""
     for file in (FILES / "colmap").glob(f"*.{suffix}"):
         shutil.copy(file, tmp_path)
     model = read_calibration(tmp_path, lambda photo: (1, 1))
@@ -97,7 +98,7 @@ def test_a_model_of_colmap_sees_its_points_where_colmap_found_them(suffix, tmp_p
 
 
 def test_cameras_of_qualisys_are_those_that_pose2sim_made_of_them():
-    """But for lenses, which its program had divided by 64."""
+    """Lenses differ, because Pose2Sim had divided them by 64."""
     ours, theirs = (
         read(f"pose2sim/{name}").cameras for name in ("Calib.qca.txt", "Calib_qca.toml")
     )
@@ -108,7 +109,7 @@ def test_cameras_of_qualisys_are_those_that_pose2sim_made_of_them():
 
 
 def test_keypoints_of_openpose_meet_in_space_between_the_cameras_of_qualisys():
-    """A person who balances: upright, of human size, left of right where seen from behind."""
+    """A person balances upright, has human size, and has left and right at the right sides."""
     rig = read("pose2sim/Calib.qca.txt").cameras
     names = [f"{camera.name}.0050" for camera in rig]
     found = read_keypoints(FILES / "pose2sim/pose", names, 1088, 1920, person=0)

@@ -1,6 +1,4 @@
-"""Refinement from end to end on small images of the bare body, and its report on starts that it
-cannot improve.
-"""
+"""Refinement on small images of the bare body, and its report where it cannot improve."""
 
 import dataclasses
 import functools
@@ -47,7 +45,7 @@ CONFIG = CaptureRefineConfig(iterations=6, points=120)
 
 @functools.cache
 def truth():
-    """A person who stands, with masks of the bare body."""
+    """Returns a capture of a person who stands, with masks of the bare body."""
     body = default_body()
     rotations, translation = jnp.asarray(rotations_of("standing")), jnp.asarray([0.0, 0.4, 0.0])
     pose = BodyPose(rotations, translation)
@@ -84,7 +82,9 @@ def turned(capture, degrees, axis=(0, 1, 0)):
 
 @functools.cache
 def augmented():
-    """Focal lengths 5 % too long, cameras turned by 2 degrees, body joints bent by 3."""
+    """Returns the capture with errors: focal lengths 5 % too long, cameras turned by 2 degrees,
+    joints by 3.
+    """
     rng = np.random.default_rng(1)
     axes = rng.normal(size=(VIEWS + 22, 3))
     axes = jnp.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True), jnp.float32)
@@ -106,7 +106,7 @@ def _joints(body, betas, pose):
 
 
 def aligned_error(capture):
-    """Mean distance of body joints from the truth after the best rigid motion, metres."""
+    """Returns the mean distance of joints from the truth, metres, after the best rigid motion."""
     a, b = (
         np.asarray(_joints(c.body, jnp.asarray(c.betas), c.pose(0)))[:22]
         for c in (capture, truth())
@@ -117,7 +117,7 @@ def aligned_error(capture):
 
 
 def keypoints(confidence=1.0):
-    """Where the true landmarks are."""
+    """Returns keypoints at the true landmarks."""
     model, capture = landmark_model(default_body(), COCO_17.names), truth()
     landmarks, _ = pose_landmarks(model, jnp.zeros(3), capture.pose(0))
     points = np.stack([project(capture.cameras[i], landmarks)[0] for i in range(VIEWS)])
@@ -229,8 +229,8 @@ def test_small_gains_are_kept_where_keypoints_do_not_get_worse(before, after, ke
 
 
 def test_keypoints_of_long_narrow_photos_are_where_they_are():
-    """At the size that is looked at, the height is 0.853 and the width, of whole pixels, 0.856 of
-    the photo's.
+    """In the smaller image the height is 0.853 of the photo's, and the width, in whole pixels,
+    0.856.
     """
     known, cameras = keypoints(), truth().cameras.resized(90, 600)
     known = dataclasses.replace(known, points=known.points * np.float32([90 / SIZE, 600 / SIZE]))
@@ -248,7 +248,7 @@ def test_keypoints_of_long_narrow_photos_are_where_they_are():
 
 @pytest.mark.slow
 def test_keypoints_weigh_by_the_noise_that_the_body_finds():
-    """A detector's bias of 6 pixels is no evidence of 0.8."""
+    """A detector's bias of 6 pixels must not count as noise of 0.8."""
     known = keypoints()
     biased = dataclasses.replace(known, points=known.points + np.float32(6.0))
     noises = []
@@ -297,7 +297,7 @@ def boundary_of(sphere, camera):
 
 
 def disc(radius, x=SIDE / 2):
-    """Coverage of a disc, with soft edges."""
+    """Returns the coverage of a disc with soft edges."""
     rows, columns = np.mgrid[:SIDE, :SIDE] + 0.5
     return np.clip(radius - np.hypot(columns - x, rows - SIDE / 2) + 0.5, 0, 1).astype(np.float32)
 
@@ -346,7 +346,7 @@ def test_what_leaves_the_image_or_is_behind_the_camera_is_no_boundary(sphere):
 
 
 def test_an_edge_before_the_body_is_no_boundary():
-    """A small square before a large one: only the large one's border is the silhouette."""
+    """A small square lies before a large one; only the large one's border is the silhouette."""
     square = np.asarray([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     vertices = np.concatenate([square, 0.3 * square - [0, 0, 0.5]]).astype(np.float32)
     faces = np.asarray([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
@@ -409,7 +409,7 @@ def test_clothes_explain_a_gap_and_a_body_outside_costs_more_than_one_inside(sph
 
 
 def shapes_of(arguments):
-    """What a compiled program depends on of the arguments of a call."""
+    """Returns what the compiled program of a call depends on: structure, shapes and functions."""
     leaves, tree = jax.tree.flatten(arguments)
     return tree, [x if callable(x) else str(jax.eval_shape(lambda y: y, x)) for x in leaves]
 

@@ -1,5 +1,6 @@
-"""Smooth motion of a body of four joints: frames that are badly seen neither ruin the others nor
-their own.
+"""Smooth motion of a body of four joints, in which some frames are badly seen.
+
+Such frames spoil neither the others nor themselves.
 """
 
 import jax
@@ -18,11 +19,14 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 FRAMES, SIZE, NOISE, STD = 7, 512, 1.0, 0.003
-"""STD: expected acceleration, metres per frame squared; the true one is 0.002."""
+"""Frames, pixels of a side, pixels of noise, and expected acceleration, metres per frame squared.
+
+The true acceleration is 0.002.
+"""
 
 
 def true_poses():
-    """Walking on, an arm that swings: rotations (m, j, 3) and translations (m, 3)."""
+    """Returns rotations (m, j, 3) and translations (m, 3) of walking with a swinging arm."""
     time = np.arange(FRAMES)[:, None, None]
     rotations = 0.2 * np.sin(0.15 * time + np.arange(4)[:, None]) * np.asarray([0.3, 1.0, 0.5])
     translations = np.stack([0.05 * np.arange(FRAMES), np.zeros(FRAMES), np.zeros(FRAMES)], axis=1)
@@ -46,7 +50,7 @@ def states_of(rotations, translations):
 
 
 def seen_by(landmarks, seed=0):
-    """Noisy observations of landmarks (m, k, 3)."""
+    """Returns noisy observations of landmarks (m, k, 3)."""
     K = intrinsics_from_fov(1.0, SIZE, SIZE)
     camera = orbit(jnp.asarray([0.2, 0.5, 0.0]), 3.0, jnp.asarray([0.0, 1.5]), 0.1, K, SIZE, SIZE)
     pose = np.asarray(camera.cam_from_world)
@@ -62,8 +66,9 @@ def seen_by(landmarks, seed=0):
 
 @pytest.fixture(scope="module")
 def walk():
-    """Observations, the start that independent fits would give (the truth with errors), and true
-    joints.
+    """Returns (observations, start, true joints).
+
+    The start is the truth with errors, as fits of single frames would give.
     """
     rotations, translations = true_poses()
     landmarks, joints = (np.asarray(x) for x in landmarks_of(rotations, translations))
@@ -76,8 +81,9 @@ def walk():
 
 
 def smoothed(seen, start, spoilt=(), model=MODEL):
-    """The result; frames that are spoilt start where a fit of nothing would: at rest in the world's
-    origin.
+    """Returns the smoothed fit.
+
+    The frames `spoilt` start as a fit without keypoints would: at rest at the world's origin.
     """
     rotations, translations = (x.copy() for x in start)
     rotations[list(spoilt)], translations[list(spoilt)] = 0, 0
@@ -98,7 +104,7 @@ def smoothed(seen, start, spoilt=(), model=MODEL):
 
 
 def centimetres(fit, joints):
-    """Mean error of each frame."""
+    """Returns the mean joint error of each frame, centimetres."""
     return 100 * np.linalg.norm(np.asarray(fit.joints) - joints, axis=-1).mean(-1)
 
 
@@ -150,8 +156,8 @@ def test_somebody_else_in_one_frame_does_not_move_the_others(walk):
 def test_smoothness_that_the_keypoints_contradict_by_the_certainty_that_the_fit_found_is_not_forced(
     walk,
 ):
-    """Six times the expected acceleration: less is expected then, and keypoints are followed as by
-    frames one by one.
+    """The motion has six times the expected acceleration; keypoints are followed as in single
+    frames.
     """
     rotations, translations = (x.copy() for x in walk[1])
     translations[:, 1] += 0.015 * (np.arange(FRAMES) % 2)

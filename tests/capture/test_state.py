@@ -1,4 +1,4 @@
-"""States of fits: which views share a camera; the prior of poses."""
+"""States of fits: which views share a camera, and the prior of poses."""
 
 import jax.numpy as jnp
 import numpy as np

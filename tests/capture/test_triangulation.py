@@ -1,4 +1,4 @@
-"""Joints by rays of several cameras; left and right exchanged in views."""
+"""Joints from the rays of several cameras, with left and right exchanged in some views."""
 
 import dataclasses
 
@@ -42,7 +42,7 @@ def scene(**changes):
 
 
 def truth(joints):
-    """The landmarks that are joints: both knees and wrists, by name."""
+    """Returns (rows, places) of the landmarks that are joints: both knees and wrists."""
     names = ("left_knee", "right_knee", "left_wrist", "right_wrist")
     rows = [model_of().names.index(name) for name in names]
     return rows, joints[:, [model_of().joint_names.index(name) for name in names]]
@@ -80,7 +80,7 @@ def test_what_no_two_views_agree_on_is_unknown():
 
 
 def test_of_noisy_points_the_pixels_errors_are_least():
-    """Cameras of several focal lengths: no other point in space has smaller squared errors."""
+    """Cameras have several focal lengths; no other point has smaller squared pixel errors."""
     _, seen = scene(views=4)
     one, scale = jax.tree.map(lambda leaf: leaf[0], seen), jnp.asarray([1.0, 4.0, 0.3, 2.0])
     middle, noise = one.K[:, None, :2, 2], np.random.default_rng(0).normal(0, 3, one.points.shape)
@@ -133,7 +133,7 @@ def found(capture, keypoints):
 
 
 def changed(keypoints, order=None, flipped=()):
-    """Keypoints of views in another order, those of some mirrored."""
+    """Returns the keypoints with views in another order and some views mirrored."""
     order = np.arange(len(keypoints.points)) if order is None else np.asarray(order)
     points, confidences = keypoints.points[order].copy(), keypoints.confidences[order].copy()
     for view in flipped:
@@ -205,7 +205,7 @@ def test_cameras_of_two_views(views):
 
 
 def test_evenly_spaced_cameras_have_two_explanations():
-    """Half a turn of all cameras makes one exchange of opposite ones the other."""
+    """Turning all cameras by half makes exchanges in some views those in the opposite ones."""
     capture, keypoints = person(13, 4, 4, even=True)
     order = np.arange(16)
     order[[0, 2]] = [2, 0]
@@ -283,15 +283,16 @@ def test_where_hands_are_exchanged_the_body_is_right():
 
 
 SIZE, NOISE = 512, 4.0
-"""Pixels of the photos and of the noise: a hundredth of a person's height."""
+"""Pixels of the photos, and of the noise: a hundredth of a person's height."""
 AROUND = jnp.asarray([0.0, 1.3, 3.0, 4.4])
-"""Azimuths of the cameras: no two stand opposite each other."""
+"""Azimuths of the cameras; no two are opposite each other."""
 MIRRORED = np.asarray(COCO_17.mirror)
 
 
 def seen_in(people, views=4, seed=0):
-    """Views of people (n, 17, 3) metres, each in another order; the order of view 0 is the given
-    one.
+    """Returns (views, orders) of people (n, 17, 3), metres.
+
+    Each view lists the people in another order; that of view 0 is the given one.
     """
     rng = np.random.default_rng(seed)
     cameras = orbit(
@@ -312,7 +313,7 @@ def seen_in(people, views=4, seed=0):
 
 
 def somebody(seed, x=0.0):
-    """A standing person: left and right are 30 cm apart."""
+    """Returns joints of a standing person, whose left and right are 30 cm apart."""
     rng = np.random.default_rng(seed)
     height = np.asarray(
         [0.8, *[0.85] * 2, *[0.8] * 2, *[0.6] * 2, *[0.3] * 2, *[0.05] * 2, *[0.0] * 2, *[-0.4] * 2]
@@ -398,11 +399,11 @@ def test_of_ways_that_are_as_short_none_is_taken(before, after, linked):
 
 
 SIDEWAYS = np.asarray([200.0, 0.0, 0.0])
-"""Pixels, and no change of visibility."""
+"""A move by 200 pixels without a change of visibility."""
 
 
 def test_whom_space_does_not_link_the_photo_of_one_camera_links():
-    """One view of each moment: two people change their order in the list, and a third comes."""
+    """Each moment has one view; two people change their order in the list, and a third comes."""
     views, _ = seen_in(np.stack([somebody(0, -0.5), somebody(1, 0.5)]), 1)
     first, second = views[0].people
     guest = first - SIDEWAYS

@@ -1,6 +1,4 @@
-"""Frames of one moment are found by time; what videos say about colors and the shape of pixels is
-obeyed.
-"""
+"""Frames of one moment are found by their times; colors and pixel shapes follow the videos."""
 
 import subprocess
 
@@ -30,7 +28,7 @@ def clock(rate, count, without=(), shake=0.0):
 
 
 def apart(found, times):
-    """The longest time between views of one moment."""
+    """Returns the longest time between views of one moment."""
     rows = zip(*found.frames.values(), strict=True)
     seen = [
         [times[camera][n] for camera, n in zip(times, row, strict=True) if n is not None]
@@ -124,7 +122,7 @@ def test_numbers_are_written_as_progressions():
 
 
 def encode(path, frames, rate, *options, filters="null", pixels="yuv420p", codec="libx264"):
-    """A video of frames (h, w, 3) in [0, 1], with almost no loss."""
+    """Encodes frames (h, w, 3) in [0, 1] as a video, with almost no loss."""
     import imageio_ffmpeg
 
     height, width = frames[0].shape[:2]
@@ -139,7 +137,7 @@ def encode(path, frames, rate, *options, filters="null", pixels="yuv420p", codec
 
 
 RATE = 10
-"""Frames of a second, in these tests; each is as bright as its moment."""
+"""Frames in a second; the brightness of a frame tells its time."""
 
 
 def moment(seconds):
@@ -243,7 +241,7 @@ def srgb_to_light(levels):
 
 
 def to_hlg(light):
-    """BT.2100, of light before the camera, 1 is white paper."""
+    """Returns BT.2100's HLG signal of scene light, where 1 is white paper."""
     light = 0.265 * light
     bright = 0.17883277 * np.log(np.maximum(12 * light - 0.28466892, 1e-9)) + 0.55991073
     return np.where(light <= 1 / 12, np.sqrt(3 * light), bright)
@@ -277,7 +275,7 @@ def middles(path):
 
 
 def tagged(primaries, transfer, matrix, then="null"):
-    """Filters that tell the encoder what the colors are."""
+    """Returns filters that tag the video with these color properties."""
     to_matrix = {"bt2020nc": "bt2020", "bt709": "bt709", "smpte170m": "smpte170m"}[matrix]
     words = (
         f"setparams=color_primaries={primaries}:color_trc={transfer}:colorspace={matrix}:range=tv"

@@ -1,4 +1,4 @@
-"""Small work on arrays compiles nothing, and gives what JAX gives."""
+"""Small work on arrays gives what JAX gives, and compiles nothing."""
 
 import jax
 import jax.numpy as jnp

@@ -1,6 +1,4 @@
-"""What users hand in: wrong arguments and values are one line that says what came and what is
-expected.
-"""
+"""Wrong arguments of users give one line that says what was given and what is expected."""
 
 import ast
 import dataclasses
@@ -256,7 +254,9 @@ def test_wrong_arguments_are_named(name):
     ],
 )
 def test_wrong_fields_of_configurations_are_named(config, change, words):
-    """As `__init__` ends; it is not called here, because types are checked before it in tests."""
+    """The check at the end of `__init__` is called alone, because types are checked before it in
+    tests.
+    """
     with pytest.raises(ValueError, match=words):
         type(config).__post_init__(replace(config, **change))
     type(config).__post_init__(config)
@@ -326,7 +326,7 @@ def test_presets_are_dicts():
 
 
 def test_errors_of_the_library_name_no_options():
-    """They are the command line's, which shows the name of an argument as an option."""
+    """Only the command line shows the name of an argument as an option."""
     package, named, options = Path(hg.__file__).parent, [], set()
     for path in package.rglob("*.py"):
         text, command = path.read_text(), path.parent.name == "cli"

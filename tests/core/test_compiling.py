@@ -1,4 +1,4 @@
-"""The cache of compiled programs: where it lies, what turns it off, and how it stays small."""
+"""The cache of compiled programs: its folder, how it is turned off, and how it stays small."""
 
 import os
 import subprocess
@@ -34,7 +34,7 @@ jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((8, 8))).block_until_ready()
 
 
 ADD = Ahead.add
-"""As it is; the tests' own does nothing."""
+"""The package's method; that of the tests compiles nothing ahead."""
 
 
 @pytest.fixture(autouse=True)
@@ -44,7 +44,7 @@ def compiles_ahead(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def no_cache(monkeypatch, tmp_path):
-    """As in a program that has not heard of a cache; the tests' own comes back."""
+    """Restores JAX's settings as in a program without a cache, and the tests' own afterwards."""
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
     quickest = jax.config.jax_persistent_cache_min_compile_time_secs

@@ -1,4 +1,4 @@
-"""Every number of every configuration has a range, and every way to make one checks it."""
+"""Every number of a configuration has a range, and every way to make one checks it."""
 
 import dataclasses
 import json

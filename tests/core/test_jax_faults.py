@@ -1,4 +1,4 @@
-"""Faults of versions of JAX: the sums themselves, the flag, and what is left alone."""
+"""Faults of versions of JAX: the wrong sums, the flag that avoids them, and other versions."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ def test_sums_of_many_small_products_are_right_after_the_import_alone():
 
 @pytest.fixture
 def faulty(monkeypatch):
-    """The faulty version is installed, and no flag is set."""
+    """Sets the version of jaxlib with wrong sums, and a flag of the user."""
     monkeypatch.setattr(jax_faults, "version", lambda name: WRONG_SUMS)
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_max_isa=AVX2")
     monkeypatch.setattr(jax_faults, "_has_started", lambda: False)

@@ -1,4 +1,4 @@
-"""Loops that are side by side elsewhere than on a CPU; this CPU runs both."""
+"""Loops that accelerators run side by side; this CPU runs both kinds."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from humangs_jax.core.loops import over
 
 @pytest.fixture
 def elsewhere(monkeypatch):
-    """What asks for the backend hears of another one."""
+    """Makes JAX report a GPU as its backend."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
 
 

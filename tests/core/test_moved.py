@@ -1,4 +1,4 @@
-"""Modules under the names that they had."""
+"""Modules can still be imported under the names that they had."""
 
 import importlib
 import sys

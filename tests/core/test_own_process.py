@@ -1,4 +1,4 @@
-"""Memory that stays with the process, interrupts that wait, workers that end with it."""
+"""The peak of memory, interrupts that wait, and workers that end with their process."""
 
 import os
 import signal
@@ -46,7 +46,7 @@ def test_freed_blocks_stay_with_the_process():
 
 
 def test_the_peak_is_that_of_the_work_inside():
-    """Not of what was freed before, nor of what is kept."""
+    """Memory that was freed before, or is kept from before, does not count."""
     kept = np.ones(16 << 20, np.uint8)
     for size in (96, 32):
         with peak_memory() as peak:
@@ -65,7 +65,7 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(autouse=True)
 def _default_handler():
-    """Shells start what runs in the background without it."""
+    """Sets Python's handler of interrupts: shells start background processes without it."""
     previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, previous)

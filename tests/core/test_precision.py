@@ -1,6 +1,4 @@
-"""Matrix products say how exact they are: accelerators round factors to 10 bits (TF32, bfloat16)
-by default.
-"""
+"""Matrix products state their precision: by default, accelerators round factors to 10 bits."""
 
 import ast
 from pathlib import Path
@@ -17,7 +15,7 @@ from humangs_jax.rendering.reference import render_reference
 
 PRODUCTS = ("einsum", "matmul", "dot", "tensordot", "vdot", "inner", "dot_general")
 SAYS = {"precision", "preferred_element_type"}
-"""The second in the network, whose numbers have the type that its configuration says."""
+"""Arguments that state it; the second is the network's, whose type its configuration gives."""
 PACKAGE = Path(humangs_jax.__file__).parent
 VIEWS, POINTS, SIZE = 2, 5, 8
 

@@ -1,4 +1,4 @@
-"""Nothing that a file says acts on the terminal, and nothing but one module writes there."""
+"""Text of files cannot act on the terminal, and one module writes there."""
 
 import io
 import re
@@ -15,7 +15,7 @@ from humangs_jax.io.reading import FileError
 
 PACKAGE = Path(humangs_jax.__file__).parent
 OWN = ("core/progress.py", "cli/screen.py")
-"""The door, and what is written while the process ends at once."""
+"""Modules that may write: the one for all, and the one that writes while the process ends."""
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_errors_of_files_are_printable():
 
 
 def test_one_module_writes_to_the_terminal():
-    """Else a call site could forget what `say` does."""
+    """Other modules could forget what `say` does to unsafe text."""
     writes = re.compile(
         r"\bprint\(|std(out|err)\.write|\bbar\.write|tqdm\.write"
         r"|os\.write\([12],|logging\.StreamHandler"
@@ -77,7 +77,7 @@ def test_any_name_can_be_said_on_any_terminal(encoding, monkeypatch):
 
 
 def lines_of(shown):
-    """What is left on a terminal: the last text of every line."""
+    """Returns what is left on a terminal: the last text of every line."""
     return [line.rsplit("\r", 1)[-1].removeprefix("\033[K") for line in shown.split("\n")]
 
 

@@ -1,4 +1,4 @@
-"""Checks of records by their annotations."""
+"""Records are checked against their annotations."""
 
 import dataclasses
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Tables of formats: listed without their code, which is imported when a row is called."""
+"""Tables of formats are listed without the code of the formats, which is imported at a call."""
 
 import sys
 from pathlib import Path

@@ -18,7 +18,7 @@ from humangs_jax.io.reading import read_json, write_json
 
 HEIGHT, WIDTH, VIEWS, FRAMES, JOINTS = 12, 10, 3, 2, 5
 HALF_LEVEL = 0.5 / 255 + 1e-6
-"""8-bit images are rounded to the nearest level."""
+"""Half a level of 8-bit images, with a margin for rounding."""
 
 
 def arrays(seed=0):
@@ -41,7 +41,7 @@ def arrays(seed=0):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A valid capture on disk, of the tiny body."""
+    """Returns the folder of a valid capture of the tiny body."""
     save_capture(tmp_path / "me", capture_from_arrays(**arrays()))
     return tmp_path / "me"
 
@@ -93,7 +93,7 @@ TOO_MANY = (
 def test_large_captures_are_read_and_endless_ones_refused_before_their_photos_are(
     folder, monkeypatch
 ):
-    """60 photos of 12 megapixels are honest work."""
+    """60 photos of 12 megapixels are allowed."""
     monkeypatch.setattr(photos_module, "image_size", lambda path: (4000, 3000))
     (folder / "photos").mkdir()
     views = [{"image": f"photos/{i}.png"} for i in range(84)]
@@ -381,7 +381,9 @@ KINDS = {
     "names that it has not, but 0": (OWN_NAMES, [0, 2], ["shape_0", "age"], [0, 2]),
     "no shape at all": (OWN_NAMES, np.zeros(10), None, [0, 0, 0]),
 }
-"""Names of the body's directions, betas, their names, what they mean in the order of the body."""
+"""Kinds of files: names of the body's directions, betas, names of betas, and betas in the body's
+order.
+"""
 WRONG_KINDS = {
     "SMPL-X's shape on expressions": (
         SMPLX_NAMES,
@@ -530,7 +532,7 @@ def test_of_an_older_capture_the_run_that_made_it_tells_whether_cameras_are_cali
 
 
 def test_photos_that_overshoot_by_a_rounding_are_used_and_written(tmp_path):
-    """Resampling may leave 1.0004; what is read, used and written is 1."""
+    """Resampling may leave 1.0004; it is read, used and written as 1."""
     given = arrays()
     given["images"] = np.where(given["images"] > 0.5, np.float32(1.0004), given["images"])
     capture = capture_from_arrays(**given)

@@ -1,6 +1,4 @@
-"""A body that is displaced to the masks: a known coat is found, and masks that say nothing do no
-harm.
-"""
+"""A body is displaced to fill the masks: a known coat is found, and useless masks do no harm."""
 
 import dataclasses
 import functools
@@ -29,7 +27,7 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 SIZE, COAT = 384, 0.01
 FOUND = 0.003
-"""Metres: a pixel of these masks shows 6 mm, and its edge is known to half of that."""
+"""Largest error, metres: a pixel shows 6 mm, and an edge is known to half of it."""
 BOUND = 2 * max(OffsetFitConfig.inwards, OffsetFitConfig.outwards) + WRAP
 POSES = 2
 
@@ -59,15 +57,16 @@ def masks_of(body, rest, poses, frames, cameras):
 
 
 def free(body):
-    """Share of each vertex that belongs neither to the head nor to hands."""
+    """Returns the share of each vertex that belongs neither to the head nor to hands."""
     held = np.asarray([any(name in joint for name in HELD_JOINTS) for joint in body.joint_names])
     return 1 - np.asarray(body.skinning_weights) @ held
 
 
 @pytest.fixture(scope="module")
 def dressed(body):
-    """A capture of eight photos in two poses of somebody in a coat, 1 cm thick, and how far its
-    vertices are from the body.
+    """Returns (capture, offsets (n, 3) of the coat from the body, metres).
+
+    The capture has eight photos in two poses of a person in a coat.
     """
     rng = np.random.default_rng(0)
     betas = jnp.zeros(len(body.shape_names)).at[:2].set(jnp.asarray([0.5, -0.3]))
@@ -104,7 +103,7 @@ def along_normals(body, capture, moved):
 
 @pytest.fixture(scope="module")
 def filled(body, dressed):
-    """The displacement that fills the masks."""
+    """Returns the displacement that fills the masks."""
     return fit_vertex_offsets(body, dressed[0], inset=(0.0, 0.0))
 
 
@@ -128,7 +127,7 @@ def test_the_inset_is_kept(body, dressed, filled):
 
 
 def test_only_a_body_that_sticks_out_of_the_masks_needs_it(body, dressed):
-    """Clothes put no body outside of a mask; a body that is too heavy lies there."""
+    """Clothes put no body outside of a mask, but a body that is too heavy lies there."""
     capture, _ = dressed
     assert not fit_vertex_offsets(body, capture, always=False).any()
     heavy = capture.betas + 3.0 * np.asarray([name == "weight" for name in body.shape_names])
@@ -150,7 +149,7 @@ REMESHED = {
 
 @pytest.mark.parametrize("wish", REMESHED)
 def test_a_displacement_is_carried_to_the_vertices_of_another_mesh(body, wish):
-    """As the mesh itself is: what the remeshing does to any quantity of the vertices."""
+    """Remeshing treats it like any quantity of the vertices."""
     conventions = dict(REMESHED[wish])
     config = tiny().with_runtime(**conventions.pop("runtime", {})).with_conventions(**conventions)
     small = decimate(body, 300)

@@ -1,4 +1,4 @@
-"""Equal exposure and white balance of photos that share no point of the body."""
+"""Photos that share no point of the body get equal exposure and white balance."""
 
 import dataclasses
 
@@ -24,14 +24,14 @@ from humangs_jax.data.exposure import (
 )
 
 POINTS = 200
-"""Of each part, on each side of the person."""
+"""Points of each part on each side of the person."""
 ONE_MOMENT, OTHER_MOMENTS = np.zeros(4, int), np.arange(4)
 
 
 def person(rng, sides=(0, 0, 1, 1), different=()):
-    """Colors of the points of a person in four photos of two sides, seen, parts.
+    """Returns (colors, seen, parts) of the points of a person in four photos of two sides.
 
-    different: parts whose color is another one behind.
+    The parts `different` have another color behind.
     """
     parts = np.tile(np.repeat(np.arange(len(PARTS)), POINTS), 2)
     side = np.repeat([0, 1], len(PARTS) * POINTS)
@@ -50,7 +50,7 @@ def tints(logs):
 
 
 def difference(logs):
-    """Of the two sides."""
+    """Returns the difference between the two sides."""
     return logs[:2].mean(axis=0) - logs[2:].mean(axis=0)
 
 
@@ -82,7 +82,7 @@ def test_an_exposure_is_found_nearly_whole_from_the_parts():
 
 
 def test_an_open_coat_does_not_count():
-    """Chest, belly and neck are of other colors behind; the other parts agree."""
+    """Chest, belly and neck have other colors behind; the other parts agree."""
     logs = np.outer([1, 1, -1, -1], [0.15, 0.0, -0.15])
     for seed in range(5):
         colors, seen, parts = person(np.random.default_rng(seed), different=(0, 1, 9))
@@ -91,7 +91,7 @@ def test_an_open_coat_does_not_count():
 
 
 def test_photos_of_one_moment_and_one_light_stay_as_they_are():
-    """Parts of them are brighter on one side, which is the light's doing."""
+    """Parts are brighter on one side because of the light."""
     for seed in range(20):
         np.testing.assert_array_equal(
             between(*person(np.random.default_rng(seed), different=(0,)), ONE_MOMENT), 0
@@ -106,7 +106,7 @@ def test_photos_of_one_moment_by_cameras_of_other_white_balances_are_made_equal(
 
 
 def test_three_groups_are_made_equal_together():
-    """A front, a back and a detail that shows two parts alone."""
+    """The groups are a front, a back, and a detail that shows only two parts."""
     colors, seen, parts = person(np.random.default_rng(1), sides=(0, 1, 0, 1))
     logs = np.asarray([[0.2, 0, -0.2], [-0.2, 0, 0.2], [0.0, 0.1, -0.1], [0.1, -0.1, 0.0]])
     logs = logs - logs.mean(axis=0)
@@ -153,7 +153,7 @@ def test_every_vertex_of_the_shipped_body_has_a_part_and_both_sides_the_same():
 
 @pytest.fixture(scope="module")
 def front_and_back(demo):
-    """Two photos of the demo that share no point, each as a moment."""
+    """Returns two photos of the demo that share no point, each as a moment."""
     seen = points_of(demo)[1]
     shared = [(seen[0] & seen[other]).sum() for other in range(1, 4)]
     pair = demo.select([0, 1 + int(np.argmin(shared))])

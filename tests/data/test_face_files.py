@@ -1,5 +1,6 @@
-"""Faces in files: tables, scores of MediaPipe, weights and expressions in animations, and those
-that are written.
+"""Faces in files: tables, MediaPipe's scores, weights and expressions in animations.
+
+Written faces come back as well.
 """
 
 import json
@@ -138,7 +139,7 @@ def person():
 
 @pytest.fixture(scope="module")
 def talking():
-    """A motion whose mouth opens, on nobody yet."""
+    """Returns a motion whose mouth opens; it is not yet that of an avatar."""
     rng = np.random.default_rng(1)
     faces = np.zeros((5, 52), np.float32)
     faces[:, ARKIT.index("jawOpen")] = np.linspace(0, 1, 5)

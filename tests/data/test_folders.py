@@ -1,6 +1,4 @@
-"""Folders of photos as phones, disks and other programs fill them: what is used, and the line about
-the rest.
-"""
+"""Folders as phones, disks and other programs fill them: photos are used, the rest is named."""
 
 import json
 
@@ -23,7 +21,7 @@ CLIP = np.full((3, written.HEIGHT, written.WIDTH, 3), 0.5)
 
 @pytest.fixture
 def rig(tmp_path):
-    """Calibration, photos and the place of the capture."""
+    """Writes a calibration and photos; returns (source, images, place of the capture)."""
     written.write_calibration_full(tmp_path / "rig.json", *written.scene(), NAMES)
     written.write_photos(tmp_path / "photos", FILES)
     return tmp_path / "rig.json", tmp_path / "photos", tmp_path / "out"

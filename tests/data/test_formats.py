@@ -1,5 +1,6 @@
-"""A further format is a module and a row of a table: help, reading, `start`, errors and docs have
-it from there.
+"""A new format needs a module and a row of a table.
+
+Help, reading, `start`, errors and docs then know it.
 """
 
 import importlib
@@ -25,7 +26,7 @@ from tests.capture import calibration_files as written
 
 @pytest.fixture
 def made_up(monkeypatch):
-    """Sets the functions of a module, and reads the tables again for the help of commands."""
+    """Returns a function that adds a format to a table and sets the functions of its module."""
     module = types.ModuleType("made_up")
     monkeypatch.setitem(sys.modules, "made_up", module)
 
@@ -106,7 +107,7 @@ def test_a_format_of_keypoints_is_one_row(tmp_path, made_up, capsys):
 
 
 def test_the_first_row_that_recognizes_a_file_reads_it(tmp_path, made_up):
-    """Files that are read together are known by their names, alone or in a folder."""
+    """Files that are read together are recognised by their names, alone or in a folder."""
     made_up(
         CAMERAS, CameraFormat("Greedy", "made_up:read"), recognizes=lambda source: True, read=None
     )

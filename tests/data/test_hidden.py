@@ -70,7 +70,7 @@ def test_a_body_is_not_carved_where_somebody_stands_in_front(hidden, demo):
 
 
 def test_a_view_is_judged_by_what_it_shows(hidden):
-    """A mask without most of the person does not make the view one of somebody else."""
+    """A view whose mask lacks most of the person is not one of another person."""
     unknown = hidden.masks > 0.5
     unknown[:, :, :] = unknown | hidden.unknown
     unknown[0, 200:, :] = True
@@ -135,13 +135,14 @@ def test_a_crop_knows_nothing_beyond_the_border_that_cuts_the_person_off(demo):
 
 @pytest.fixture(scope="module")
 def small(demo):
-    """Two photos of the demo, small ones."""
+    """Returns two photos of the demo at a small size."""
     return demo.select([0, 1]).resized(256)
 
 
 def with_bar(capture, low, high):
-    """The capture with masks that a bar cuts in the first photo, between two shares of the person's
-    height, and where the bar hides the person.
+    """Returns (capture whose first mask a bar cuts, pixels where the bar hides the person).
+
+    The bar lies between two shares of the person's height.
     """
     rows = np.flatnonzero((capture.masks[0] > 0.5).any(1))
     masks = capture.masks.copy()
@@ -152,7 +153,7 @@ def with_bar(capture, low, high):
 
 
 def moved(capture, degrees, seed=0):
-    """The capture with a body that is off by so much in each joint."""
+    """Returns the capture with a body whose joints are off by random turns, degrees."""
     turns = np.random.default_rng(seed).normal(0, np.radians(degrees), (1, 55, 3))
     rotations = np.asarray(capture.poses.rotations) + turns
     poses = replace(capture.poses, rotations=rotations.astype(np.float32))
@@ -161,7 +162,7 @@ def moved(capture, degrees, seed=0):
 
 @pytest.mark.parametrize("degrees", [0, 2, 4])
 def test_nothing_is_in_front_where_masks_show_the_whole_person(degrees, small):
-    """Nor between arm and trunk, with a body that is a little off."""
+    """Nor is the gap between arm and trunk in front, with a body that is a little off."""
     assert hidden_parts(moved(small, degrees)) is None
     assert with_hidden_parts(small) is small and hidden_line(small, small) is None
 
@@ -184,7 +185,7 @@ def test_a_bar_in_front_of_the_body_is_unknown(low, high, degrees, small):
 
 
 def test_a_limb_that_the_body_has_elsewhere_is_not_hidden(small):
-    """The body's left leg is lifted to the side; the mask shows it where it is."""
+    """The body's left leg is lifted to the side, and the mask shows it at rest."""
     rotations = np.asarray(small.poses.rotations).copy()
     rotations[:, small.body.joint_names.index("left_hip"), 2] += 0.5
     poses = replace(small.poses, rotations=rotations)

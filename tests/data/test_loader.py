@@ -1,4 +1,4 @@
-"""The loader: deterministic, resumable, and never silent about what it leaves out."""
+"""The loader is deterministic, continues where it stopped, and names what it leaves out."""
 
 import logging
 import re
@@ -65,7 +65,7 @@ def loader_of(cache, sampling, input_size, target_size, batch_size=1):
 
 
 def stored_subject(path, body):
-    """A whole capture folder as the loader sees it."""
+    """Returns a whole capture folder as the loader sees it."""
     return CaptureCache([path], body).some_views(0, range(len(read_summary(path, body).frames)))
 
 
@@ -85,7 +85,7 @@ def source(folder):
 
 
 def greys(views):
-    """(subject, view) of every image, read off its grey."""
+    """Returns (subject, view) of every image, which its grey level tells."""
     return [divmod(round(255 * float(image.mean())), LEVELS) for image in views.images]
 
 
@@ -218,9 +218,7 @@ def test_a_broken_folder_is_skipped_counted_and_named(folder, tmp_path, caplog):
 
 
 def test_captures_of_another_body_are_left_out(tmp_path):
-    """Its joints and coefficients have the same shapes, and would be posed as those of the body
-    that is trained on.
-    """
+    """Their joints and coefficients have the same shapes: they would be posed as the right ones."""
     write_subject(tmp_path / "ours", 1)
     write_subject(tmp_path / "smplx", 2)
     edit_npz(tmp_path / "smplx" / "body.npz", body="../SMPLX_NEUTRAL.npz")
@@ -290,7 +288,7 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(
 def test_an_image_that_only_decoding_finds_broken_costs_its_examples_alone(
     folder, tmp_path, monkeypatch
 ):
-    """Whatever was asked for before: a resumed run does not know what an earlier one found out."""
+    """The order of calls does not matter: a resumed run does not know what an earlier one found."""
     write_subject(tmp_path / "s2", 2)
     folders = (folder / "s0", tmp_path / "s2")
 
@@ -388,8 +386,8 @@ WINDOW = ViewSampling(input_counts=(4,), target_count=4, rule="window")
 
 
 def test_the_window_rule_is_the_release_s():
-    """Of 60 views: the ends of a window come first, 25 to 59 views apart, then views inside of it;
-    all are different.
+    """Of 60 views the ends of a window come first, 25 to 59 views apart, then different views
+    inside it.
     """
     distances, subject = set(), fake_subject(60, 1)
     for seed in range(3000):

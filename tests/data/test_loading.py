@@ -1,4 +1,4 @@
-"""Sources, mixtures, rows of processes, threads that read ahead."""
+"""Sources, mixtures, rows of processes, and threads that read ahead."""
 
 import collections
 import json
@@ -28,7 +28,7 @@ SIZE = 4
 
 
 def toy_views(values, name):
-    """Views whose every leaf tells the numbers `values` (v,)."""
+    """Returns views in which each leaf holds the numbers `values` (v,)."""
     fill = lambda *shape: jnp.broadcast_to(
         values.reshape(-1, *[1] * len(shape)), (len(values), *shape)
     )
@@ -43,7 +43,7 @@ def toy_views(values, name):
 
 
 class CountingSource:
-    """Example (seed, index, input_count) as numbers in its leaves; `name` tells the source."""
+    """A source whose examples hold (seed, index, input_count); `name` tells sources apart."""
 
     def __init__(self, name=0.0, counts=(1, 2, 3), delay=None, broken_at=None):
         self.name, self.input_counts, self.broken = name, counts, {f"thing of {name}": "torn"}
@@ -67,7 +67,7 @@ class CountingSource:
 
 
 def content(batch):
-    """(source, index) of each row."""
+    """Returns (source, index) of each row."""
     return [
         tuple(row) for row in np.asarray(batch.inputs.translations)[:, :2, 0].astype(int).tolist()
     ]
@@ -196,7 +196,7 @@ def test_mixtures_are_checked():
 
 
 def toy_person(key, input_count):
-    """A person of a key, as made on the fly: all of it random."""
+    """Returns a random example of a key, like those that are made on the fly."""
     values = jax.random.uniform(key, (input_count + 1,))
     return Example(toy_views(values[:input_count], ""), toy_views(values[input_count:], ""))
 
@@ -228,8 +228,8 @@ def test_keys_drawn_for_a_split_are_of_its_people(seed, index, split):
 @given(st.sampled_from(sorted(SPLITS)), st.integers(0, 999), st.integers(0, 2**32 - 1))
 @settings(deadline=None, max_examples=60)
 def test_a_key_is_its_person_and_appearance(split, number, appearance):
-    """The words of keys are (appearance, seed): keys of different splits cannot be equal, whatever
-    the appearance.
+    """Keys consist of (appearance, seed): those of different splits differ, whatever the
+    appearance.
     """
     seed = SPLITS[split][number]
     key = subject_key(seed, appearance)

@@ -1,6 +1,4 @@
-"""Masks that are too large or too small, moved to the edges in the photos; and colors along the
-edge of a mask.
-"""
+"""Masks that are too large or too small move to the edges in the photos; colors along an edge."""
 
 import json
 import logging
@@ -28,10 +26,12 @@ from humangs_jax.io.images import read_grey, read_image, write_png
 
 HEIGHT, WIDTH = 240, 160
 FOUND = 0.5
-"""Of a step more than that of the search, in pixels of a person who is 200 high."""
+"""Largest error of a found size beyond the search's step, in pixels of a person 200 high."""
 LEFT = 0.7
-"""Mean distance of a silhouette from the true one, in the same pixels; measured up to 0.4. The
-search has steps of 0.5; silhouettes with corners do not grow and shrink by a distance."""
+"""Largest mean distance between silhouettes, in the same pixels; measured up to 0.4.
+
+The search has steps of 0.5. A silhouette with corners does not grow by a distance exactly.
+"""
 
 
 def fit_mask(photo, mask):
@@ -39,9 +39,7 @@ def fit_mask(photo, mask):
 
 
 def figure(scale=1):
-    """Coverage of a figure of two ellipses and a box, 200 pixels high at scale 1, with soft
-    edges.
-    """
+    """Returns the coverage of two ellipses and a box, 200 pixels high at scale 1."""
     fine = 4
     y, x = (np.mgrid[: HEIGHT * scale * fine, : WIDTH * scale * fine] + 0.5) / fine / scale
     parts = [
@@ -57,7 +55,7 @@ def figure(scale=1):
 
 
 def photo_of(mask, seed=0, background=None):
-    """A striped person in front of blurred noise."""
+    """Returns a photo of a striped person in front of blurred noise."""
     rng = np.random.default_rng(seed)
     size = (*mask.shape, 3)
     if background is None:
@@ -70,7 +68,7 @@ def photo_of(mask, seed=0, background=None):
 
 
 def grown(mask, pixels):
-    """The mask with a silhouette that lies that many pixels further out."""
+    """Returns the mask with its silhouette moved outwards by `pixels`."""
     return np.clip(signed_distance(mask) + pixels + 0.5, 0, 1).astype(np.float32)
 
 
@@ -105,7 +103,7 @@ def test_parts_are_moved_by_their_own_error():
 
 
 def test_one_side_alone_stays():
-    """A side that is too large looks like one whose rim has the color of the wall."""
+    """A side that is too large looks like one whose rim has the wall's color."""
     mask = figure()
     wrong = np.where(np.arange(HEIGHT)[:, None] < 120, grown(mask, 3.0), mask)
     fitted, excess = fit_mask(photo_of(mask), wrong)
@@ -114,7 +112,7 @@ def test_one_side_alone_stays():
 
 @pytest.fixture(scope="module")
 def person():
-    """The demo's person in four views: colors without the background, masks."""
+    """Returns (colors without background, masks) of the demo's person in four views."""
     capture = load_capture("demo_capture").resized(256)
     masks = capture.masks
     return np.clip(1 + (capture.images - 1) / np.maximum(masks[..., None], 1e-3), 0, 1), masks
@@ -124,7 +122,7 @@ WALL = np.asarray([0.85, 0.83, 0.8])
 
 
 def before_a_wall(colors, masks, rim=0.0, color=WALL, where=True):
-    """Photos with a noisy wall, and a stripe of a color along the rim, that many pixels wide."""
+    """Returns photos before a noisy wall, with a stripe along the silhouette, `rim` pixels wide."""
     photos = []
     for i, (image, mask) in enumerate(zip(colors, masks, strict=True)):
         wall = WALL + 0.01 * np.random.default_rng(i).normal(size=image.shape)
@@ -161,7 +159,7 @@ def test_masks_of_the_same_person_that_are_off_are_moved(person, pixels):
 
 
 def test_a_mask_that_most_views_contradict_stays():
-    """A rim of the color of one of the walls; masks that are off are off in most views."""
+    """In one view a rim may look like the wall; masks that are off are off in most views."""
     mask = figure()
     photos = [photo_of(mask, seed) for seed in range(4)]
     for wrong, moved in (({3}, 0), ({1, 3}, 2), ({0, 1, 2, 3}, 4)):
@@ -221,7 +219,7 @@ def test_boxes_of_a_mask_and_of_the_person_in_it():
 
 @pytest.fixture
 def folder(tmp_path):
-    """A capture of one photo whose mask is three pixels too large, and the true mask."""
+    """Returns (folder of a capture of a photo whose mask is three pixels too large, true mask)."""
     mask = figure()
     place = tmp_path / "me"
     place.mkdir()
@@ -292,17 +290,17 @@ def test_reconstruct_moves_masks_unless_told_not_to(
 
 SKIN, ROOM = np.asarray([0.8, 0.5, 0.4], np.float32), np.asarray([0.1, 0.2, 0.9], np.float32)
 ROUNDING = 1e-5
-"""Of float32 sums over the kernel."""
+"""Rounding of float32 sums over the kernel."""
 
 
 def disc(size: int, radius: float, soft: float) -> np.ndarray:
-    """Coverage of a disc whose edge is `soft` pixels wide."""
+    """Returns the coverage of a disc whose edge is `soft` pixels wide."""
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
     return np.clip((radius - np.hypot(x, y)) / soft + 0.5, 0, 1).astype(np.float32)
 
 
 def mixed(coverage: np.ndarray) -> np.ndarray:
-    """Skin before the room."""
+    """Returns the colors of skin before the room."""
     return SKIN * coverage[..., None] + ROOM * (1 - coverage[..., None])
 
 

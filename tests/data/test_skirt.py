@@ -1,4 +1,4 @@
-"""A skirt is found in the masks, and its surface lies where theirs is; trousers have none."""
+"""A skirt is found in the masks, with its surface in the right place; trousers have none."""
 
 import dataclasses
 import functools
@@ -30,18 +30,17 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 SIZE, VIEWS = 384, 6
 HEM = 2 * (BOTTOM - TOP) / (ROWS - 1)
-"""The hem is known to a row; cameras above see its front lower and its back higher than the points
-between the legs.
+"""Largest error of the hem: a row of the mesh on both sides.
+
+Cameras above see the hem's front lower and its back higher than the points between the legs.
 """
 SURFACE = 0.016
-"""Metres, median: two pixels of these masks; between the photos the section is a smooth guess.
+"""Largest median error of the surface, metres: two pixels of these masks.
 
-It starts at some 0.06.
+Between the photos the section is a smooth guess. The error starts at some 0.06.
 """
 STRETCH = 3.0
-"""A skirt of legs that are turned by 60 degrees against each other: longest edge over that in the
-T-pose, without a tear.
-"""
+"""Longest edge with legs 60 degrees apart, over that in the T-pose: the skirt does not tear."""
 CONE = (0.28, 0.17)
 """Half axes of the hem, metres."""
 
@@ -57,8 +56,9 @@ def rasterizer():
 
 
 def cone(body, hem):
-    """An elliptic cone around the legs of the T-pose, from the hips to `hem` (0: hips, 1: ankles),
-    and its height at the hem.
+    """Returns ((vertices, faces), height at the hem) of an elliptic cone around the legs.
+
+    It reaches from the hips (`hem` 0) down towards the ankles (1).
     """
     joints = np.asarray(body.joint_regressor @ body.template)
     names = list(body.joint_names)

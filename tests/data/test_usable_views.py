@@ -1,5 +1,6 @@
-"""Photos before they are used: views left out whose mask does not show the person, few of many, in
-equal exposure.
+"""Photos are checked before use: views without the person go, few of many are chosen.
+
+Chosen photos get equal exposure.
 """
 
 import dataclasses
@@ -39,7 +40,7 @@ def with_mask(capture, view, mask):
 
 
 def elsewhere(mask):
-    """A spot in the corner, where the body is not."""
+    """Returns a mask of a spot in the corner, far from the body."""
     spot = np.zeros_like(mask)
     spot[:40, :40] = 1
     return spot
@@ -54,7 +55,7 @@ SPOILED = {
 
 
 def head(mask):
-    """The top eighth of the person."""
+    """Returns the mask's top eighth."""
     rows = np.flatnonzero((mask > 0.5).any(axis=1))
     return mask * (np.arange(len(mask)) < rows[0] + len(rows) // 8)[:, None]
 
@@ -126,7 +127,7 @@ def test_no_view_left_is_an_error_that_names_them(demo):
 # -------------------------------------------------------------------------------------------
 
 GUARANTEE = 1 - 1 / np.e
-"""Of the greedy choice for a monotone submodular function."""
+"""Least share of the best gain that a greedy choice reaches (monotone submodular functions)."""
 
 
 def covered(quality, rows):
@@ -143,7 +144,7 @@ def test_the_greedy_choice_keeps_its_guarantee(quality, count):
 
 @pytest.mark.slow
 def test_repeated_photos_are_left_out(demo):
-    """Of four photos, three of which are one, two different ones show more."""
+    """Three of four photos are the same: two different ones show more."""
     doubled = demo.select([0, 0, 2, 0])
     chosen = best_views(doubled, 2)
     assert 2 in chosen and len(set(chosen)) == 2
@@ -165,7 +166,7 @@ def test_few_photos_are_all_taken_and_none_is_refused(demo):
 
 
 def test_without_a_number_what_adds_nothing_is_left_out(demo):
-    """Photos from four sides add something each; their copies do not."""
+    """Photos from four sides each add something, and their copies do not."""
     assert best_views(demo, None) == [0, 1, 2, 3]
     assert len(best_views(demo.select([0, 2, 0, 2]), None)) == 2
 
@@ -200,8 +201,8 @@ def test_a_photo_from_farther_away_is_worth_less_by_its_pixels_per_metre(demo):
 
 
 def test_surface_counts_and_not_the_number_of_vertices(demo, monkeypatch):
-    """One photo shows the 60 % of the vertices with the smallest areas, the other one the others:
-    more skin.
+    """One photo shows the 60 % of the vertices with the smallest areas; the other one shows more
+    skin.
     """
 
     def quality(body, views):
@@ -218,12 +219,12 @@ def test_surface_counts_and_not_the_number_of_vertices(demo, monkeypatch):
 # --------------------------------------------------------------------------------------------------
 
 SHRINKING = 0.1
-"""Share of a gain that the prior keeps back where many points are shared."""
+"""Largest share of a gain that the prior removes where many points are shared."""
 POINTS = 4000
 
 
 def skin(rng, count=4, noise=0.05):
-    """Colors of common points in photos of equal exposure."""
+    """Returns colors of common points in photos of equal exposure."""
     own = rng.uniform(0.2, 0.7, (1, POINTS, 3))
     return own * np.exp(noise * rng.normal(size=(count, POINTS, 3)))
 
@@ -259,7 +260,7 @@ def test_gains_are_exactly_one_without_disagreement_or_without_common_points():
 
 
 def test_photos_with_nothing_in_common_are_not_moved_against_each_other():
-    """Two pairs of cameras on two sides: each pair agrees, and the pairs keep their means."""
+    """Two pairs of cameras stand on two sides: each pair is made equal, and their means stay."""
     rng = np.random.default_rng(3)
     logs = np.repeat([[0.3], [0.1], [-0.1], [-0.3]], 3, axis=1)
     seen = (np.arange(POINTS) < POINTS // 2) == np.asarray([True, True, False, False])[:, None]
@@ -285,7 +286,7 @@ def test_a_synthetic_capture_stays_as_it_is(demo):
 
 
 def exposed(capture, logs):
-    """The capture as if each camera had metered for itself."""
+    """Returns the capture as if each camera had chosen its exposure."""
     return dataclasses.replace(
         capture, images=apply_gain(capture.images, capture.masks, np.exp(-logs))
     )
@@ -315,7 +316,7 @@ def test_a_capture_in_different_exposures_is_made_equal(demo):
 )
 @settings(max_examples=4)
 def test_gains_are_found_once_for_a_capture_whatever_its_exposure_gains(demo, logs, views):
-    """Equal photos, some of them, and smaller ones are never given gains again."""
+    """Photos that are already equal, subsets and smaller photos get no further gains."""
     equal = equalize_exposure(exposed(demo, logs))
     assert equalize_exposure(equal) is equal
     some = equal.select(views)

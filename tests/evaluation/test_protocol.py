@@ -1,6 +1,4 @@
-"""Crops and backgrounds of the protocols against other implementations, on random images and
-masks.
-"""
+"""Crops and backgrounds of the protocols against other implementations, on random images."""
 
 import typing
 
@@ -21,7 +19,7 @@ from humangs_jax.losses.losses import GAUSSIAN, TORCHMETRICS, UNIFORM
 
 
 def blob(seed, height, width):
-    """A mask somewhere, perhaps at the rim, and an image."""
+    """Returns (image, mask) with a mask at a random place, perhaps at the rim."""
     rng = np.random.default_rng(seed)
     tall, wide = rng.integers(height // 4, height // 2), rng.integers(width // 6, width // 2)
     top, left = rng.integers(0, height - tall + 1), rng.integers(0, width - wide + 1)
@@ -36,7 +34,7 @@ def bounds(inside):
 
 
 def test_the_presets_are_those_of_the_table():
-    """Background, crop, mask on prediction, LPIPS, SSIM: docs/evaluation.md."""
+    """The table of docs/evaluation.md lists background, crop, mask, LPIPS and SSIM."""
     table = {
         "humangs": ("white", WholeFrame(), None, False, ("vgg",), GAUSSIAN),
         "animatable-gaussians": (
@@ -69,8 +67,9 @@ def test_the_presets_are_those_of_the_table():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_square_box(seed):
-    """Padded by hand, resampled by scipy: sample i of n lies at (i + 1/2) of / n - 1/2, and the rim
-    goes on as it is.
+    """The box is padded by hand and resampled by scipy.
+
+    Sample i of n lies at (i + 1/2) of / n - 1/2, and the rim is repeated.
     """
     image, mask = blob(seed, 130, 110)
     (top, bottom), (left, right) = bounds(mask > 0.5)
@@ -101,9 +100,7 @@ def test_the_square_box(seed):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_centred_window(seed):
-    """Of an image that has the size already; the corner by the published rule, written with
-    branches.
-    """
+    """The window has its final size; the published rule for its corner is written with branches."""
     image, mask = blob(seed, 100, 80)
     wanted, corner = (70, 30), []
     for (first, last), size, side in zip(bounds(mask > 0), wanted, mask.shape, strict=True):

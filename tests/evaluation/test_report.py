@@ -1,4 +1,4 @@
-"""The page of an evaluation in a browser: worst first, sortable, asks nobody for anything."""
+"""The page of an evaluation in a browser: sorted by score, sortable, and without network access."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def browser(found, tmp_path_factory):
 
 
 def column(browser, heading):
-    """The cells of a column of the images, as shown."""
+    """Returns the texts of a column of the table of images."""
     return browser.run(
         f"""const heads = [...document.querySelectorAll('#images th')]
           .map((head) => head.textContent);

@@ -1,6 +1,4 @@
-"""The evaluator from source to report: which views are compared, predictions by file name, and what
-is wrong in one line.
-"""
+"""The evaluator: which views are compared, predictions by file name, and errors in one line."""
 
 import dataclasses
 import functools
@@ -34,7 +32,7 @@ evaluate = functools.partial(hg.evaluate, protocol="lhm")
 
 @pytest.fixture(scope="module")
 def people():
-    """Two people of four views each, two of them of another frame; and what somebody predicted."""
+    """Returns (capture, predicted images) of two people with two frames of two views."""
     made = {}
     for i, name in enumerate(("ann", "bob")):
         predicted, truth, masks = random_views(i, 4, 40, 32)
@@ -117,9 +115,7 @@ def test_a_page_keeps_the_worst(people):
 
 
 def test_people_who_are_scored_are_kept(people, tmp_path):
-    """An interrupted call leaves them; the same call goes on and finds what an undisturbed one
-    does.
-    """
+    """An interrupted call keeps their scores; the next call completes them."""
     asked, stop = [], ["bob"]
 
     def method(case, background):
@@ -229,7 +225,7 @@ def write_predictions(folder, people, alpha=False):
 
 @pytest.fixture
 def folders(people, tmp_path, monkeypatch):
-    """The captures on disk; their body is the tiny one."""
+    """Returns the folder of the captures, whose body is the tiny one."""
     for name, (capture, _) in people.items():
         save_capture(tmp_path / "people" / name, capture)
     load = hg.load_capture
@@ -241,7 +237,7 @@ def folders(people, tmp_path, monkeypatch):
 
 
 def test_predictions_are_found_by_file_name(people, folders, tmp_path):
-    """Those of one program with alpha, of another without; one that numbers them; some missing."""
+    """One program writes alpha, another none; one numbers its files; some are missing."""
     for alpha in (False, True):
         write_predictions(tmp_path / f"theirs{alpha}", people, alpha)
         found = evaluate(folders, predictions=tmp_path / f"theirs{alpha}")
@@ -355,7 +351,7 @@ def test_inputs_stand_around_the_person():
 
 
 class People:
-    """A source of examples by number."""
+    """A source of examples that are chosen by number."""
 
     input_counts = (2,)
 
@@ -394,7 +390,7 @@ def test_people_of_one_name_are_told_apart():
 
 
 def test_a_source_gives_people(people):
-    """Views of equal poses are one frame, in the order of appearance."""
+    """Views of equal poses are a frame, in the order of their first appearance."""
     found = find_people(People(people["ann"][0]), body=small_body())
     assert found.names == ("0000", "0001", "0002")
     case = found.load(1)
@@ -438,7 +434,7 @@ def test_the_command(people, folders, tmp_path, humangs):
 
 @pytest.mark.slow
 def test_avatars_and_weights_are_drawn_on_the_protocols_background(tmp_path):
-    """The demo person: by weights, and by the avatar of the same photos: the same numbers."""
+    """Weights, and the avatar that they make of the same photos, give the same numbers."""
     weights = hg.load_weights()
     avatar = hg.reconstruct(*weights, hg.load_capture("demo_capture"))
     avatar.save(tmp_path / "demo_capture.npz")
@@ -472,7 +468,7 @@ def test_avatars_and_weights_are_drawn_on_the_protocols_background(tmp_path):
 
 
 def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, monkeypatch, capsys):
-    """Where its files are as they were."""
+    """It continues if its files have not changed."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_predictions(tmp_path / "theirs", people, alpha=True)
     scored, interrupting = [], [True]

@@ -1,6 +1,4 @@
-"""Scores against other implementations: scikit-image, torchmetrics' definition in numpy, crops made
-by hand.
-"""
+"""Scores against scikit-image, torchmetrics' definition in numpy, and crops made by hand."""
 
 import dataclasses
 
@@ -25,14 +23,13 @@ from humangs_jax.losses.losses import (
 from humangs_jax.losses.perceptual import lpips
 
 DECIBELS = 1e-4
-"""Of a mean of some thousand float32 squares: 10 / ln 10 times their relative error of 1e-5 at
-most.
-"""
+"""Largest error of a PSNR: 10 / ln 10 times 1e-5, the relative error of the mean of squares."""
 
 
 def torchmetrics_ssim(x, y):
-    """StructuralSimilarityIndexMeasure(data_range=1.0): moments by 2-D kernel, reflected padding,
-    which is cut off again.
+    """Returns StructuralSimilarityIndexMeasure(data_range=1.0) of torchmetrics.
+
+    Moments have a 2-D kernel and reflected padding, which is cut off again.
     """
     at = np.arange(11) - 5.0
     kernel = np.exp(-0.5 * (at / 1.5) ** 2)
@@ -69,7 +66,7 @@ SSIM = {
 
 @pytest.mark.parametrize("window", SSIM, ids=["gaussian", "uniform", "torchmetrics"])
 def test_ssim_of_a_padded_image_is_that_of_the_image(window):
-    """1e-6 is asked for; float64 leaves 1e-12."""
+    """1e-6 is required; float64 reaches 1e-12."""
     predicted, truth, _ = (x[0].astype(np.float64) for x in random_views(3, 1, 48, 40))
     expected = SSIM[window](predicted, truth)
     with jax.enable_x64(True):
@@ -109,9 +106,7 @@ def test_lpips_of_a_padded_image_is_that_of_the_image(networks, net):
 
 @pytest.mark.slow
 def test_backgrounds_masks_and_crops_of_every_protocol():
-    """Each preset's PSNR and SSIM from images that are put on its background, cut out and cropped
-    by hand.
-    """
+    """The expected PSNR and SSIM are of images composed and cropped by hand."""
     predicted, truth, masks = (x[0] for x in random_views(1, 1, 128, 128))
     alpha = np.roll(masks, 2, axis=1)
     capture = capture_from(truth[None], masks[None])
@@ -150,7 +145,7 @@ def test_backgrounds_masks_and_crops_of_every_protocol():
 
 @pytest.mark.parametrize("name", ["giga", "lhm++"])
 def test_soft_masks_count_once(name, monkeypatch):
-    """A person of one color, cut out by the true mask, is the photo on that background."""
+    """A person of one color, cut out by the true mask, equals the photo on that background."""
     seen = []
     monkeypatch.setattr(scores, "pair_scores", lambda *pair: seen.append(pair) or {})
     monkeypatch.setattr(scores, "person_scores", lambda *_: ({}, np.zeros((1, 1), bool)))
@@ -184,7 +179,7 @@ def test_lpips_sees_its_own_crop(monkeypatch):
 
 @pytest.mark.slow
 def test_patches_are_those_that_are_more_than_half_person(networks):
-    """64 x 64, 32 apart, each scored as an image."""
+    """Patches of 64 x 64 lie 32 apart, and each is scored as an image."""
     predicted, truth, masks = (x[0] for x in random_views(4, 1, 200, 152))
     masks = np.clip(2 * masks, 0, 1)
     protocol = dataclasses.replace(PROTOCOLS["lvsm"], lpips=("alex",))
@@ -209,9 +204,7 @@ def test_patches_are_those_that_are_more_than_half_person(networks):
 
 
 def test_patches_that_are_mostly_background_do_not_count():
-    """Two patches of 96 x 80 pixels, one above the other: people fill more than half of the upper
-    one alone.
-    """
+    """Of two patches of 96 x 80 pixels, people fill more than half of the upper one only."""
     predicted, truth, masks = (x.copy() for x in random_views(5, 1))
     masks[:, :40], masks[:, 40:] = 1, 0
     (row,) = scores.score_views(predicted, capture_from(truth, masks), PROTOCOLS["lvsm"])
@@ -221,7 +214,7 @@ def test_patches_that_are_mostly_background_do_not_count():
 
 
 def test_a_photo_on_white_is_the_same_person_on_black():
-    """Where the mask is soft, too: color * mask."""
+    """This also holds where the mask is soft: the result is color * mask."""
     random = np.random.default_rng(0)
     color, mask = random.random((9, 7, 3), np.float32), random.random((9, 7), np.float32)[..., None]
     found = scores.on_background(color * mask + 1 - mask, mask[..., 0], PROTOCOLS["ghg"])
@@ -230,7 +223,7 @@ def test_a_photo_on_white_is_the_same_person_on_black():
 
 @pytest.mark.slow
 def test_images_of_other_sizes_share_the_programs():
-    """Crops of one bucket, as of many people, compile once."""
+    """Crops of many people fall into few sizes, each of which is compiled once."""
     rng = np.random.default_rng(0)
     protocol = PROTOCOLS["giga"]
     compiled = scores.pair_scores._cache_size

@@ -1,4 +1,4 @@
-"""Means in their order, intervals and tables: plain numbers."""
+"""Means, intervals and tables of plain numbers."""
 
 import csv
 import io
@@ -51,8 +51,8 @@ def test_a_score_that_one_lacks_has_no_plain_mean():
 
 
 def test_the_interval_covers_the_true_mean_as_often_as_it_says():
-    """Of 200 samples of 40 normal numbers; the percentile interval of so few is a little short: 93
-    % (Student's t).
+    """It does so in 93 % of 200 samples of 40 normal numbers: percentile intervals of few numbers
+    are short.
     """
     rng = np.random.default_rng(0)
     intervals = [bootstrap(rng.normal(5.0, 2.0, 40).tolist(), seed=i) for i in range(200)]

@@ -1,5 +1,6 @@
-"""Bodies that weights are tried on: the made-up one is another mesh of the same people, and reads
-as SMPL-X.
+"""Bodies on which weights are tried: the made-up one is another mesh of the same people.
+
+It reads as SMPL-X.
 """
 
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ def body():
 
 
 def sides(faces):
-    """Undirected edges and how many faces each has."""
+    """Returns the undirected edges, and how many faces each has."""
     pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     return np.unique(pairs, axis=0, return_counts=True)
 

@@ -1,4 +1,4 @@
-"""Operations and messages counted from traced programs, against sums by hand."""
+"""Operations and messages, counted in traced programs, against sums by hand."""
 
 import functools
 

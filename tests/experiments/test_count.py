@@ -1,4 +1,4 @@
-"""What `count` counts, on a module made for it."""
+"""What `count` counts, on a made-up module."""
 
 import shutil
 import subprocess

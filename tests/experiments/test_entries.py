@@ -1,4 +1,4 @@
-"""Every experiment runs at its smallest size, and says what it found."""
+"""Every experiment runs at its smallest size and reports what it found."""
 
 import json
 
@@ -32,7 +32,7 @@ CASES = {
     "training_cost": "--preset tiny --chips 1 --sizes 32 --variants kept",
     "training_steps": "--repeats 1 --only",
 }
-"""Options of each; the last words are given whole."""
+"""Options of each experiment."""
 LAST = {
     "fit_sequences": ["all frames seen"],
     "scene_fits": ["few points, fit_scene"],

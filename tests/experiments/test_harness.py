@@ -1,4 +1,4 @@
-"""`python -m experiments`: options from signatures, rows that are kept, what is written."""
+"""`python -m experiments`: options from signatures, kept results, written files."""
 
 import dataclasses
 import json

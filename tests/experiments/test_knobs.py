@@ -1,4 +1,4 @@
-"""docs/knobs.md is what the code says."""
+"""docs/knobs.md agrees with the code."""
 
 import re
 

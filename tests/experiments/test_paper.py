@@ -1,4 +1,4 @@
-"""The experiments of the paper: variants that belong together, differences within noise, tables."""
+"""The paper's experiments: variants, differences within noise, and tables."""
 
 import dataclasses
 import functools
@@ -33,7 +33,7 @@ PEOPLE = 20
 
 
 def run(psnr, photos=4, done=True, seed=0, counts=(), curve=(10.0, 12.0, 12.1)):
-    """A row whose test people have these scores, but for what differs between them."""
+    """Returns the row of a run whose test people have a mean PSNR of `psnr`."""
     spread = np.random.default_rng(0).normal(
         0, 2, PEOPLE
     )  # shared by all runs: people differ more than variants
@@ -324,7 +324,7 @@ def test_photos_of_varying_poses_are_of_as_many_poses_as_there_are():
 
 
 def checkpoint(path):
-    """Of a small network, as the authors store theirs."""
+    """Writes a small network's checkpoint as the authors store theirs."""
     encoder, reader, decoder = paper_parts(tiny().model.architecture)
     encoder, reader = encoder.clone(patch_size=64), reader.clone(sample_rgb=False, shells=())
     decoder = decoder.clone(frame="canonical", residual_color=False)
@@ -341,8 +341,9 @@ def checkpoint(path):
 
 @pytest.mark.slow
 def test_a_table_is_one_command_on_a_data_set(tmp_path, monkeypatch, capsys):
-    """Rows: a checkpoint that was converted, a network trained by the command, and the shipped
-    weights, on scenes of THuman and on the same ones seen from nearer.
+    """Rows are a converted checkpoint, a network that the command trained, and the shipped weights.
+
+    They are scored on scenes of THuman, and on the same scenes from nearer.
     """
     raw, converted = tmp_path / "raw", tmp_path / "converted.safetensors"
     data, body = made_up.WRITERS["thuman"](raw, vertices=800, texture_size=128), raw / "body.npz"
@@ -371,8 +372,8 @@ def test_a_table_is_one_command_on_a_data_set(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_training_at_the_published_size_starts():
-    """A step of both stages of `--config paper`, on shapes alone: eight people at 256 pixels, then
-    four at 512.
+    """Both stages of `--config paper` are traced for a step: eight people at 256 pixels, four at
+    512.
     """
     config, body = read_config("paper"), load_body()
     state, networks = (

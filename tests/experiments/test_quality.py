@@ -1,7 +1,6 @@
-"""Quality of reconstructions: every number is that of the images that were drawn; rows, tables and
-verdicts.
+"""Quality of reconstructions: numbers are those of the drawn images; rows, tables, verdicts.
 
-The network is `tiny` with variables of zero; for bodies of other sizes its avatars are made up.
+The network is `tiny` with variables of zero; avatars of other sizes are made up.
 """
 
 import json
@@ -33,7 +32,7 @@ def run(function, *options):
 
 @pytest.mark.slow
 def test_scores_by_task_are_means_over_views():
-    """With LPIPS of any net; without weights it is missing."""
+    """LPIPS may be of any net; without weights it is missing."""
     rng, frames = np.random.default_rng(0), np.asarray([0, 0, 1])
     truth, drawn = rng.random((2, 3, 48, 48, 3)).astype(np.float32)
     held_out = capture_from(truth, np.ones((3, 48, 48), np.float32), frames)
@@ -65,7 +64,7 @@ def test_wrong_options_are_one_line(function, capsys):
 
 
 def mean_psnr(drawn, truth, chosen):
-    """Mean over the chosen views, by the formula."""
+    """Returns the mean PSNR of the chosen views, by its formula."""
     errors = (np.clip(drawn, 0, 1) - truth).astype(np.float64)[chosen] ** 2
     return np.mean(-10 * np.log10(errors.mean(axis=(1, 2, 3))))
 

@@ -1,5 +1,6 @@
-"""The list of an accelerator's quarter of an hour: every line is a command that there is, what is
-done stays done, and what is too slow is cut.
+"""The list of commands for a quarter of an hour on an accelerator.
+
+Every command exists, finished ones are not repeated, and slow ones are cut.
 """
 
 import importlib

@@ -1,6 +1,4 @@
-"""The parts of the real capture that need no download: its calibration, lenses, background and
-careful masks.
-"""
+"""Parts of the real capture that need no download: calibration, lenses, background, masks."""
 
 import numpy as np
 

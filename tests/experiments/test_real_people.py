@@ -1,6 +1,4 @@
-"""Photos of real people: what is made of the folders that are given, and what a run goes on
-from.
-"""
+"""Photos of real people: what is made of the given folders, and how a run continues."""
 
 import dataclasses
 import json
@@ -23,7 +21,7 @@ COUNT = 16
 
 @pytest.fixture
 def clip(tmp_path):
-    """A folder with a GIF whose frames are of rising grey."""
+    """Returns a folder with a GIF whose frames become brighter."""
     frames = [Image.new("RGB", (32, 32), (10 * i, 10 * i, 10 * i)) for i in range(COUNT)]
     frames[0].save(tmp_path / "input.gif", save_all=True, append_images=frames[1:])
     return tmp_path

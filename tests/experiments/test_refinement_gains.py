@@ -1,4 +1,4 @@
-"""Means and tables of refinement, README's tables: without rendering anybody."""
+"""Means and tables of refinement, without rendering."""
 
 import jax
 import jax.numpy as jnp

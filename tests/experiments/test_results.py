@@ -1,4 +1,4 @@
-"""Tables of the docs and the JSON files they are rendered from."""
+"""Tables of the docs agree with the JSON files they are rendered from."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Speed as ratios to a plain product: what is compared, and what fails a change."""
+"""Speed as a ratio to that of a plain product: what is compared, and which ratios fail a change."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from experiments import speed
 
 
 def times(product, **others):
-    """Milliseconds of a process; what is not given takes ten products."""
+    """Returns milliseconds of a process; what is not given takes ten products."""
     return {"product": product, **dict.fromkeys(speed.MEASURED, 10 * product), **others}
 
 

@@ -1,4 +1,4 @@
-"""The measurements of splatting: errors against float64, labels, the front."""
+"""Measurements of splatting: errors against float64, labels, and the front."""
 
 import numpy as np
 import pytest

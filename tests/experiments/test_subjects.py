@@ -1,6 +1,4 @@
-"""People to evaluate on: one set of photos for all numbers of views, held-out views as the written
-captures have them.
-"""
+"""People for evaluation: the same photos for all numbers of views, and held-out views."""
 
 import numpy as np
 import pytest

@@ -1,6 +1,4 @@
-"""The comparison systems: shapes, gradients, and the properties that make each of them that
-system.
-"""
+"""The comparison systems: shapes, gradients, and the properties that define each system."""
 
 import dataclasses
 
@@ -27,7 +25,7 @@ from humangs_jax.network.upsampler import UpsamplerConfig
 ATTENDING = ("cross_attention", "lhm_views", "lhm_plus")
 OURS = (*ATTENDING, *ONE_PHOTO, "ghg")
 VERTICES, JOINTS, TEXELS = 21, 3, 8
-"""Vertices: not a multiple of what pools or groups have."""
+"""Sizes of the body; the vertices are no multiple of what pools or groups have."""
 PER_VIEW = (
     "images",
     "cameras",

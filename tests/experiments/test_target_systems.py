@@ -1,6 +1,4 @@
-"""Systems that run again for every target: gradients, and the properties that make each of them
-that system.
-"""
+"""Systems that run again for every target: gradients, and the properties that define them."""
 
 import dataclasses
 import functools
@@ -43,7 +41,7 @@ ask = jax.jit(
 
 @functools.cache
 def inputs_of(name):
-    """Photos of noise; a body as large as the tube, with its map."""
+    """Returns photos of noise and a body as large as the tube, with its map."""
     body = mapped_tube(small(name))
     inputs = random_inputs(vertices=len(body.template), size=SIZE)
     return replace(inputs, texels=body.texels, skinning_weights=body.skinning_weights)
@@ -51,7 +49,7 @@ def inputs_of(name):
 
 @functools.cache
 def drawing(name):
-    """(variables, inputs, queries) -> images."""
+    """Returns the compiled function (variables, inputs, queries) -> images."""
     return jax.jit(functools.partial(draw, small(name)))
 
 
@@ -73,7 +71,7 @@ def frame_outputs(variables, outputs, body, at, config):
 
 @functools.cache
 def driving(name):
-    """(variables, inputs, pose) -> canonical Gaussians of a frame, and the outputs before."""
+    """Returns the compiled function (variables, inputs, pose) -> (Gaussians, outputs)."""
     config, body = small(name), mapped_tube(small(name))
 
     def run(variables, inputs, pose):
@@ -322,8 +320,8 @@ def test_corrections_are_bounded_and_zeros_are_none():
 
 @pytest.mark.slow
 def test_corrections_turn_gaussians_about_the_axes_of_the_body():
-    """A quarter turn about z takes a Gaussian that is long along y to one that is long along x,
-    however it was written.
+    """A quarter turn about z turns a Gaussian that is long along y into one that is long along x,
+    whatever its quaternion.
     """
     half = 0.5**0.5
     gaussians = Gaussians(
@@ -345,8 +343,8 @@ def test_corrections_turn_gaussians_about_the_axes_of_the_body():
 
 @pytest.mark.slow
 def test_texels_attend_by_scaled_products():
-    """Products grow with the width; their softmax must not: of random features it stays far from
-    one token.
+    """Products grow with the width, their softmax must not: for random features it is far from
+    choosing one token.
     """
     module, width = PoseAttention(width=4, tokens=2), 4
     x, pose_vector = jnp.asarray([[[[1.0, 2, 3, 4]]]]), jnp.ones(3)
@@ -362,9 +360,7 @@ def test_texels_attend_by_scaled_products():
 
 @pytest.mark.slow
 def test_a_sharper_softmax_of_views_takes_the_color_of_the_best_one():
-    """Texels that two photos see, one red and one green: their weights are exp(sharpness *
-    cosine).
-    """
+    """Texels are seen by a red and a green photo, whose weights are exp(sharpness * cosine)."""
     inputs = inputs_of("giga")
     images = jnp.stack([jnp.full_like(inputs.images[0], 0).at[..., i].set(1.0) for i in range(2)])
     inputs = replace(inputs, images=images, depth_maps=0 * inputs.depth_maps + 100.0)
@@ -392,9 +388,7 @@ def test_a_sharper_softmax_of_views_takes_the_color_of_the_best_one():
 
 @functools.cache
 def stereo():
-    """A small GPS-Gaussian-style network, its variables, inputs of four photos, and their
-    Gaussians.
-    """
+    """Returns (configuration, variables, inputs of four photos, function that gives Gaussians)."""
     config = SYSTEMS["gps"]("bench").with_parts(decoder=StereoDecoder((4, 8), planes=6))
     variables, inputs = random_variables(config), random_inputs(views=4, size=SIZE)
     return (
@@ -443,8 +437,8 @@ def test_a_target_is_drawn_from_the_two_photos_nearest_to_it():
 
 @pytest.mark.slow
 def test_depths_come_from_what_two_photos_have_in_common():
-    """With the learned scores at 0 a photo's depths depend on the nearest other photo, and on no
-    third one.
+    """With learned scores of 0, a photo's depths depend on the nearest other photo and on no third
+    one.
     """
     config, variables, inputs, _ = stereo()
     zero = lambda path, x: 0 * x if path[-2].key == "0_out" else x

@@ -1,4 +1,4 @@
-"""The sweep of speed against accuracy: its points, its front, and the files made of it."""
+"""The sweep of speed against accuracy: its points, its front, and its files."""
 
 from experiments import tradeoff_report as report
 from experiments.tradeoff_report import points

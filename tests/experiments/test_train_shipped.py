@@ -14,7 +14,7 @@ from humangs_jax.network.weights import expected_variables, load_weights, save_w
 from humangs_jax.training.config import tiny as tiny_run
 
 HALF_PRECISION = 2**-11
-"""Relative: the file has float16."""
+"""Relative rounding: the file has float16."""
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,7 @@ def test_a_camera_keeps_float64_where_jax_has_it(kind):
 
 
 def test_sides_are_whole_numbers_of_pixels():
-    """Asked of the check itself: types are checked before it in tests."""
+    """The check is called alone, because types are checked before it in tests."""
     sides = cameras._pixels(64.0, np.int64(48).item())
     assert sides == (64, 48) and all(type(side) is int for side in sides)
     for wrong in ((32.5, 24), (32, 24.5), (float("nan"), 24), (32, float("inf"))):

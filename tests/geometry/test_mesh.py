@@ -1,4 +1,4 @@
-"""Areas and normals of known surfaces; the smallest turn between any two directions."""
+"""Areas and normals of known surfaces; the smallest turn between two directions."""
 
 import numpy as np
 import pytest

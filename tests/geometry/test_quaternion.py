@@ -1,4 +1,4 @@
-"""Rotations: quaternions, matrices, and singular values of 3x3 matrices."""
+"""Quaternions, rotation matrices, and singular values of 3x3 matrices."""
 
 import jax
 import jax.numpy as jnp
@@ -100,7 +100,7 @@ def test_zero_quaternion_is_the_identity_with_finite_gradient():
 
 
 def test_interpolation_goes_the_shortest_way_at_an_even_speed():
-    """scipy's Slerp, through half a turn and between rotation vectors that are far apart but nearly
+    """Expected is scipy's Slerp, through half a turn and between distant rotation vectors of nearly
     one rotation.
     """
     rng = np.random.default_rng(5)

@@ -67,14 +67,14 @@ class Attack(NamedTuple):
     reader: str
     make: Callable[[Path], Path]
     expect: str = "refused"
-    """Or "read", or "either"."""
+    """The outcome that must follow: "refused", "read", or "either"."""
 
 
 ATTACKS: list[Attack] = []
 
 
 def attack(name: str, readers: str, make: Any, expect: str = "refused") -> None:
-    """Adds a row for each of some readers. make: a maker, or the bytes of a file."""
+    """Adds a row for each of some readers; `make` is a maker, or the bytes of a file."""
     for reader in readers.split(", "):
         own = make if callable(make) else written(NAMES.get(reader, "a.bin"), make)
         ATTACKS.append(Attack(f"{reader}: {name}", reader, own, expect))
@@ -92,7 +92,7 @@ NAMES |= {"glb motion": "a.glb", "bvh": "a.bvh", "face table": "a.csv", "obj": "
 
 
 def setting(changes):
-    """A change of JSON: a value for each path, as in "accessors.0.count"."""
+    """Returns a change of JSON that sets a value for each path, such as "accessors.0.count"."""
 
     def change(content):
         for path, value in changes.items():
@@ -107,7 +107,7 @@ def setting(changes):
 
 
 def changed(reader, change, inside=None):
-    """The valid file of a reader with other bytes."""
+    """Returns a maker of a reader's valid file with changed bytes."""
 
     def make(folder):
         path = FORMATS[reader].make(folder)
@@ -118,12 +118,15 @@ def changed(reader, change, inside=None):
 
 
 def with_values(reader, changes):
-    """The valid JSON of a reader with other values."""
+    """Returns a maker of a reader's valid JSON with other values."""
     return changed(reader, lambda data: json.dumps(setting(changes)(json.loads(data))).encode())
 
 
 def with_arrays(reader, **changes):
-    """The valid arrays of a reader without checksum, some replaced by a value or by a function."""
+    """Returns a maker of a reader's valid arrays, without checksum, some of them replaced.
+
+    A change is a value, or a function of the old array.
+    """
 
     def change(data):
         with np.load(io.BytesIO(data)) as archive:
@@ -174,19 +177,22 @@ def dtype(code, state=b""):
 
 
 def array(kind, shape, data):
-    """Instructions of an array, as numpy writes it."""
+    """Returns pickle instructions that make an array, as numpy writes them."""
     made = name_of("numpy.core.multiarray", "_reconstruct") + name_of("numpy", "ndarray")
     made += number(0) + TUPLE1 + b"C\x01b" + TUPLE3 + REDUCE
     return made + MARK + number(1) + shape + kind + b"\x89" + data + TUPLE + BUILD
 
 
 def pickle_of(instructions):
-    """A dict whose entry v_template is what the instructions leave."""
+    """Returns a pickled dict whose entry v_template is made by the instructions."""
     return PROTO + b"\x02" + EMPTY_DICT + word("v_template") + instructions + SETITEM + STOP
 
 
 def doubled(times):
-    """x = (x, x), again and again, from the memo: comparing or printing it takes 2^times steps."""
+    """Returns instructions that make x = (x, x) again and again.
+
+    Comparing or printing the result takes 2^times steps.
+    """
     out = EMPTY_TUPLE + b"q\x00"
     for i in range(times):
         at = bytes([i])
@@ -214,7 +220,7 @@ def hex_of_hex(times):
 
 
 def sparse(kind="csc", shape=(3, 3), indptr=(0, 1, 1, 1), indices=(0,)):
-    """A sparse matrix as scipy writes it."""
+    """Returns instructions that make a sparse matrix, as scipy writes them."""
     of = lambda values, code: array(
         dtype(code), sizes(len(values)), raw(np.asarray(values, code).tobytes())
     )
@@ -330,7 +336,7 @@ for kind, value in TORCH.items():
 
 
 def raw_zip(members):
-    """A zip of (name, method, compressed bytes, size when unpacked), without checksums."""
+    """Returns a zip of members (name, method, packed bytes, unpacked size), without checksums."""
     body, directory = bytearray(), bytearray()
     for name, method, data, size in members:
         common = struct.pack("<HHHHHIIIHH", 20, 0, method, 0, 0, 0, len(data), size, len(name), 0)
@@ -343,7 +349,7 @@ def raw_zip(members):
 
 
 def deflated_zeros(size, start=b""):
-    """`start`, then zeros, compressed: one block again and again."""
+    """Returns compressed `start` and zeros; one block of zeros is repeated."""
     pack = zlib.compressobj(9, zlib.DEFLATED, -15)
     head = pack.compress(start) + pack.flush(zlib.Z_FULL_FLUSH)
     pack.compress(bytes(1 << 20)) + pack.flush(zlib.Z_FULL_FLUSH)
@@ -566,7 +572,10 @@ attack("lists in lists", "glb motion", glb(NESTED))
 
 
 def spz_four(count, unpacked, streams=5, place=32):
-    """Version 4 whose frames unpack to 64 MB each, and say that it is so much."""
+    """Returns a maker of a version 4 file whose frames unpack to 64 MB each.
+
+    `unpacked` are the sizes that its table states.
+    """
     frame = zstd.compress(bytes(64 << 20))
     table = b"".join(struct.pack("<QQ", len(frame), size) for size in unpacked)
     header = struct.pack("<IIIBBBBI12x", 0x5053474E, 4, count, 0, 12, 0, streams, place)
@@ -697,7 +706,7 @@ WORDS = {
     "a line separator": "\u2028\u2029",
     "half a surrogate": "\udc9b",
 }
-"""Words that a terminal would act on."""
+"""Text that a terminal would act on."""
 for kind, text in WORDS.items():
     for key in ("image", "mask"):
         named = with_values("capture", {f"views.0.{key}": f"images/{text}.png"})
@@ -714,11 +723,11 @@ for kind, text in WORDS.items():
 # --------------------------------------------------------------------------------------------------
 
 OUTSIDE = {"views.0.image": "outside.png", "views.0.mask": "mask.png", "body": "outside.npz"}
-"""What lies beside a capture, by the keys that may name it."""
+"""Files beside a capture, by the keys that may name them."""
 
 
 def capture_with(changes, prepare=lambda folder: None):
-    """A capture with other values, by path, after something was done to its folder."""
+    """Returns a maker of a capture with other values, after `prepare` has changed its folder."""
 
     def make(folder):
         folder = write_capture(folder / "me")
@@ -768,7 +777,7 @@ for name in ("..", "../..", "/", "x\0y"):
 
 
 def views(count, image="images/000.png", **changes):
-    """Views that name a photo each: with the number of the view, if the name has a place for it."""
+    """Returns views that each name a photo; "{}" in `image` stands for the view's number."""
     one = {key: value for key, value in CAPTURE_VIEW.items() if key != "mask"} | changes
     return {"views": [one | {"frame": 0, "image": image.format(i)} | changes for i in range(count)]}
 
@@ -778,7 +787,7 @@ CAPTURE_VIEW["cam_from_world"] = TRANSFORMS["frames"][0]["transform_matrix"]
 
 
 def large(count=0, link=os.link, size=1024):
-    """A large photo and its links."""
+    """Returns a preparation that writes a large photo and `count` links to it."""
 
     def prepare(folder):
         Image.fromarray(np.zeros((size, size, 3), np.uint8)).save(folder / "images" / "000.png")
@@ -809,7 +818,7 @@ def two_links_to_itself(folder):
 
 
 def forty_pairs(folder):
-    """Each folder of a chain has two links to the next."""
+    """Makes a chain of folders, each with two links to the next."""
     for i in range(40):
         (folder / f"p{i}").mkdir()
         for name in "ab":
@@ -850,7 +859,7 @@ for kind, prepare in FOLDERS.items():
 
 
 def first(value, index=0):
-    """A change of the first number of an array, or of another one."""
+    """Returns a change of one number of an array, by default the first."""
 
     def change(old):
         new = np.array(old)

@@ -1,4 +1,4 @@
-"""Every reader of the package with a valid file for each: what hostile files are made from.
+"""Every reader of the package with a valid file for it, from which hostile files are made.
 
 Files of other tools are those of `tests/data/files`, where their licence allows it.
 """
@@ -72,18 +72,18 @@ from tests.capture import calibration_files
 
 REAL = Path(__file__).parents[1] / "data" / "files"
 SIDE = 16
-"""Pixels of the photos of data sets."""
+"""Side of the photos of data sets, pixels."""
 BODY = tetrahedron(tuple("xyz"))
 
 
 class Format(NamedTuple):
-    """A reader, and a valid file for it."""
+    """A reader and a valid file for it."""
 
     read: Callable[[Path], Any]
     make: Callable[[Path], Path]
     """Writes the file or folder into an empty folder; returns its path."""
     inside: str = ""
-    """The file of a folder that damage goes into: the one that is read first."""
+    """The file of a folder that is damaged: the one that is read first."""
 
     def damaged(self, path: Path) -> Path:
         return path / self.inside
@@ -115,7 +115,7 @@ def read_detections(*names, size=(640, 480)):
 
 
 def read_data_set(folder):
-    """All people, with all that there is of them."""
+    """Reads all parameters and photos of all people."""
     for person in open_people(folder, DATA_BODY, SIDE):
         subject = person.subject
         subject.parameters(range(subject.frame_count))
@@ -133,13 +133,13 @@ DATA_BODY = data_body()
 
 
 def read_scans(folder):
-    """What preprocessing computes before it renders."""
+    """Reads and computes what preprocessing needs before it renders."""
     for name in open_thuman(folder)[0]:
         scan_content(folder, name, DATA_BODY, PreprocessConfig("thuman", views=1))
 
 
 def go_on_preprocessing(folder):
-    """Of a set whose only subject is finished."""
+    """Continues a set whose only readable subject is finished."""
     settings = PreprocessConfig("avatarrex", size=SIDE)
     preprocess(folder / "raw", folder / "out", folder / "SMPLX_TINY.npz", settings, progress=False)
 
@@ -150,7 +150,7 @@ def go_on_with_synthetic_people(path):
 
 
 def film(path):
-    """The frames of a video of a motion, and the path of its camera."""
+    """Computes frames of a motion's video and the path of its camera."""
     with reading(path, "motion"):
         motion = trim_and_resample(load_motion(path), fps=30.0)
         return smoothed_path(np.asarray(motion.translations), FOLLOWING * motion.fps)
@@ -161,7 +161,7 @@ def film(path):
 
 
 def saved(name, write):
-    """A maker of a file by write(path)."""
+    """Returns a maker of a file that write(path) writes."""
 
     def make(folder):
         write(folder / name)
@@ -171,7 +171,7 @@ def saved(name, write):
 
 
 def written(name, data):
-    """A maker of a file of bytes, of text, of JSON, or of what a function returns."""
+    """Returns a maker of a file of bytes, text or JSON, or of what a function returns."""
 
     def write(path):
         content = data() if callable(data) else data
@@ -187,7 +187,7 @@ def npz(name, arrays):
 
 
 def real(name):
-    """A maker of a copy of a file or folder of another tool."""
+    """Returns a maker of a copy of another tool's file or folder."""
 
     def make(folder):
         source, copy = REAL / name, folder / Path(name).name
@@ -209,7 +209,7 @@ def _of_others(names, suffix):
 
 
 def data_set(write, *arguments, **options):
-    """A maker of the folder of a data set."""
+    """Returns a maker of a data set's folder."""
 
     def make(folder):
         write(folder, *arguments, **options)
@@ -265,7 +265,7 @@ TRANSFORMS = {"fl_x": 60, "cx": 5, "cy": 6, "w": 10, "h": 12} | {
 
 
 def write_import(folder):
-    """Photos and a calibration beside them."""
+    """Writes photos and a calibration beside them."""
     (folder / "photos").mkdir()
     for name in VIEWS:
         picture(f"{name}.png", 12, 10, 3)(folder / "photos")
@@ -277,7 +277,7 @@ def import_beside(path):
 
 
 def rig(writer, name):
-    """A maker of a calibration of four cameras by a writer of `calibration_files`."""
+    """Returns a maker of a calibration of four cameras, by a writer of `calibration_files`."""
 
     def make(folder):
         writer(folder / name, *calibration_files.scene(), calibration_files.NAMES)
@@ -335,7 +335,7 @@ def write_glb_motion(path):
 
 
 def write_glb_face(path):
-    """The shapes of a mesh in two frames."""
+    """Writes the weights of a mesh's shapes in two frames."""
     writer = GlbWriter()
     times = writer.array("SCALAR", np.arange(2.0))
     output = writer.array("SCALAR", np.linspace(0, 1, 2 * len(SHAPES)))
@@ -352,7 +352,7 @@ def write_weights(path):
 
 
 def ply(form, elements, body):
-    """A PLY of elements {"vertex 4": {"float": names}}."""
+    """Returns a PLY file; `elements` are {"vertex 4": {"float": names}}."""
     lines = ["ply", f"format {form} 1.0"]
     for element, properties in elements.items():
         lines.append(f"element {element}")
@@ -373,7 +373,7 @@ PACKED_BODY = np.repeat(np.float32([-1, 1]), 6).tobytes() + np.arange(16, dtype=
 
 
 def write_obj(folder, texture="texture.png"):
-    """A textured square."""
+    """Writes a textured square."""
     picture("texture.png", 4, 4, 3)(folder)
     (folder / "scan.mtl").write_text(f"newmtl skin\nKd 1 1 1\nmap_Kd {texture}\n")
     corners = "".join(f"v {x} {y} 0\nvt {x} {y}\n" for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
@@ -405,7 +405,7 @@ def bank_arrays():
 
 
 def write_preprocessed(folder):
-    """One subject that is finished, and another one that was skipped."""
+    """Writes a preprocessed set: one subject is finished and another one was skipped."""
     for name in "ab":
         dataset_files.write_avatarrex(folder / "raw" / name, frames=1)
     (folder / "raw" / "b" / "smpl_params.npz").unlink()
@@ -415,7 +415,7 @@ def write_preprocessed(folder):
 
 
 def gaussians(name, harmonics=0, **options):
-    """A maker of a file that the package writes."""
+    """Returns a maker of a file of Gaussians that the package writes."""
     return saved(
         name, lambda path: save_gaussians(path, random_gaussians(harmonics=harmonics), **options)
     )

@@ -1,4 +1,4 @@
-"""Valid files of every reader with a few parts exchanged: each is read, or refused in one line.
+"""Files of every reader with a few changed parts are read, or refused in one line.
 
 HUMANGS_FUZZ_INPUTS=N makes N files for each reader, the same ones in each run.
 """
@@ -44,7 +44,7 @@ ARRAYS = st.builds(np.zeros, SHAPES, st.sampled_from(("<f4", "<f8", "<i4", "<u1"
 
 
 def exchanged(draw, pieces, hostile):
-    """Pieces of which some are left out, doubled, or exchanged for hostile ones."""
+    """Returns the pieces, some of them left out, doubled, or replaced by hostile ones."""
     pieces = list(pieces)
     for _ in range(draw(st.integers(1, 4))):
         at, count = draw(st.integers(0, len(pieces))), draw(st.sampled_from((1, 1, 8, 64)))
@@ -118,7 +118,7 @@ def of_npz(draw, data):
 
 
 def of_zip(draw, data):
-    """The pickle of a checkpoint, or any other member."""
+    """Returns the zip with its pickle, or any other member, changed."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     name = draw(st.sampled_from(sorted(members)))
@@ -147,7 +147,7 @@ def of_gzip(draw, data):
 
 
 def taken_apart(data):
-    """How a file is taken apart, by its first bytes."""
+    """Returns the strategy for a file, chosen by its first bytes."""
     if data.startswith(b"PK"):
         return of_npz if b".npy" in data else of_zip
     for start, change in {b"glTF": of_glb, b"\x1f\x8b": of_gzip}.items():

@@ -1,7 +1,6 @@
-"""Hostile files end in one line that names them, in bounded memory and time, and nothing else
-happens.
+"""Reading a hostile file ends with one line that names it, within bounds of memory and time.
 
-That nothing is half-written is in tests/io/test_atomic.py.
+tests/io/test_atomic.py checks that nothing is half-written.
 """
 
 import os
@@ -39,12 +38,13 @@ MAY_BE_MISSING = {
     *("log", "missing photos", "scene arrays", "preprocessed scene", "skipped subject", "start"),
     *("splat", "manifest", "EasyMocap", "Human3R", "LHM", "TRAM", "cameras with lenses"),
 }
-"""Files that need not be there, or are one of several; zeros are Gaussians of a `.splat`."""
+"""Readers whose file may be missing, or may be one of several; zeros are Gaussians of a `.splat`.
+"""
 HEAVY = (
     *("million", "300,000 frames", "flipped bit", "900 folders", "5,000 photos", "white photos"),
     *("4,000 times", "100 MB"),
 )
-"""In the names of attacks that take more than 0.4 s of the processor."""
+"""Words in the names of attacks that take more than 0.4 s of the processor."""
 QUICK = [each for each in ATTACKS if not any(word in each.name for word in HEAVY)]
 
 

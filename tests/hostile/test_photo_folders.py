@@ -1,8 +1,7 @@
-"""Folders of photos as they come: a result and a warning that names the photo, or one clear line
-and nothing written.
+"""Folders of any photos give a result and a warning that names the photo, or one line.
 
-The person of the demo capture in a drawn room. `humangs detect` is run on each folder; `humangs
-start` goes on from its answer.
+After an error nothing is written. The person is that of the demo, in a drawn room. `humangs detect`
+runs on each folder, and `humangs start` continues from its answer.
 """
 
 import io
@@ -26,12 +25,12 @@ from humangs_jax.io.images import read_grey, resized, to_uint8
 
 HEIC = Path(__file__).parents[1] / "io" / "phone.heic"
 TURNED = 6
-"""EXIF orientation."""
+"""Value of the EXIF orientation."""
 CAPTURE = load_capture("demo_capture")
 
 
 def view(i, size=384):
-    """A photo of the person, and the mask."""
+    """Returns (photo, mask) of the person."""
     photo = in_a_room(np.asarray(CAPTURE.images[i]), np.asarray(CAPTURE.masks[i]))
     return resized(photo, size, size), resized(np.asarray(CAPTURE.masks[i]), size, size)
 
@@ -53,7 +52,7 @@ def good(folder, count=2):
 
 
 def one(change, name="odd.png", **options):
-    """A folder of two good photos and one that is changed."""
+    """Returns a maker of a folder of two good photos and a changed one."""
 
     def make(folder):
         good(folder)
@@ -63,7 +62,7 @@ def one(change, name="odd.png", **options):
 
 
 def beside(scales):
-    """People side by side, each of a share of the height."""
+    """Returns a maker of photos of people side by side; `scales` are shares of the height."""
 
     def make(folder):
         for i in range(2):
@@ -83,7 +82,7 @@ def grey(photo):
 
 
 def far(width, height, size):
-    """The person at a size in a large photo."""
+    """Returns a change that puts the person, `size` pixels high, into a large photo."""
 
     def change(_):
         photo, (person, mask) = room(width, height), view(0, size)
@@ -109,7 +108,10 @@ def only(**photos):
 
 
 def files(**contents):
-    """Two good photos, and files of these bytes; `_` in a name stands for a dot."""
+    """Returns a maker of a folder of two good photos and files of these bytes.
+
+    `_` in a name stands for a dot.
+    """
 
     def make(folder):
         good(folder)
@@ -216,7 +218,7 @@ FAST = (
 
 @pytest.fixture(scope="module")
 def remembered():
-    """What was found in photos that an earlier folder has, too."""
+    """Returns a detector that keeps its results for photos that several folders have."""
     known = {}
 
     def find(networks, photo):
@@ -229,7 +231,7 @@ def remembered():
 
 
 def run(kind, command, remembered, monkeypatch, capsys):
-    """Exit code, lines of errors and of warnings."""
+    """Returns (exit code, lines of errors, lines of warnings) of a command."""
     monkeypatch.setattr(detect, "find_people", remembered)
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     FOLDERS[kind][0](Path("photos"))
@@ -279,7 +281,7 @@ HOPELESS = [
 def test_start_says_in_one_line_what_is_wrong_with_the_photos(
     kind, remembered, tmp_path, monkeypatch, capsys
 ):
-    """Or that cameras are missing; there is no capture then."""
+    """The line may also say that cameras are missing; no capture is written then."""
     monkeypatch.chdir(tmp_path)
     command = ["start", "photos", "--out", "me", "--no-browser"]
     code, errors, warnings = run(kind, command, remembered, monkeypatch, capsys)

@@ -17,33 +17,33 @@ from humangs_jax.core.progress import printable
 MEMORY = 3 << 30
 """Bytes of address space that reading a file may add to what the process has."""
 RESIDENT = 1 << 30
-"""Bytes that it may make resident."""
+"""Bytes that reading a file may make resident."""
 SECONDS = 10.0
-"""Seconds of the processor that it may take."""
+"""Seconds of the processor that reading a file may take."""
 KILLED = 60
-"""Seconds of the processor after which the run of all tests ends: a loop in C hears no signal."""
+"""Seconds of the processor after which the run of all tests ends: loops in C hear no signal."""
 LONGEST_LINE = 1500
 FORBIDDEN = {
     *("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.fork", "pty.spawn"),
     *("socket.connect", "socket.bind", "socket.getaddrinfo", "urllib.Request", "webbrowser.open"),
 }
 MODULES = ("antigravity", "this", "webbrowser", "humangs_jax.cli.__main__")
-"""A file may name modules: none of these is imported."""
+"""Modules that hostile files name; none of them may be imported."""
 CHANGES = {
     *("os.remove", "os.rmdir", "os.rename", "os.mkdir", "os.link", "os.symlink", "os.chmod"),
     *("os.truncate", "shutil.rmtree", "shutil.copyfile", "shutil.move"),
 }
 DESCRIPTORS = {"os.remove": 1, "os.rmdir": 1, "os.mkdir": 2, "os.rename": 2}
-"""Which of their arguments is the descriptor of the folder that a path is relative to."""
+"""Number of the argument that is the descriptor of the folder a path is relative to."""
 CACHES = os.environ.get("JAX_COMPILATION_CACHE_DIR", "")
 
 
 class Forbidden(BaseException):
-    """No reader catches it."""
+    """Raised for what is forbidden; no reader catches it."""
 
 
 class Watch:
-    """An audit hook. Hooks stay for ever: this one looks only while `folder` is set."""
+    """An audit hook, which stays for ever and therefore acts only while `folder` is set."""
 
     def __init__(self):
         self.folder, self.seen = None, []
@@ -66,7 +66,11 @@ class Watch:
                     self.check(event, path, where)
 
     def check(self, event, path, where=-1):
-        """where: descriptor of the folder that the path is relative to, -1 for the working one."""
+        """Stops an event outside of the folder.
+
+        `where` is the descriptor of the folder that the path is relative to, -1 for the working
+        folder.
+        """
         base = os.getcwd() if where == -1 else os.readlink(f"/proc/self/fd/{where}")
         place = Path(os.path.abspath(os.path.join(base, os.fsdecode(path))))
         allowed = place.is_relative_to(self.folder) or place == Path(os.devnull)
@@ -87,7 +91,7 @@ def too_long(*_):
 
 @contextlib.contextmanager
 def watched(folder):
-    """Forbids everything above while it is open."""
+    """Forbids what this module names while the context is open."""
     status = Path("/proc/self/statm")
     pages = [int(number) for number in status.read_text().split()]
     size = resource.getpagesize()
@@ -118,9 +122,11 @@ def chain(error):
 
 
 def outcome(read, path, folder):
-    """ "read" or "refused".
+    """Returns "read" or "refused".
 
-    Raises: AssertionError if a refusal is no line that names a full path; whatever else is raised.
+    Raises:
+        AssertionError: if a refusal is no line that names a full path.
+        Exception: whatever else reading raises.
     """
     try:
         with watched(folder):

@@ -1,4 +1,4 @@
-"""ICC profiles, written from their specification (ICC.1), for tests: Pillow makes none but sRGB."""
+"""Writes ICC profiles from their specification (ICC.1): Pillow makes none but sRGB."""
 
 import struct
 
@@ -10,7 +10,7 @@ P3 = ((0.68, 0.32), (0.265, 0.69), (0.15, 0.06))
 PROPHOTO_TO_XYZ = np.asarray(
     [[0.7976749, 0.1351917, 0.0313534], [0.2880402, 0.7118741, 0.0000857], [0, 0, 0.8252100]]
 )
-"""Of D50, which these profiles need not adapt."""
+"""From ProPhoto RGB to XYZ of D50, which profiles have, too."""
 P3_TO_XYZ = np.asarray(
     [[0.5151, 0.2920, 0.1571], [0.2412, 0.6922, 0.0666], [-0.0011, 0.0419, 0.7841]]
 )
@@ -20,7 +20,7 @@ ADOBE_TO_XYZ = np.asarray(
 SRGB_TO_XYZ = np.asarray(
     [[0.43607, 0.38515, 0.14307], [0.22249, 0.71687, 0.06061], [0.01392, 0.09708, 0.71410]]
 )
-"""As in the profiles that Apple and Adobe give away, to the digits that they print."""
+"""From sRGB to XYZ, in the digits that the profiles of Apple and Adobe have."""
 
 
 def numbers(*values):
@@ -52,7 +52,7 @@ def description(text):
 
 
 def profile(tags, space=b"RGB ", kind=b"mntr", pcs=b"XYZ "):
-    """A version 2 profile with these tags, by name."""
+    """Returns a version 2 profile with these tags by name."""
     tags = {b"desc": description("made up"), b"wtpt": b"XYZ " + bytes(4) + numbers(*D50), **tags}
     at, entries, body = 132 + 12 * len(tags), b"", b""
     for name, content in tags.items():
@@ -74,7 +74,7 @@ def profile(tags, space=b"RGB ", kind=b"mntr", pcs=b"XYZ "):
 
 
 def of_colors(to_xyz, curve, **options):
-    """A profile of three primaries, the columns of `to_xyz`, and one curve."""
+    """Returns a profile of one curve and three primaries, the columns of `to_xyz`."""
     columns = {
         name + b"XYZ": b"XYZ " + bytes(4) + numbers(*to_xyz[:, i])
         for i, name in enumerate((b"r", b"g", b"b"))
@@ -87,8 +87,9 @@ def of_grey(curve):
 
 
 def of_tables(space, inputs, to_lab):
-    """A profile whose colors are a table (lut8) of Lab: `to_lab` of the corners of the cube, first
-    channel slowest.
+    """Returns a profile whose colors are a table (lut8) of Lab.
+
+    `to_lab` is applied to the corners of the cube, the first channel slowest.
     """
     grid = np.stack(np.meshgrid(*[[0, 1]] * inputs, indexing="ij"), axis=-1).reshape(-1, inputs)
     lab = np.asarray([to_lab(*corner) for corner in grid])

@@ -44,7 +44,7 @@ def writes_into(text):
 
 @pytest.fixture
 def dead_process():
-    """The id of a process that has ended."""
+    """Returns the id of a process that has ended."""
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     return process.pid
@@ -126,7 +126,7 @@ def test_a_folder_that_was_made_for_a_file_that_failed_goes_again(tmp_path):
 
 @pytest.mark.parametrize("renames", [0, 1])
 def test_an_interrupt_between_the_renames_loses_nothing(tmp_path, monkeypatch, renames):
-    """Interrupted before the `renames`-th rename, the old folder is in its place again."""
+    """After an interrupt before the `renames`-th rename the old folder is back in its place."""
     folder, calls, rename = folder_with(tmp_path / "folder", "old"), [], Path.rename
 
     def interrupted(self, target):
@@ -143,8 +143,8 @@ def test_an_interrupt_between_the_renames_loses_nothing(tmp_path, monkeypatch, r
 
 @pytest.mark.parametrize("moves", [0, 1, 2])
 def test_an_interrupt_between_moves_deletes_no_old_file(tmp_path, monkeypatch, moves):
-    """Files that are out of date go last: a process that is killed before leaves the old or the new
-    of each name. Files that must not lie beside the new ones go first.
+    """Outdated files go last: a process that is killed before leaves an old or a new file of each
+    name. Files that must not lie beside the new ones go first.
     """
     old, new = ("a.png", "b.png", "c.png"), ("a.png", "b.png")
     for name in (*old, "invalid"):
@@ -431,7 +431,7 @@ WRITES_ITSELF = {
     "io/arrays.py": "into the temporary file of replace_file",
     "core/processes.py": "a switch of /proc",
 }
-"""Why a module opens a file to write, beside `io/atomic.py`."""
+"""Modules other than `io/atomic.py` that open a file to write, with the reason."""
 WRITING = re.compile(
     r"(?<!atomic)\.write_(text|bytes)\(|open\([^()]*\"(w|a|x)b?\"|np\.save|\.tofile\("
     r"|shutil\.(copy|move)"
@@ -439,7 +439,7 @@ WRITING = re.compile(
 
 
 def test_nothing_else_writes_files():
-    """Whatever writes through `io.atomic` is whole at any moment."""
+    """What `io.atomic` writes is whole at any moment."""
     package = Path(atomic.__file__).parents[1]
     found = {
         str(path.relative_to(package))
@@ -459,7 +459,7 @@ def test_names_that_are_no_utf8_stay_what_they_are_in_text(tmp_path):
 
 
 def test_the_file_that_is_to_be_last_is_moved_last(tmp_path, monkeypatch):
-    """Where it was not there before, it says that all others are in place."""
+    """If it was not there before, it tells that all others are in place."""
     moved, replace = [], Path.replace
 
     def noted(self, target):

@@ -1,4 +1,4 @@
-"""Photos say how their colors are encoded; they are read in sRGB, whatever that is."""
+"""Photos in any color space are read as sRGB."""
 
 import io
 import struct
@@ -49,7 +49,7 @@ LOSSLESS = ("PNG", "WEBP")
 
 
 def by_little_cms(pixels, profile, mode="RGB"):
-    """What another program makes of it."""
+    """Returns the pixels in sRGB as LittleCMS converts them."""
     source, target = ImageCms.getOpenProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
     intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
     return np.asarray(
@@ -124,7 +124,7 @@ def chunk(name, data):
 
 
 def png(pixels, *chunks, depth=8):
-    """A PNG of colors with further chunks before its pixels."""
+    """Returns a PNG file with further chunks before its pixels."""
     rows = b"".join(b"\0" + row.astype(f">u{depth // 8}").tobytes() for row in pixels)
     head = chunk(
         b"IHDR", struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], depth, 2, 0, 0, 0)
@@ -261,11 +261,14 @@ def test_numbers_in_a_png_say_how_colors_are_encoded(tmp_path):
 
 
 HEIC = (Path(__file__).parent / "phone.heic").read_bytes()
-"""Red, the upper left quarter blue; see test_images."""
+"""A photo in red with a blue upper left quarter; see test_images."""
 
 
 def with_box(heic, box):
-    """A HEIC photo with another box of colors: what holds it grows, and places in the file move."""
+    """Returns a HEIC photo with another color box.
+
+    Boxes around it grow, and positions in the file move.
+    """
     at = heic.index(b"colr") - 4
     size = int.from_bytes(heic[at : at + 4], "big")
     data, more = bytearray(heic), len(box) - size

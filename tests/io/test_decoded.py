@@ -1,4 +1,4 @@
-"""Photos that several steps of a command read are decoded once."""
+"""A photo that several steps of a command read is decoded once."""
 
 import shutil
 from collections import Counter
@@ -12,11 +12,11 @@ from humangs_jax.io.decoded import decoded_once, forget_decoded
 from humangs_jax.io.images import read_grey, read_image, write_png
 
 SIZE = (40, 30)
-"""Width and height of the photos here, pixels."""
+"""Width and height of the photos, pixels."""
 
 
 def noise(channels, dtype=np.uint8):
-    """Pixels of all levels."""
+    """Returns random pixels of all levels."""
     top = np.iinfo(dtype).max + 1
     shape = (SIZE[1], SIZE[0], channels)
     return np.random.default_rng(0).integers(0, top, shape).astype(dtype)
@@ -24,7 +24,7 @@ def noise(channels, dtype=np.uint8):
 
 @pytest.fixture()
 def decodings(monkeypatch):
-    """How often files of each content were decoded."""
+    """Returns how often files of each content were decoded."""
     counted, levels = Counter(), images._levels
 
     def counting(image, data):

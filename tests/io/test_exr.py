@@ -91,7 +91,7 @@ def test_other_types_become_float32(tmp_path):
 
 
 def test_half_precision_keeps_metres(tmp_path):
-    """Colors, normals and parts in 16 bits; depth and positions to the last bit."""
+    """Colors, normals and parts have 16 bits; depths and positions are exact."""
     channels = dict(make_view(0).channels) | {
         "normal.X": make_view(0).rgba[..., 0],
         "part": np.full((HEIGHT, WIDTH), 55.0),

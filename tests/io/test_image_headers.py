@@ -1,6 +1,4 @@
-"""What stands behind or inside of a photo is not the photo; formats of phones and the web are
-read.
-"""
+"""Data behind or inside of a photo is not read as the photo; formats of phones and the web are."""
 
 import io
 import sys
@@ -27,7 +25,7 @@ def encoded(kind, image=PHOTO, **options):
 
 
 def with_segment(jpeg, marker, content):
-    """A JPEG with one more segment, before all others."""
+    """Returns a JPEG file with one more segment before all others."""
     return (
         jpeg[:2]
         + bytes([0xFF, marker])
@@ -63,7 +61,7 @@ def test_scans_behind_a_picture_and_in_its_segments_are_not_the_pictures(jpeg, a
 
 
 def repeated(jpeg, count, between=b""):
-    """A progressive JPEG with its last scan `count` times."""
+    """Returns a progressive JPEG file whose last scan occurs `count` times."""
     last = jpeg.rindex(b"\xff\xda")
     return jpeg[:last] + (between + jpeg[last:-2]) * count + jpeg[-2:]
 

@@ -1,6 +1,6 @@
-"""Photos at other sizes, masks as segmentation tools write them, EXIF and HEIC.
+"""Photos at other sizes, masks of segmentation tools, EXIF and HEIC.
 
-(Reading and writing photos: tests/data.)
+tests/data tests how photos are read and written.
 """
 
 import struct
@@ -30,18 +30,20 @@ from humangs_jax.io.images import (
 from humangs_jax.io.reading import FileError, Limits, set_limits
 
 HEIC = Path(__file__).parent / "phone.heic"
-"""Written by pillow-heif 1.8.1: 32 x 24, red, the upper left quarter blue; EXIF has orientation 6
-and a focal length of 26 mm.
+"""A photo that pillow-heif 1.8.1 wrote: 32 x 24, red with a blue upper left quarter.
+
+Its EXIF has orientation 6 and a focal length of 26 mm.
 """
 
 ROUNDING = 2e-6
-"""Of sums of some hundred float32 products of numbers in [0, 1]."""
+"""Rounding of sums of some hundred float32 products of numbers in [0, 1]."""
 SIDE = st.integers(1, 60)
 
 
 def area_average(image, size):
-    """Along the first axis: the integral over each new pixel, by the cumulated sums at its
-    edges.
+    """Returns the image at another height by area.
+
+    A new pixel is the integral over its area, from cumulated sums at its edges.
     """
     sums = np.concatenate([0 * image[:1], np.cumsum(image, axis=0, dtype=np.float64)])
     edges = np.arange(size + 1) * (len(image) / size)
@@ -82,9 +84,7 @@ def test_each_axis_has_its_own_filter_and_no_value_leaves_the_range(
 
 @pytest.mark.parametrize("size", [(90, 70), (41, 33), (160, 31)])
 def test_enlarging_is_bicubic(size):
-    """As Pillow does it, but for the rim, and for what it leaves outside of the range of the
-    image.
-    """
+    """Pillow gives the same, but at the rim and outside of the image's range."""
     image = np.random.default_rng(0).random((31, 40), np.float32)
     theirs = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BICUBIC))
     y, x = (
@@ -123,7 +123,7 @@ def test_focal_length_is_that_of_the_diagonal(kind, value, expected, tmp_path):
 
 
 def with_frame(path, size, frame, flag=1):
-    """A photo of 26 mm whose EXIF says that it was taken with this width and height."""
+    """Writes a photo whose EXIF has 26 mm and says that it was taken with this size."""
     exif = Image.Exif()
     exif[0x0112] = flag
     exif.get_ifd(0x8769).update({0xA405: 26, 0xA002: frame[0], 0xA003: frame[1]})

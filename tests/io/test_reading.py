@@ -1,4 +1,4 @@
-"""The room of untrusted files: its limits, its one error line, its paths, its archives."""
+"""Reading untrusted files: limits, the line of an error, paths, archives."""
 
 import ast
 import dataclasses
@@ -87,7 +87,7 @@ def test_a_limit_is_named_and_can_be_changed(tmp_path):
 
 
 def test_a_file_unpacks_to_so_many_times_its_size_or_to_what_any_file_may():
-    """The greater of the two, not their sum; and never beyond the limit of arrays."""
+    """The greater of the two counts, not their sum, and never more than the limit of arrays."""
     set_limits(Limits(plain_bytes=1000, ratio=10, array_bytes=5000))
     for size, most in ((1, 1000), (100, 1000), (101, 1010), (400, 4000), (600, 5000)):
         check_unpacked(size, most)
@@ -238,9 +238,7 @@ def test_a_folder_is_searched_once_however_many_links_lead_to_it(tmp_path, caplo
 
 
 def test_threads_parse_one_header_at_a_time(tmp_path, monkeypatch):
-    """More at once are an error of CPython 3.11 now and then, and healthy captures were left out of
-    a run for it.
-    """
+    """CPython 3.11 sometimes fails if threads parse at once, and runs left out healthy captures."""
     arrays = {name: np.full((2, 3), i) for i, name in enumerate("abc")}
     np.savez(tmp_path / "some.npz", **arrays)
     inside, most = [], []
@@ -303,7 +301,7 @@ def test_materials_and_textures_are_found_by_names_with_spaces_quotes_and_option
 
 
 def test_a_file_without_permission_says_that_and_not_what_is_in_it(tmp_path, monkeypatch):
-    """At every door: an error of the contents would be wrong."""
+    """Every reader must say so; an error about the contents would be wrong."""
 
     def refuse(path, *arguments, **options):
         raise PermissionError(errno.EACCES, "Permission denied", str(path))

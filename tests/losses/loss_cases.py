@@ -1,4 +1,4 @@
-"""Made-up loss networks and images, the same wherever they are drawn. numpy only."""
+"""Made-up loss networks and images in numpy, the same on every machine."""
 
 import functools
 
@@ -49,9 +49,9 @@ SEED = 2026
 
 @functools.cache
 def made_up_state(name):
-    """{"0.weight": (out, in, size, size), "0.bias": (out,), ...} in float64.
+    """Returns {"0.weight": (out, in, size, size), "0.bias": (out,), ...} in float64.
 
-    For vgg19 these are the weights behind the project's golden perceptual_a.
+    For vgg19 these are the weights of the project's golden perceptual_a.
     """
     generator, state = np.random.default_rng(SEED), {}
     for layer, inputs, outputs, size in BACKBONES[name]:
@@ -62,15 +62,15 @@ def made_up_state(name):
 
 
 def made_up_heads(net):
-    """(1, c, 1, 1) float64 each; not negative, as the trained ones."""
+    """Returns (1, c, 1, 1) float64 each, not negative, like the trained heads."""
     generator = np.random.default_rng(SEED + 1)
     return [generator.random((1, count, 1, 1)) for count in HEADS[net]]
 
 
 def image_pair(height, width, seed=0):
-    """Two images (h, w, 3) in [0, 1], float64: noise on a slope, and that with other noise.
+    """Returns two images (h, w, 3) in [0, 1], float64: noise on a slope, and it with other noise.
 
-    They have no plain areas: among maxima that only rounding tells apart, any may get the gradient.
+    No area is plain: among maxima that only rounding tells apart, any may get the gradient.
     """
     generator = np.random.default_rng(seed)
     target = (
@@ -80,7 +80,7 @@ def image_pair(height, width, seed=0):
 
 
 def convolutions_of(name, dtype):
-    """`made_up_state` as (kernel (y, x, in, out), bias) by layer."""
+    """Returns `made_up_state` as (kernel (y, x, in, out), bias) by layer."""
     state = made_up_state(name)
     kernel = lambda layer: state[f"{layer}.weight"].transpose(2, 3, 1, 0).astype(dtype)
     return {

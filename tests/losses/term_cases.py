@@ -1,4 +1,4 @@
-"""The terms of the training loss for pictures alone."""
+"""The terms of the training loss, of images alone."""
 
 import importlib
 
@@ -11,7 +11,7 @@ from humangs_jax.rendering.splatting import Rendering
 
 
 def terms_of_images(drawn, images, **weights):
-    """The unweighted terms, by name, of pictures (v, h, w, 3) that were drawn against photos."""
+    """Returns the unweighted terms by name, of drawn images (v, h, w, 3) against photos."""
     losses = importlib.import_module("humangs_jax.losses.losses")
     covered = jnp.ones(images.shape[:3])
     shown = lambda rgb, alpha: Rendering(rgb, alpha, alpha, jnp.zeros((), jnp.int32))

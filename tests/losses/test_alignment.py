@@ -1,6 +1,4 @@
-"""Comparison after small moves: detail that is a few pixels off counts for more than a blur,
-wrong detail does not.
-"""
+"""Comparison after small moves: detail a few pixels off beats a blur, wrong detail does not."""
 
 import numpy as np
 import pytest
@@ -20,7 +18,7 @@ PERSON = slice(10, 110), slice(20, 60)
 
 
 def person(seed=0, detail=2.0):
-    """Colors with detail of a few pixels inside of a rectangle 100 pixels high, and its mask."""
+    """Returns a photo (h, w, 4): detail inside of a rectangle 100 pixels high, and its mask."""
     rng, photo = np.random.default_rng(seed), np.ones((HEIGHT, WIDTH, 4), np.float32)
     noise = gaussian_filter(rng.normal(size=(HEIGHT, WIDTH, 3)), (detail, detail, 0))
     photo[..., 3] = 0
@@ -34,7 +32,7 @@ def plain_psnr(image, photo):
 
 
 def blurred(photo):
-    """Without detail, and with a sharp outline."""
+    """Returns the photo without detail and with its sharp outline."""
     smooth = gaussian_filter(photo, (4, 4, 0))
     smooth[..., 3] = photo[..., 3]
     return np.where(photo[..., 3:] > 0, smooth, photo)

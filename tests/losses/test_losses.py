@@ -1,4 +1,4 @@
-"""Losses and metrics against numbers worked out by hand."""
+"""Losses and metrics against numbers that were computed by hand."""
 
 import jax.numpy as jnp
 import numpy as np

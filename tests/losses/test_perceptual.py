@@ -1,5 +1,6 @@
-"""Losses of frozen networks, on made-up weights, against torch (torch_losses.py), and what must
-hold for any weights.
+"""Losses of frozen networks with made-up weights, against torch (torch_losses.py).
+
+Some properties hold for any weights.
 """
 
 import itertools
@@ -42,10 +43,13 @@ SIZES = {"vgg19": (37, 32), "vgg": (37, 32), "alex": (37, 43), "squeeze": (40, 3
 # relative; sums of some thousand products, a dozen times over, and differences of unit vectors
 FLOAT32 = 1e-5
 GRADIENT = 3e-5
-"""Relative L2 in float32. A sum of n terms of either sign, one after the other, rounds by u sqrt(n)
-/ 2.4 of itself: 1.7e-6 for the 9 x 512 of VGG's widest layers. Thirteen layers forward and
-backward: 9e-6 in quadrature; differences of unit vectors triple it. Measured with AVX-512, whose
-vectors shorten the sums: 4e-6."""
+"""Relative L2 error of gradients in float32.
+
+A sum of n terms of either sign, added in order, rounds by u sqrt(n) / 2.4 of itself: 1.7e-6 for the
+9 x 512 of VGG's widest layers. Thirteen layers forward and backward give 9e-6 in quadrature, and
+differences of unit vectors triple it. With AVX-512, whose vectors shorten the sums, 4e-6 was
+measured.
+"""
 FLOAT64 = 1e-12
 STORED = 1e-7  # the gradients are stored as float32
 BFLOAT16 = 0.05  # relative; features keep 8 bits
@@ -81,7 +85,7 @@ def test_the_smallest_image(name):
 
 
 def pooled(layer, x):
-    """What a layer makes of x (h, w, 3), all above zero, behind a convolution that does nothing."""
+    """Returns a layer's result for x (h, w, 3) > 0, behind a convolution that changes nothing."""
     identity = {"0": Convolution(jnp.eye(3)[None, None], jnp.zeros(3))}
     return feature_maps(identity, ((Conv("0", 3, 3, 1, 1, 0), layer),), x)[0][0]
 
@@ -136,7 +140,7 @@ def pair(name, dtype="float32"):
 
 @jax.jit
 def with_gradient(weights, predicted, target):
-    """(loss, its parts) and the gradient."""
+    """Returns ((loss, its parts), gradient)."""
 
     def loss(image):
         if isinstance(weights, Lpips):
@@ -178,7 +182,7 @@ def test_the_numbers_and_gradients_of_torch(name, dtype):
 
 @pytest.mark.slow
 def test_the_golden_numbers():
-    """Of the project (golden perceptual_a)."""
+    """The numbers are the project's golden perceptual_a."""
     golden, vgg = np.load(DATA / "perceptual_a.npz"), made_up("vgg19")
     images = [jnp.asarray(golden[name].transpose(0, 2, 3, 1)) for name in ("predicted", "target")]
     batched = lambda *images: jax.vmap(
@@ -191,7 +195,7 @@ def test_the_golden_numbers():
 
 @pytest.mark.slow
 def test_the_loss_of_vgg16_against_its_definition():
-    """Convolutions and pools by numpy, in float64."""
+    """The expected convolutions and pools are in numpy, float64."""
     predicted, target = image_pair(16, 19)
     shift, scale = np.asarray([-0.030, -0.088, -0.188]), np.asarray([0.458, 0.448, 0.450])
     ends, features = ("2", "7", "14", "21", "28"), []
@@ -238,7 +242,7 @@ def test_no_gradient_reaches_the_target_of_the_perceptual_loss():
 
 @pytest.mark.slow
 def test_where_all_features_are_zero_gradients_are_finite():
-    """The length of a zero vector has no gradient: the original gives NaN there."""
+    """The length of a zero vector has no gradient; the original gives NaN there."""
     weights = made_up("alex")
     dead = {name: Convolution(x.kernel, x.bias - 1e4) for name, x in weights.backbone.items()}
     images = pair("alex")
@@ -263,9 +267,7 @@ def test_weights_in_bfloat16(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["alex", "vgg"])
 def test_lpips_of_views_is_that_of_each_and_reads_the_truth_once(name):
-    """The value and the gradient of `lpips`, by one pass for the truth, and for the image one
-    forwards and one backwards.
-    """
+    """Value and gradient are those of `lpips`; the truth takes one pass and the image two."""
     weights = made_up(name)
     pairs = [image_pair(*SIZES[name], seed) for seed in (0, 1)]
     shown, truth = (jnp.stack([pair[i] for pair in pairs]) for i in (0, 1))

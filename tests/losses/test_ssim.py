@@ -1,4 +1,4 @@
-"""SSIM against scikit-image, and what a loss made of it must do."""
+"""SSIM against scikit-image, and properties of the loss that is made of it."""
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +19,17 @@ from humangs_jax.losses.losses import (
 )
 
 FLOAT32_SSIM = 3e-5
-"""A variance is the difference of two numbers of up to 1, each rounded a few times (2e-7), beside
-C2 = 9e-4: 8e-4 at a pixel of a bright flat region, of either sign, in the mean of thousands."""
+"""Rounding of SSIM in float32.
+
+A variance is the difference of two numbers of up to 1, each rounded a few times (2e-7), beside C2 =
+9e-4. That is 8e-4 at a pixel of a bright flat region, of either sign, and less in the mean of
+thousands.
+"""
 WINDOW = GAUSSIAN.size
 
 
 def ssim(predicted, target):
-    """scikit-image's."""
+    """Returns scikit-image's SSIM."""
     return structural_similarity(
         predicted, target, win_size=WINDOW, gaussian_weights=True, data_range=1, channel_axis=-1
     )

@@ -1,9 +1,9 @@
-"""Writes data/torch_losses.npz: what torch makes of the loss networks, in float64.
+"""Writes data/torch_losses.npz: the loss networks' results in torch, float64.
 
     python tests/losses/torch_losses.py
 
-Needs torch; the tests do not. The layers are written out one by one, as torchvision and lpips stack
-them; weights and images come from `loss_cases`.
+It needs torch; the tests do not. Layers are listed one by one, as torchvision and lpips stack them.
+Weights and images are those of `loss_cases`.
 """
 
 from pathlib import Path
@@ -41,7 +41,7 @@ def vgg(widths, pool):
 
 
 def backbone(name):
-    """The layers, and after how many of them the features are taken."""
+    """Returns (layers, numbers of layers after which features are taken)."""
     p = "pool"
     if name == "vgg19":
         widths = [64, 64, p, 128, 128, p, *[256] * 4, p, *[512] * 4, p, *[512] * 4, p]

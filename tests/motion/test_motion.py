@@ -20,7 +20,7 @@ from humangs_jax.geometry import quaternion
 from humangs_jax.motion import MotionError, Poses, load_motion, save_motion
 
 FLOAT32 = 1e-5
-"""Angles up to 3 rad and metres in float32, a few operations."""
+"""Error of angles up to 3 rad and of metres, after a few float32 operations."""
 FRAMES = 6
 
 
@@ -34,7 +34,7 @@ def write(path, **arrays):
 
 
 def upright_poses(columns):
-    """Poses whose pelvis stands on +y."""
+    """Returns poses whose pelvis points along +y."""
     return random((FRAMES, columns), scale=0.1)
 
 
@@ -81,8 +81,8 @@ def test_principal_coefficients_of_hands_are_left_flat_and_that_is_said(tmp_path
 
 
 def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
-    """Known to the command's help and to `load_motion`, which finds the one of two formats that a
-    file is by its content.
+    """The command's help and `load_motion` know a new row; of two formats of a file, its content
+    tells which one it is.
     """
     standing = lambda path, reading: Poses(
         np.zeros((2, 55, 3)), np.zeros((2, 3)), float(path.read_text())
@@ -118,12 +118,12 @@ TURNS = {
     "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
     "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
 }
-"""From a world in which the axis is up to ours."""
+"""Rotations to our world from one in which another axis is up."""
 
 
 @pytest.mark.parametrize("axis", TURNS)
 def test_any_world_is_turned_upright(tmp_path, axis):
-    """The same motion in the coordinates of another world comes back, as joints in space."""
+    """A motion in another world's coordinates has the same joints in space after reading."""
     poses, trans = upright_poses(165), random((FRAMES, 3))
     turn = np.asarray(TURNS[axis], float)
     turned = poses.copy()
@@ -159,9 +159,7 @@ def parts(rotations, translations):
 @pytest.mark.parametrize("heading", [0, 215])
 @pytest.mark.parametrize("kind", motions())
 def test_people_on_the_floor_stay_there(tmp_path, caplog, kind, heading):
-    """AMASS has z up and the others y, also when people crawl along an axis, lie, or stand on their
-    hands.
-    """
+    """AMASS has z up and the others y, also for people who crawl, lie, or stand on their hands."""
     facing = Rotation.from_euler("y", heading, degrees=True)
     for up, arrays in (("z", amass), ("y", parts)):
         path = write(tmp_path / f"{up}.npz", **arrays(*in_world(*motions()[kind], UP[up] * facing)))
@@ -350,7 +348,7 @@ def test_folders_that_are_no_motion_and_wrong_options_are_one_line(tmp_path):
 
 
 def rest_body():
-    """A body of joints alone, the shipped one's roughly: enough for the ground."""
+    """Returns a body of joints alone, close to the shipped ones: enough to find the ground."""
     joints = np.array(random((55, 3), 1, 0.3), np.float32)
     joints[0] = PELVIS
     joints[7] = [0.1, -1.16, 0]
@@ -396,8 +394,8 @@ def test_at_rate_keeps_frames_and_interpolates_between_them():
 
 
 def test_at_rate_turns_at_an_even_speed():
-    """30 to 60: about a fixed axis, through half a turn where rotation vectors jump, and between
-    opposite vectors.
+    """From 30 to 60 frames a second: about a fixed axis, through half a turn, where rotation
+    vectors jump, and between opposite vectors.
     """
     axis = np.asarray([0.6, 0.0, 0.8])
     angles = np.asarray([2.9, 3.1, 3.3, 3.5])
@@ -414,7 +412,7 @@ def test_at_rate_turns_at_an_even_speed():
 
 @pytest.mark.slow
 def test_the_shipped_walk(tmp_path):
-    """On the ground in every frame, a smooth loop, arms down, legs in turn."""
+    """It touches the ground in every frame, loops smoothly, and has arms down and legs in turn."""
     from humangs_jax.body.library import load_body
     from humangs_jax.body.model import pose_body, shape_body
 

@@ -1,6 +1,4 @@
-"""Motions as estimators and data sets write them, read back as the motion that was written; files
-of several people.
-"""
+"""Motions in the files of estimators and data sets come back as written; also several people."""
 
 import numpy as np
 import pytest

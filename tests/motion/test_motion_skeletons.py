@@ -1,6 +1,6 @@
-"""Skeletons of other programs: bones, feet and names, in files as CMU, Mixamo and LaFAN write them.
+"""Skeletons of other programs: bones, feet and names, in files of CMU, Mixamo and LaFAN.
 
-The page: tests/viewer.
+tests/viewer tests the page.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from humangs_jax.motion.clips import read_bvh
 from humangs_jax.motion.skeleton import retargeted, shipped_joints
 
 EXACT = 1e-5
-"""Radians and metres: float32, and BVH's eight decimals."""
+"""Error of radians and metres in float32 and with BVH's eight decimals."""
 
 
 @functools.cache
@@ -42,7 +42,7 @@ def person():
 
 
 def other_person():
-    """Longer shins, shorter thighs, wider hips, other arms."""
+    """Returns joints of a person of other proportions: longer shins, shorter thighs, wider hips."""
     rest, stretch = (
         person(),
         {"knee": 0.85, "ankle": 1.2, "hip": 1.3, "elbow": 1.1, "wrist": 0.9, "spine2": 1.2},
@@ -110,7 +110,7 @@ TURNS = {
     "names", [CMU, LAFAN, CMU | {"spine1": "Waist", "spine2": "Chest", "spine3": "Thorax"}]
 )
 def test_a_pelvis_with_a_rotation_of_its_own(tmp_path, names, turns):
-    """The joints that carry hips and spine turn back: the people are where they were."""
+    """The joints that carry hips and spine turn back, so that people are where they were."""
     rest, poses = person().copy(), dance(4, names=names)
     rest[INDEX["spine1"]] = rest[0]
     moves = np.random.default_rng(1).normal(size=(4, 3))
@@ -122,7 +122,7 @@ def test_a_pelvis_with_a_rotation_of_its_own(tmp_path, names, turns):
 
 
 def test_hips_that_hang_on_a_turned_pelvis_itself(tmp_path):
-    """The spine alone tells where the pelvis is."""
+    """Only the spine shows where the pelvis is."""
     rest = person().copy()
     rest[INDEX["spine1"]] = rest[0]
     (tmp_path / "a.bvh").write_text(
@@ -137,8 +137,8 @@ def test_hips_that_hang_on_a_turned_pelvis_itself(tmp_path):
 
 
 def test_joints_between_those_we_know_turn_bones_too(tmp_path):
-    """A joint of no length above the elbow that turns by itself, as some rigs have: the forearm
-    starts where the file's does.
+    """A joint of no length above the elbow turns, as in some rigs; the forearm starts where the
+    file has it.
     """
     rest, poses, bent = person(), dance(3, names=CMU), dance(3, names=CMU)
     arm, elbow = INDEX["left_shoulder"], INDEX["left_elbow"]
@@ -173,7 +173,7 @@ def test_a_rest_pose_in_which_nobody_stands_gets_its_twists_from_the_motion(tmp_
 
 @pytest.mark.parametrize("names", [CMU, LAFAN])
 def test_feet_stay_on_the_ground_on_another_body(tmp_path, names):
-    """Squats of one person, with a jump in the middle, on a body of other proportions."""
+    """One person's squats, with a jump in the middle, move a body of other proportions."""
     source, target, frames = other_person(), person(), 9
     bend = np.radians(np.linspace(0, 80, frames))
     poses, moves = np.zeros((frames, 55, 3)), np.zeros((frames, 3))
@@ -207,8 +207,8 @@ def test_names_of_programs_and_the_tree_of_those_unknown(tmp_path, scheme):
 
 
 def test_a_foot_without_toes_does_not_follow_the_shin(tmp_path):
-    """Where bones lie along one axis in the rest pose nothing tells where it points: as in T-pose
-    on average.
+    """If bones lie along one axis at rest, the file does not tell where the foot points: as in
+    T-pose on average.
     """
     rest, short = (
         person(),
@@ -226,7 +226,7 @@ def test_a_foot_without_toes_does_not_follow_the_shin(tmp_path):
 @pytest.mark.parametrize("gap", ["   ", " \t "])
 @pytest.mark.parametrize("brace", ["\n{", "{", " {"])
 def test_names_with_spaces(tmp_path, gap, brace):
-    """As Biped and Rocketbox have them: a name ends with its line, or before a brace."""
+    """Biped and Rocketbox have them: a name ends with its line or before a brace."""
     names = {ours: theirs.replace(" ", gap) for ours, theirs in NAMED["Rocketbox"].items()}
     rest, poses = person(), dance(3, names=CMU)
     text = "\n".join(
@@ -312,7 +312,7 @@ def test_the_skeleton_of_a_glb(tmp_path, interpolation):
 
 
 def test_a_glb_in_centimetres_below_a_turned_node(tmp_path):
-    """As Blender writes z-up rigs: an armature of scale 0.01, turned by a quarter."""
+    """Blender writes rigs with z up so: an armature of scale 0.01 with a quarter turn."""
     rest, poses = person(), dance(3)
     matrix = np.eye(4)
     matrix[:3, :3] = 0.01 * Rotation.from_euler("x", -90, degrees=True).as_matrix()
@@ -397,9 +397,7 @@ def test_glb_files_that_are_no_motion(tmp_path):
 
 
 def test_the_text_of_a_glb_may_be_as_long_as_other_json(tmp_path):
-    """A character of many clips has a megabyte of it; a scan, which another library loads, may
-    not.
-    """
+    """Characters of many clips have a megabyte of text; scans, which trimesh loads, may not."""
     for name, more in (("a.glb", {}), ("b.glb", {"extras": ["clip"] * 150_000})):
         write_glb(tmp_path / name, person(), dance(2), np.zeros((2, 3)), MIXAMO, **more)
     assert (tmp_path / "b.glb").stat().st_size > 1_000_000
@@ -414,7 +412,7 @@ def test_the_text_of_a_glb_may_be_as_long_as_other_json(tmp_path):
 @pytest.mark.parametrize("up", ["y", "z"])
 @pytest.mark.parametrize("kind", motions())
 def test_people_on_the_floor_stay_there(tmp_path, caplog, kind, up):
-    """Whatever they do, the rest pose tells which way is up."""
+    """The rest pose tells which way is up, whatever people do."""
     poses, translations = motions()[kind]
     poses = poses.copy()
     poses[:, [i for i, name in enumerate(JOINT_NAMES) if name not in CMU]] = 0

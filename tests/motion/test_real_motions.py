@@ -1,4 +1,4 @@
-"""Files that other programs wrote (tests/data/files), with what their own numbers say."""
+"""Motions that other programs wrote (tests/data/files) have the values of their own numbers."""
 
 import csv
 import json
@@ -15,11 +15,11 @@ from humangs_jax.motion.skeleton import shipped_joints
 
 FILES = Path(__file__).parents[1] / "data" / "files"
 DEGREES = 8.0
-"""Between the upper arm of the file and ours: people differ a little in the rest pose."""
+"""Largest angle between the file's upper arm and ours: rest poses of people differ a little."""
 
 
 def test_an_animation_of_univrm_lifts_the_arm_that_the_file_lifts_and_smiles():
-    """Its bones have turned axes of their own, as Blender's have."""
+    """Its bones have turned axes, as Blender's have."""
     path = FILES / "three-vrm/test.vrma"
     data = path.read_bytes()
     length = struct.unpack_from("<I", data, 12)[0]

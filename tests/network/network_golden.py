@@ -1,10 +1,10 @@
-"""The published network's numbers at every stage: the copy of the reference that tests carry.
+"""The published network's numbers at every stage, as files of the tests.
 
 `data/golden_a.pt` is a checkpoint of the published network with random weights at small sizes, in
-the released format; `data/golden_a_subject_0.npz` the reference's numbers for one subject, some
-stages thinned out (see `THINNED`). `golden_b` has one view, eight layers, and pools visible
-vertices only (`POOLS`). Both come from the project's golden data (computed in float64 by the
-authors' release, stored as float32); `python tests/network/network_golden.py GOLDEN_DIRECTORY`
+the released format. `data/golden_a_subject_0.npz` has the reference's numbers for one subject; some
+stages are thinned out (see `THINNED`). `golden_b` has one view and eight layers, and pools visible
+vertices only (`POOLS`). Both come from the project's golden data, which the authors' release
+computed in float64 and stored as float32. `python tests/network/network_golden.py GOLDEN_DIRECTORY`
 makes the npz files again.
 """
 
@@ -20,7 +20,7 @@ DATA = Path(__file__).parent / "data"
 CHECKPOINT = DATA / "golden_a.pt"
 SUBJECT = DATA / "golden_a_subject_0.npz"
 POOLS = {"golden_a": "all", "golden_b": "visible"}
-"""Which views a vertex's features are pooled over: what a checkpoint does not record."""
+"""Views over which a vertex's features are pooled, which a checkpoint does not record."""
 
 every = lambda step, axes=1, before=0: (slice(None),) * before + (slice(None, None, step),) * axes
 THINNED = {
@@ -38,18 +38,16 @@ THINNED = {
     "posed_means3D": every(7),
     "posed_rotations": every(7),
 }
-"""What the carried copy keeps of each stage."""
+"""Indices of each stage that the files of the tests keep."""
 
 
 def carried(name):
-    """(checkpoint, stages of one subject) of "golden_a" or "golden_b"."""
+    """Returns the paths (checkpoint, stages of one subject) of "golden_a" or "golden_b"."""
     return DATA / f"{name}.pt", DATA / f"{name}_subject_0.npz"
 
 
 def load_subject(name="golden_a"):
-    """Arrays of the carried subject in the layout of the golden files (b = 1), stages thinned
-    out.
-    """
+    """Returns the subject's arrays in the golden files' layout (b = 1), stages thinned out."""
     checkpoint, subject = carried(name)
     arrays = dict(np.load(subject))
     arrays = {name: x if name in check_parity.PER_VIEW else x[None] for name, x in arrays.items()}
@@ -57,7 +55,7 @@ def load_subject(name="golden_a"):
 
 
 def thinned_errors(found, carried):
-    """Relative errors of one subject's stages, of which `carried` keeps a part."""
+    """Returns relative errors of the stages that the files of the tests keep."""
     expected = {name: x for name, x in carried.items() if not name.startswith("in_")}
     return check_parity.relative_errors(
         {name: found[name][THINNED.get(name, ())] for name in expected}, expected

@@ -1,9 +1,8 @@
-"""The published network in plain numpy and float64, one subject at a time, from a state dict in the
-release's names.
+"""The published network in numpy and float64, one subject at a time.
 
-Written from the description of the network alone (equations, names of tensors, layouts), for every
-option it has; it shares no line with `humangs_jax`. Stages come under the names and in the layouts
-of the golden files.
+It reads a state dict in the release's names. It is written from the description of the network
+alone (equations, names of tensors, layouts), with all its options, and shares no line with
+`humangs_jax`. Stages have the names and layouts of the golden files.
 """
 
 import dataclasses
@@ -16,8 +15,9 @@ erf = np.vectorize(math.erf)
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Of a made-up network and its inputs; the upsampler's hidden width and that of the heads'
-    hidden layers are 8.
+    """Sizes of a made-up network and its inputs.
+
+    The hidden layers of upsampler and heads are 8 wide.
     """
 
     width: int = 16
@@ -38,7 +38,7 @@ class Options:
     all_views: bool = True
 
     def release_config(self):
-        """The release's configuration file."""
+        """Returns the content of the release's configuration file."""
         model = {
             "neural_texture": {"resolution": self.texture[0], "dim": self.texture[1]},
             "image_tokenizer": {"patch_size": self.patch, "image_size": self.size[0]},
@@ -62,7 +62,7 @@ class Options:
 
 
 def random_state(options, seed=0):
-    """A checkpoint with random weights, every one of which matters; float32."""
+    """Returns a checkpoint of random float32 weights, every one of which matters."""
     rng = np.random.default_rng(seed)
     o, hidden, state = options, 8, {}
 
@@ -130,7 +130,7 @@ def random_state(options, seed=0):
 
 
 def random_inputs(options, state, seed=1):
-    """The `in_*` arrays: a cloud of vertices that some views see and others do not; float32."""
+    """Returns the `in_*` arrays, float32: vertices of which some views see some."""
     rng = np.random.default_rng(seed)
     o = options
     b, v, n, (h, w) = o.subjects, o.views, o.vertices, o.size
@@ -180,7 +180,7 @@ def softmax(x):
 
 
 def bilinear(grid, x, y):
-    """grid (c, h, w) at texel positions, corners aligned, zeros outside; -> (*x.shape, c)."""
+    """Samples grid (c, h, w) at texel positions, corners aligned, zeros outside: (*x.shape, c)."""
     c, h, w = grid.shape
     out = np.zeros((*x.shape, c))
     for j in (np.floor(y), np.floor(y) + 1):
@@ -193,7 +193,7 @@ def bilinear(grid, x, y):
 
 
 def convolution(x, weight, bias):
-    """(v, c, h, w), odd kernel, same size."""
+    """Convolves x (v, c, h, w) with an odd kernel; the size stays."""
     p = weight.shape[-1] // 2
     h, w = x.shape[2:]
     x = np.pad(x, ((0, 0), (0, 0), (p, p), (p, p)))
@@ -206,8 +206,9 @@ def convolution(x, weight, bias):
 
 
 def transposed_convolution(x, weight, bias):
-    """Kernel 4, stride 2, padding 1: every input pixel (i, j) adds kernel[a, b] to output pixel (2i
-    + a - 1, 2j + b - 1).
+    """Convolves transposed, with kernel 4, stride 2 and padding 1.
+
+    Input pixel (i, j) adds kernel[a, b] to output pixel (2i + a - 1, 2j + b - 1).
     """
     v, _, h, w = x.shape
     y = np.zeros((v, weight.shape[1], 2 * h + 2, 2 * w + 2))
@@ -220,7 +221,7 @@ def transposed_convolution(x, weight, bias):
 
 
 class Network:
-    """A state dict, and how to run it; `head`: width of an attention head."""
+    """The network of a state dict; `head` is the width of an attention head."""
 
     def __init__(self, state, options):
         self.state = {key: np.asarray(x, np.float64) for key, x in state.items()}
@@ -279,7 +280,7 @@ class Network:
         )
 
     def subject(self, arrays):
-        """Every stage of one subject's `in_*` arrays."""
+        """Returns every stage of one subject's `in_*` arrays."""
         o, stages = self.options, {}
         image, c2w, posed = arrays["in_image"], arrays["in_c2w"], arrays["in_smpl_posed_vertices"]
         canonical = arrays["in_smpl_canonical_vertices"][0]
@@ -421,8 +422,9 @@ def skinned_quaternion(linear, q):
 
 
 def triple(options, seed=0):
-    """State dict, arrays (inputs and every stage, stored as float32) and release configuration of
-    made-up numbers.
+    """Returns (state dict, arrays, release configuration) of made-up numbers.
+
+    The arrays are inputs and every stage, stored as float32.
     """
     state = random_state(options, seed)
     arrays = random_inputs(options, state, seed + 1)

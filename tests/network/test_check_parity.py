@@ -1,6 +1,4 @@
-"""experiments/paper/check_parity.py on made-up triples whose numbers come from an independent
-network (network_oracle.py).
-"""
+"""experiments/paper/check_parity.py, with numbers of an independent network (network_oracle.py)."""
 
 import dataclasses
 import json
@@ -17,7 +15,7 @@ from experiments.harness import call
 from experiments.paper import check_parity
 
 GOLDEN = Path(__file__).parents[3] / "shared" / "golden"
-"""The whole golden data, where a checkout has it beside it."""
+"""Folder of the whole golden data, if it lies beside the checkout."""
 VARIANTS = {
     "no class token, one Gaussian, three views of 96": Options(
         class_token=False,
@@ -65,7 +63,7 @@ def write_triple(folder, options, change=lambda arrays: None):
 
 
 def run(checkpoint, dtype="float32"):
-    """Exit status, and the column of the result."""
+    """Returns (exit status, column of the result)."""
     out = checkpoint.with_name("out.json")
     given = [checkpoint, "--dtypes", dtype, "--json", out]
     code = call(check_parity.parity, [str(each) for each in given])
@@ -75,7 +73,7 @@ def run(checkpoint, dtype="float32"):
 
 
 def test_the_oracle_is_the_published_network():
-    """Stages of golden_a, with which the authors' own code was run."""
+    """The authors' own code computed the stages of golden_a."""
     state, _ = golden.read_state_dict(golden.CHECKPOINT)
     arrays = dict(np.load(golden.SUBJECT)) | {"in_lbs_weights": state["tpose_lbs_weights"]}
     options = Options(width=64, head=16, gaussians=5, texture=(16, 4))
@@ -107,7 +105,7 @@ def test_other_precisions(dtype, tmp_path):
 
 
 def test_one_wrong_number_in_any_stage_fails():
-    """The stages are computed once; each is spoilt in turn."""
+    """The stages are computed once, and each gets an error in turn."""
     _, arrays, _ = oracle.triple(SMALL)
     expected = {name: x for name, x in arrays.items() if not name.startswith("in_")}
     found = {name: x.astype(np.float64) for name, x in expected.items()}
@@ -148,7 +146,7 @@ def test_what_is_not_compared_fails(tmp_path, capsys):
 
 
 def test_ties_of_posed_rotations_are_free_and_nothing_else_is():
-    """Two readings of the same blended transform, one of which is 1e-3 better conditioned."""
+    """One blended transform has two solutions, of which one is 1e-3 better conditioned."""
     readings = np.zeros((1, 1, 4, 4))
     readings[0, 0, :2] = [[0.6, 0.5, 0, 0], [0.4, 0.7, 0, 0]]
     found = {

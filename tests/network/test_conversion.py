@@ -297,7 +297,7 @@ def test_the_command_converts(tmp_path, monkeypatch, capsys):
 
 
 def loss_networks():
-    """LPIPS squeeze as the released checkpoint would carry it, its heads twice."""
+    """Returns LPIPS squeeze as a released checkpoint has it, with its heads twice."""
     draw = np.random.default_rng(0)
     layers = expected_tensors("SqueezeNet 1.1").items()
     state = {
@@ -328,7 +328,7 @@ def test_the_command_keeps_the_loss_networks(tmp_path, monkeypatch, capsys):
 
 
 def test_parts_of_loss_networks_are_refused(tmp_path, monkeypatch, capsys):
-    """The golden checkpoint carries four stubs of tensors."""
+    """The golden checkpoint has only four small tensors of them."""
     arguments = ("--out", tmp_path / "w.safetensors", "--losses", tmp_path / "losses.safetensors")
     code, _, error = run(monkeypatch, capsys, "convert", CHECKPOINT, *arguments)
     assert code == 1 and "perceptual_loss_module.vgg.features.0.bias' of VGG-19 is missing" in error

@@ -1,4 +1,4 @@
-"""Every stage of the published network against its authors' numbers (see network_golden.py)."""
+"""Every stage of the published network against its authors' numbers (network_golden.py)."""
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,11 @@ from experiments.paper import check_parity
 from humangs_jax.network.conversion import load_checkpoint
 
 TOLERANCES = {"float32": 2e-5, "float64": 1e-6}
-"""Relative to a stage's largest magnitude. In float32 ours stays within 3e-6, the release itself
-within 5e-6. The reference is stored as float32: half a rounding step is 6e-8."""
+"""Largest errors relative to a stage's largest magnitude.
+
+In float32 ours stays within 3e-6, and the release within 5e-6. The reference is stored as float32:
+half a rounding step is 6e-8.
+"""
 
 
 CASES = [

@@ -24,9 +24,9 @@ from humangs_jax.network.vertex_decoder import VertexDecoder
 from humangs_jax.network.weights import expected_variables
 
 FLOAT32_TOLERANCE = 1e-5
-"""The same sums in another order: a few layers of float32 roundings on numbers of order one."""
+"""Sums in another order: a few layers of float32 roundings of numbers of order one."""
 BFLOAT16_TOLERANCE = 0.05
-"""bfloat16 has 8 bits (0.4 %); some twenty roundings in a row on numbers of order one."""
+"""Some twenty roundings in a row of numbers of order one: bfloat16 has 8 bits (0.4 %)."""
 
 
 PER_VIEW = ("images", "posed_vertices", "posed_normals", "position_maps", "depth_maps")
@@ -34,8 +34,9 @@ PER_VIEW = ("images", "posed_vertices", "posed_normals", "position_maps", "depth
 
 @functools.partial(jax.jit, static_argnames=("config",))
 def run(variables, inputs, config):
-    """Encoding and outputs, compiled once per configuration and shape (the compiler merges what
-    both compute).
+    """Returns (encoding, outputs), compiled once for each configuration and shape.
+
+    The compiler merges what both compute.
     """
     return encode(variables, inputs, config), apply_humangs(variables, inputs, config)[0]
 
@@ -59,7 +60,7 @@ def variables_of(config):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
 def test_presets_have_the_shapes_they_promise(name):
-    """Traced at full size, nothing is computed."""
+    """The network is traced at full size, and nothing is computed."""
     config = presets.PRESETS[name]()
     views, vertices, size = 4, 37, config.conventions.image_size
     inputs = jax.eval_shape(
@@ -148,7 +149,7 @@ def test_deeper_blocks_begin_smaller():
 
 @pytest.mark.slow
 def test_the_order_of_the_views_does_not_matter():
-    """Maps are permuted with the views, everything pooled stays."""
+    """Maps are permuted like the views, and what is pooled stays."""
     inputs, order = random_inputs(), jnp.asarray([1, 0])
     per_view = {name: getattr(inputs, name) for name in PER_VIEW}
     permuted = replace(
@@ -243,7 +244,7 @@ def test_unseen_vertices_are_grey_and_pool_nothing():
 
 
 def padded(inputs, views):
-    """Garbage behind the views that there are."""
+    """Returns the inputs with garbage behind their views."""
     missing = views - len(inputs.images)
     extend = lambda x, junk: jnp.concatenate(
         [x, jnp.broadcast_to(jnp.asarray(junk, x.dtype), (missing, *x.shape[1:]))]

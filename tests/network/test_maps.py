@@ -1,4 +1,4 @@
-"""Maps: sampled, convolved, sampled before they are convolved, and upsampled."""
+"""Maps are sampled, convolved, sampled before they are convolved, and upsampled."""
 
 import dataclasses
 import re
@@ -25,13 +25,13 @@ from humangs_jax.network.maps import (
 from humangs_jax.network.upsampler import MOMENTUM, UpConvolution, Upsampler, UpsamplerConfig
 
 RTOL32 = 1e-5
-"""Three float32 products and sums of numbers of order one."""
+"""Rounding of three float32 products and sums of numbers of order one."""
 FLOAT64 = 1e-12
-"""The same sums in another order."""
+"""Rounding of sums in another order, float64."""
 
 
 def oracle(grid, indices):
-    """Sum over ALL texels of tent(x - i) tent(y - j): bilinear interpolation, zeros outside."""
+    """Returns sums over ALL texels of tent(x - i) tent(y - j): bilinear, with zeros outside."""
     height, width, _ = grid.shape
     tent = lambda x: np.maximum(0, 1 - np.abs(x))
     wx, wy = tent(indices[:, :1] - np.arange(width)), tent(indices[:, 1:] - np.arange(height))
@@ -84,8 +84,8 @@ def test_nearest_rounds_halves_to_even():
 
 
 def test_conventions():
-    """Half-pixel indices see the same image at every resolution; the mixed ones miss it by less
-    than half a texel.
+    """Half-pixel indices see the same image at every resolution; mixed ones miss it by less than
+    half a texel.
     """
     pixels = jnp.asarray([[0.5, 0.5], [8.0, 4.0], [15.5, 7.5]])
     half = texel_indices(pixels, (16, 8), (16, 8), "half_pixel")
@@ -113,7 +113,7 @@ def test_half_pixel_sampling_reproduces_a_ramp_at_any_resolution():
 
 
 def test_planes_and_axes():
-    """Each plane is read at its two axes, the first named one along the width."""
+    """A plane is read at its two axes, the first of its name along the width."""
     r = 5
     centres = jnp.linspace(-1, 1, r)
     horizontal = jnp.broadcast_to(centres[None, :, None], (r, r, 1))
@@ -135,7 +135,7 @@ def test_background_reads_the_last_texel_and_outside_is_zero():
 
 
 def test_background_and_empty_slots_add_nothing_to_a_texture_one_by_one(monkeypatch):
-    """An accelerator's additions to one place wait for each other: the background's are one sum."""
+    """An accelerator's additions to one place wait for each other; the background's are one sum."""
     texture = jnp.asarray(np.random.default_rng(0).normal(size=(3, 4, 4, 2)), jnp.float32)
     inside = np.random.default_rng(1).uniform(-1, 1, (5, 3))
     positions = jnp.asarray([[1.0] * 3] * 4 + [[NOWHERE] * 3] * 3 + inside.tolist(), jnp.float32)
@@ -157,7 +157,7 @@ def test_background_and_empty_slots_add_nothing_to_a_texture_one_by_one(monkeypa
 
 
 def spied(places):
-    """`sample_bilinear`, which notes the indices that it is given."""
+    """Returns `sample_bilinear`, which adds the indices that it is given to `places`."""
 
     def read(grid, indices, origin):
         places.append(indices)
@@ -223,7 +223,7 @@ def test_the_module_has_the_parameters_of_flax():
 
 @pytest.mark.parametrize("batch", [1, 2], ids=["unrolled", "looped"])
 def test_in_a_loop_all_of_its_convolutions_are_those_that_the_library_knows(batch):
-    """XLA leaves others to nested loops over single numbers."""
+    """XLA makes nested loops over single numbers of other ones."""
 
     def total_gradient(xs, kernel):
         add = lambda total, x: (
@@ -297,7 +297,7 @@ def random_maps(depths=4, views=2, side=3, width=6):
 
 
 def test_up_convolution_is_the_transposed_convolution():
-    """Every input pixel adds its kernel, stride 2, minus a border of one."""
+    """Each input pixel adds its kernel with stride 2; a border of one is cut off."""
     rng = np.random.default_rng(1)
     x, kernel, bias = (
         rng.normal(size=(2, 3, 4, 5)),

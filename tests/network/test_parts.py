@@ -1,6 +1,4 @@
-"""A part that is not the paper's takes the place of one: in the pass, in training, in weights
-files.
-"""
+"""Another part in place of one of the paper's: in the network, in training, in files of weights."""
 
 import dataclasses
 
@@ -43,7 +41,7 @@ from humangs_jax.network.weights import load_weights, save_weights
 
 @part
 class LookingReader(Reader):
-    """Vertices look at all tokens of all views, by their canonical position."""
+    """Vertices attend to all tokens of all views, by their canonical position."""
 
     width: Width = 8
 

@@ -1,5 +1,6 @@
-"""What vertices read: where they are seen, means over views, and shells. A round body in a wide
-round coat: what its shells say can be written down.
+"""What vertices read: where they are seen, means over views, and shells.
+
+A round body wears a wide round coat, for which the values of shells are known.
 """
 
 import jax
@@ -80,7 +81,7 @@ def test_visibility_reads_the_pixel_that_holds_the_vertex():
 
 
 def read_row(grid, positions):
-    """A stand-in for a lookup: the first row of the map, plus the positions."""
+    """Stands in for a lookup: returns the map's first row plus the positions."""
     return {"row": grid[0, 0] + positions[:, :1], "first": positions[:, 0]}
 
 
@@ -117,9 +118,9 @@ def test_photo_colors_are_grey_where_nothing_is_seen():
 
 @pytest.mark.parametrize("pool", ["visible", "all"])
 def test_views_that_do_not_see_a_vertex_do_not_dilute_its_feature(pool):
-    """Each photo's map is constant: the mean over the views that count is known.
+    """Each photo's map is constant, so that the mean over views is known.
 
-    View 1 sees nothing, view 2 is padding.
+    View 1 sees nothing, and view 2 is padding.
     """
     inputs = random_inputs(views=3)
     inputs = replace(
@@ -167,16 +168,16 @@ def test_at_the_edge_of_a_mask_a_shell_has_the_color_of_the_person_alone():
 
 
 BODY, COAT = 0.5, 0.8
-"""Radii of two spheres about the origin."""
+"""Radii of two spheres about the origin, metres."""
 DISTANCES = (0.0, 0.1, 0.2, 0.4)
 SIDE = 128
 VIEWS = 4
 LATERAL = 0.02
-"""A pixel is 0.02 wide at the sphere: what happens at the silhouette is known so well."""
+"""Error at the silhouette: a pixel is 0.02 wide at the sphere."""
 
 
 def scene(views=VIEWS):
-    """Photos of the coat: red as the first view sees it, green as the others do."""
+    """Returns photos of the coat, which the first view sees red and the others green."""
     cameras = orbit(
         jnp.zeros(3),
         4.0,
@@ -227,9 +228,7 @@ def read(arguments, present=None):
 
 
 def lateral(points, cameras):
-    """(v, p) sine of the angle between a point and the optical axis, times the camera's
-    distance.
-    """
+    """Returns the sine (v, p) of the angle between point and optical axis, times the distance."""
     away = points - np.asarray(cameras.center)[:, None]
     axis = np.asarray(cameras.cam_from_world)[:, 2, :3]
     cosine = np.einsum("vpc,vc->vp", away, axis) / np.linalg.norm(away, axis=-1)

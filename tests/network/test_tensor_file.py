@@ -30,9 +30,7 @@ def test_the_name_of_a_file_does_not_matter(kind, name, tmp_path):
 
 
 def test_headers_of_any_length(tmp_path):
-    """A header's length must not pass for another format's first bytes (640 is 80 02, the start of
-    a pickle).
-    """
+    """A header's length may equal another format's first bytes: 640 is 80 02, a pickle's start."""
     for length in range(600, 680, 8):
         save_file(STATE, tmp_path / "a", {"padding": "x" * (length - 200)})
         assert (

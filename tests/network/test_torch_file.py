@@ -18,7 +18,7 @@ DATA = Path(__file__).parent / "data"
 
 
 def test_a_file_that_torch_wrote():
-    """Of a state dict (write_torch_files.py, torch 2.15)."""
+    """The file is a state dict of torch 2.15 (write_torch_files.py)."""
     state, skipped = read_torch_file(DATA / "torch_zip.pth")
     truth = dict(np.load(DATA / "torch_numbers.npz"))
     assert skipped == 0 and list(state) == list(truth)
@@ -29,7 +29,7 @@ def test_a_file_that_torch_wrote():
 
 
 def write_pickle(path, data, **members):
-    """A checkpoint whose pickle is these bytes."""
+    """Writes a checkpoint whose pickle consists of these bytes."""
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("archive/data.pkl", data)
         for name, content in members.items():
@@ -80,7 +80,7 @@ def test_only_storages_of_the_state_dict_are_read(tmp_path):
 
 
 class Call:
-    """Pickled as a call."""
+    """An object that is pickled as a call."""
 
     def __init__(self, function, *arguments):
         self.parts = function, arguments
@@ -126,7 +126,7 @@ def test_nor_does_any_other_call_of_torch(name, tmp_path):
 
 
 def test_what_is_allowed_cannot_be_changed(tmp_path):
-    """BUILD with a pair of dicts sets attributes of whatever stands on the stack."""
+    """BUILD with a pair of dicts sets attributes of any object on the stack."""
     for target in (
         b"ctorch._utils\n_rebuild_tensor_v2\n",
         b"ctorch\nFloatStorage\n",
@@ -206,9 +206,7 @@ def test_every_truncation_is_a_clear_error(tmp_path):
 
 
 def damaged(path):
-    """State dicts of a file with one byte changed, where reading it raises no error, and how often
-    it does.
-    """
+    """Changes one byte of a file at a time; returns (state dicts, number of refusals, bytes)."""
     whole, states, noticed = path.read_bytes(), [], 0
     for position in range(0, len(whole), 3):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 0x5A]) + whole[position + 1 :])
@@ -257,7 +255,7 @@ def test_a_file_from_before_torch_1_6_says_what_to_do():
 
 
 def test_tensors_in_a_plain_pickle(tmp_path):
-    """Torch writes a stream for each storage, which `pickle` keeps as bytes."""
+    """torch writes a stream for each storage, which `pickle` keeps as bytes."""
     numbers = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.asarray([1, 2], np.int64)}
     (tmp_path / "a.pkl").write_bytes(plain_pickle(numbers))
     found = read_values(tmp_path / "a.pkl")

@@ -22,7 +22,7 @@ from humangs_jax.network.transformer import (
 )
 
 FLOAT32_TOLERANCE = 2e-6
-"""Outputs are averages of numbers of order one; a dozen float32 roundings."""
+"""A dozen float32 roundings of averages of numbers of order one."""
 LENGTH, HEADS, WIDTH = 13, 3, 4
 
 
@@ -31,7 +31,7 @@ def random_qkv(seed=0, length=LENGTH):
 
 
 def oracle(q, k, v, count):
-    """One head and query at a time, float64."""
+    """Returns attention in float64, for one head and query at a time."""
     out = np.zeros_like(q)
     for i in range(len(q)):
         for h in range(q.shape[1]):
@@ -125,7 +125,7 @@ def test_query_key_norm_makes_attention_blind_to_their_lengths():
 CONFIG = TransformerConfig(width=16, layers=6, head_width=8)
 network = functools.partial(Transformer, runtime=Runtime())
 BLOCKS_TOLERANCE = 1e-5
-"""The same sums in another order, over six layers."""
+"""Sums in another order, over six layers."""
 TOKENS = jnp.asarray(np.random.default_rng(0).normal(size=(11, 16)), jnp.float32)
 VARIABLES = random_like(jax.eval_shape(network(CONFIG).init, jax.random.key(0), TOKENS))
 
@@ -155,7 +155,7 @@ def test_blocks_may_be_looped_over_and_recomputed(how):
 
 @pytest.mark.slow
 def test_outputs_are_those_of_the_quarters():
-    """A network that is cut off after a quarter gives the raw output of that quarter."""
+    """A network that is cut off after a quarter gives that quarter's raw output."""
     outputs = network(CONFIG).apply(VARIABLES, TOKENS)
     assert len(outputs) == 4
     blocks = lambda n: {

@@ -91,7 +91,7 @@ def test_skinning_weights_are_corrected_by_their_logits():
 
 
 def shells_of(colors):
-    """Two vertices, three shells, of which the last is outside of the hull."""
+    """Returns three shells of two vertices; the last shell is outside of the hull."""
     seen, hull = jnp.ones((2, 3)), jnp.asarray([[1.0, 1, 0]] * 2)
     return Shells(jnp.asarray([0.0, 0.1, 0.2]), colors, seen, hull, hull)
 
@@ -122,7 +122,7 @@ def test_gaussians_choose_their_shell_and_its_color():
 
 
 def biases_of(decoder, features):
-    """Fresh biases of the last layers: what Gaussians start from, but for tiny weights."""
+    """Returns fresh biases of the last layers, from which Gaussians start."""
     init = jax.jit(
         lambda features: decoder.init(
             jax.random.key(0), features, random_inputs(vertices=2), TINY.forward_context()
@@ -208,9 +208,7 @@ def test_quaternions_are_unit_whatever_the_head_says():
 
 
 def test_a_person_twice_as_large_has_gaussians_twice_as_large():
-    """Lengths inside are those of a body of 1.8 m; means, offsets and scales come back to
-    metres.
-    """
+    """The network sees a body of 1.8 m; means, offsets and scales are in metres again."""
     decoder, features = (
         VertexDecoder(hidden=8, tight=1, free=1),
         VertexFeatures(jnp.ones((4, 3)), jnp.ones(2)),

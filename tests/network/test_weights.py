@@ -25,7 +25,7 @@ def file(tmp_path):
 
 
 def rewrite(file, change, **metadata):
-    """The same file with other tensors or another header."""
+    """Writes the file again with other tensors or another header."""
     tensors = load_file(file)
     header = {
         "format": weights.FORMAT,

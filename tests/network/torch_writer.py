@@ -1,4 +1,4 @@
-"""Checkpoints as `torch.save` writes them, without torch."""
+"""Writes checkpoints as `torch.save` does, without torch."""
 
 import collections
 import dataclasses
@@ -21,9 +21,7 @@ KINDS = {dtype: kind for kind, dtype in STORAGE_DTYPES.items() if kind != "BFloa
 
 @dataclasses.dataclass
 class FakeTensor:
-    """What `torch.save` writes for a tensor: a storage by reference, and a view of it (contiguous
-    by default).
-    """
+    """What `torch.save` writes of a tensor: a storage, and a view of it, by default contiguous."""
 
     storage: np.ndarray
     kind: str = "FloatStorage"
@@ -33,7 +31,7 @@ class FakeTensor:
 
 
 def tensors(state):
-    """A state dict of arrays as tensors."""
+    """Returns a state dict whose arrays are tensors."""
     own = {key: np.ascontiguousarray(x).reshape(np.shape(x)) for key, x in state.items()}
     return collections.OrderedDict((key, FakeTensor(x, KINDS[x.dtype])) for key, x in own.items())
 
@@ -43,7 +41,7 @@ def contiguous(shape):
 
 
 def pickled(content, extra=lambda tensor: ()):
-    """The pickle of `content` and the storages of the tensors in it, named by their number."""
+    """Returns (pickle of `content`, storages of its tensors); a storage's number is its name."""
     torch, utils = types.ModuleType("torch"), types.ModuleType("torch._utils")
     # modules in the place of PyTorch, so that the pickle names its functions and classes
     rebuild = lambda *_: None
@@ -91,7 +89,7 @@ def pickled(content, extra=lambda tensor: ()):
 
 
 def write_checkpoint(path, content, byteorder="little", compression=zipfile.ZIP_STORED):
-    """A zip-format checkpoint of whatever `content` is; tensors in it as `FakeTensor`."""
+    """Writes a checkpoint in zip format, whose tensors are `FakeTensor`."""
     data, storages = pickled(content)
     with zipfile.ZipFile(path, "w", compression) as archive:
         archive.writestr("archive/data.pkl", data)
@@ -102,7 +100,7 @@ def write_checkpoint(path, content, byteorder="little", compression=zipfile.ZIP_
 
 
 def stream(storage, kind="FloatStorage", little=True, count=None, first=MAGIC_NUMBER):
-    """One storage as torch puts it into a plain pickle: a file from before torch 1.6."""
+    """Returns a storage as torch wrote it into a plain pickle before torch 1.6."""
     module = types.ModuleType("torch")
     setattr(module, kind, type(kind, (), {"__module__": "torch"}))
     size = storage.size if count is None else count
@@ -126,7 +124,7 @@ def stream(storage, kind="FloatStorage", little=True, count=None, first=MAGIC_NU
 
 
 def plain_pickle(content, stream=stream):
-    """A pickle of arrays as those of tensors that `pickle.dump` writes."""
+    """Returns a pickle of arrays, written like tensors that `pickle.dump` writes."""
     names = {"torch.storage": "_load_from_bytes", "torch._utils": "_rebuild_tensor_v2"}
     modules = {"torch": types.ModuleType("torch")}
     for module, name in names.items():

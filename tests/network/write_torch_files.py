@@ -1,5 +1,7 @@
-"""Writes data/torch_zip.pth: a state dict as `torch.save` writes it, and its numbers as npz; and
-data/torch_stream.pt, as before torch 1.6. Needs torch; tests do not.
+"""Writes data/torch_zip.pth and data/torch_stream.pt. Needs torch; tests do not.
+
+The first is a state dict as `torch.save` writes it, with its numbers as npz. The second is one from
+before torch 1.6.
 
 python tests/network/write_torch_files.py
 """

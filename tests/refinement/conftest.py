@@ -1,5 +1,6 @@
-"""One size of buffers for all tests of the normal lane, so that they share compiled programs; slow
-tests plan their own.
+"""Fixtures with one size of buffers for all fast tests, so that they share compiled programs.
+
+Slow tests plan their own sizes.
 """
 
 import pytest
@@ -23,11 +24,11 @@ def body():
 
 @pytest.fixture(scope="session")
 def person(body):
-    """The avatar to be refined, and photos of the same one in other colors."""
+    """Returns (avatar to be refined, photos of it in other colors)."""
     return toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), moving=True)
 
 
 @pytest.fixture(scope="session")
 def four(body):
-    """An avatar, and four photos of the person, in other colors than the avatar's."""
+    """Returns (avatar, four photos of it in other colors)."""
     return toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), views=4)

@@ -1,4 +1,4 @@
-"""A toy person: a body with one Gaussian a vertex, and photos of the same one in other colors."""
+"""A toy person: a body with one Gaussian on each vertex, and photos in other colors."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ WIDTH, HEIGHT = 48, 64
 STEPS = RefineConfig(iterations=0, steps=12, seconds=None, held_out=0.0)
 
 SAME = SplatConfig(max_pairs=1 << 14, max_rows=1 << 13, visibility=True)
-"""Buffers of all tests of the normal lane."""
+"""Sizes of buffers of all fast tests."""
 
 
 def toy_avatar(body, shade):
@@ -45,8 +45,9 @@ def toy_avatar(body, shade):
 
 
 def toy_capture(body, avatar, views=3, moving=False, distance=3.6):
-    """Photos of an avatar, each in another pose if `moving`. distance: of each camera,
-    metres.
+    """Returns photos of an avatar, each in another pose if `moving`.
+
+    `distance` is that of each camera, metres.
     """
     cameras = orbit(
         jnp.asarray([0.0, 0.9, 0.0]),
@@ -74,13 +75,11 @@ def toy_capture(body, avatar, views=3, moving=False, distance=3.6):
 
 
 FEW = 0.03
-"""Share of numbers that may differ: where a gradient is rounding alone, Adam makes whole steps of
-it.
-"""
+"""Largest share of numbers that differ: Adam makes whole steps of gradients that are rounding."""
 
 
 def assert_nearly_all_close(got, expected, atol):
-    """Two pytrees of one structure."""
+    """Compares two pytrees of one structure, but for the share `FEW` of each leaf."""
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
         differ = np.abs(np.asarray(a) - np.asarray(b)) > atol
         assert differ.mean() < FEW, (

@@ -1,4 +1,4 @@
-"""Steps on the head: nothing else moves, what they compare, and when `refine` makes them."""
+"""Steps on the head move nothing else; what they compare, and when `refine` makes them."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ ALONE = RefineConfig(iterations=0, steps=0, seconds=None, head_steps=20, held_ou
 
 @pytest.fixture
 def small_photos(monkeypatch):
-    """Those of the toy person count as large, and no crop wants larger ones."""
+    """Makes the toy person's photos count as large, so that no crop wants larger ones."""
     monkeypatch.setattr(heads, "LEAST_SIDE", HEIGHT)
 
 

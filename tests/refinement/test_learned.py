@@ -1,6 +1,4 @@
-"""The learned update: what it sees, that it does nothing untrained, and what the shipped one
-gains.
-"""
+"""The learned update: what it sees, what the shipped one gains; untrained it does nothing."""
 
 import dataclasses
 
@@ -40,7 +38,7 @@ ROUNDING = 1e-5
 
 @pytest.fixture(scope="module")
 def scene(body):
-    """Avatar, one photo of the same person in other colors, parameters, splatting."""
+    """Returns (avatar, one photo of it in other colors, parameters, configuration of splatting)."""
     avatar = toy_avatar(body, 0.0)
     views = crop_to_person(prepare_capture(toy_capture(body, toy_avatar(body, 0.15))))
     photo = photos_of(views)[0]

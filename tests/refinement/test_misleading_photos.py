@@ -1,6 +1,4 @@
-"""The demo's person, one of whose photos misleads: views that nothing saw do not get worse than
-without refinement.
-"""
+"""One of the demo's photos misleads: views that nothing saw must not get worse by refinement."""
 
 import dataclasses
 
@@ -18,7 +16,7 @@ from humangs_jax.refinement.refine import refine_with_report
 
 SIZE = 256
 ALLOWED = 0.1
-"""Decibels that may be lost."""
+"""Largest loss, decibels."""
 STEPS = 60
 
 
@@ -29,8 +27,9 @@ def without_mask(capture, view):
 
 
 def with_pose_off(capture, view, joints):
-    """The pose of one photo is off by 10 degrees: the whole body about the vertical (1 joint), or
-    each joint about some axis.
+    """Returns the capture with the pose of one photo off by 10 degrees.
+
+    For one joint the whole body turns about the vertical; else each joint turns about some axis.
     """
     frames = np.asarray(capture.frames)
     rotations, axes = np.array(capture.poses.rotations)[frames], np.asarray([[0.0, 1.0, 0.0]])

@@ -1,4 +1,4 @@
-"""Refinement on a toy person: a body whose Gaussians differ in color from its photos."""
+"""Refinement of a toy person, whose Gaussians differ in color from the photos."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -68,8 +68,8 @@ def test_what_no_photo_sees_stays(person):
 
 @pytest.mark.slow
 def test_refined_avatars_look_the_same_at_other_sizes(person):
-    """As an image of the photos' size, reduced, does; and at that size as the optimised Gaussians
-    do.
+    """They look like a reduced image of the photos' size, and like the optimised Gaussians at that
+    size.
     """
     avatar, capture = person
     refined = refinement.refine(avatar, capture, STEPS)
@@ -100,7 +100,7 @@ def squared_error(avatar, capture):
 @pytest.mark.slow
 @pytest.mark.parametrize("times", [1 / 3, 3])
 def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
-    """Also if its low-pass is that of smaller or larger pixels than theirs."""
+    """This also holds if its low-pass is that of smaller or larger pixels."""
     avatar, capture = person
     views = crop_to_person(prepare_capture(capture))
     own = with_pixel_footprint(avatar, times * pixel_sizes(avatar, views))
@@ -127,7 +127,7 @@ def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
 
 @pytest.mark.slow
 def test_photos_from_near_and_far_are_fitted_together(body, person):
-    """The far ones have larger pixels, which do not blur what the near one shows."""
+    """The larger pixels of the far photos do not blur what the near one shows."""
     avatar, _ = person
     photos = toy_capture(body, toy_avatar(body, 0.1), distance=jnp.asarray([2.5, 5.0, 12.0]))
     report = refinement.refine_with_report(avatar, photos, STEPS)
@@ -267,7 +267,7 @@ def test_wrong_captures_are_named(person):
 
 
 def stepping(monkeypatch, changed):
-    """`search.step`, replaced by a function of it and its arguments."""
+    """Replaces `search.step` by a function of it and its arguments."""
     own = search.step
     monkeypatch.setattr(search, "step", lambda *arguments: changed(own, *arguments))
 
@@ -293,7 +293,7 @@ def test_long_runs_after_iterations_take_smaller_steps(iterations, share, person
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Time passes by a tenth of a second with each step and each iteration."""
+    """Returns a clock that each step and each iteration moves by a tenth of a second."""
     clock, learned = SimpleNamespace(now=0.0, slower=1.0), search.learned_update
 
     def timed(own, *arguments):
@@ -337,7 +337,7 @@ def test_buffers_are_doubled_until_all_fits_and_that_counts_as_compilation(clock
 
 
 def seen_by_steps(monkeypatch):
-    """The views of every step of the runs to come."""
+    """Returns a list to which each step of later runs adds its view."""
     seen, own = [], search.stepped
     monkeypatch.setattr(
         search,
@@ -364,7 +364,7 @@ def test_the_best_explained_photos_are_held_out_of_trials_and_then_fitted(four, 
 
 
 def test_a_trial_that_loses_leaves_the_avatar_alone(four, monkeypatch):
-    """Steps and iterations that fit the photos they see and spoil the one that they do not."""
+    """Steps and iterations fit the photos they see and spoil the one that is held out."""
     avatar, capture = four
     unchanged = lambda found: not found.iterations and not int(found.state.done)
     monkeypatch.setattr(
@@ -379,7 +379,7 @@ def test_a_trial_that_loses_leaves_the_avatar_alone(four, monkeypatch):
 
 
 def shifted(capture, pixels):
-    """Each photo has moved in another direction."""
+    """Returns the capture with each photo moved in another direction."""
     steps = [(pixels, 0), (0, pixels), (-pixels, 0), (0, -pixels)]
     moved = lambda stack: np.stack(
         [np.roll(x, step, (0, 1)) for x, step in zip(stack, steps, strict=True)]
@@ -430,7 +430,7 @@ def test_a_held_out_photo_is_compared_where_each_state_draws_the_person(body, mo
 
 
 def test_a_photo_that_contradicts_the_others_is_left_out_and_named(four, monkeypatch):
-    """By its name among all views of the capture, one of which shows nobody."""
+    """Its name is that among all views of the capture, one of which shows nobody."""
     avatar, capture = four
     capture = capture.select([0, 0, 1, 2, 3])
     images, masks = np.array(capture.images), np.array(capture.masks)
@@ -481,7 +481,7 @@ def test_held_out_pixels_decide_on_the_iterations_of_few_photos(
 
 
 def test_what_makes_the_photos_worse_is_not_returned(person, monkeypatch):
-    """Also if nothing is held out, so that the search keeps its last state."""
+    """This also holds if nothing is held out, so that the search keeps its last state."""
     worse = lambda own, state, *_: replace(
         state, parameters=replace(state.parameters, means=state.parameters.means + 0.2)
     )
@@ -505,8 +505,9 @@ def test_blocks_of_pixels_are_held_out_and_every_photo_has_its_turn():
 
 
 def few(**changes):
-    """A state of two Gaussians, a gradient of ones, settings whose steps are the gradient times a
-    rate.
+    """Returns (state of two Gaussians, gradient of ones, settings).
+
+    With these settings a step is the gradient times a rate.
     """
     names = {"means": 3, "quats": 4, "log_scales": 3, "opacity_logits": None, "color_logits": 3}
     arrays = {name: jnp.ones((2,) if n is None else (2, n)) for name, n in names.items()}

@@ -1,9 +1,9 @@
-"""Compositing in float64 numpy, written from the formulas of `compositing`, with bounds on what
-float32 makes of them.
+"""Compositing in float64 numpy, with bounds on the rounding of float32.
 
-A running error analysis (Higham, section 3.3): beside every number its bound, in units of the last
-place u = 2^-24. It holds for both schedules, in any order of their sums, with or without fused
-multiplications. Bounds follow the magnitudes of the terms, not the results, which cancel.
+It is written from the formulas of `compositing`. A running error analysis (Higham, section 3.3)
+keeps a bound beside every number, in units of the last place u = 2^-24. It holds for both
+schedules, for any order of their sums, with or without fused multiplications. Bounds follow the
+magnitudes of the terms, not the results, which cancel.
 """
 
 from typing import NamedTuple
@@ -14,12 +14,12 @@ from rounding import SCALE, UNIT
 from humangs_jax.rendering.compositing_on_accelerators import CHUNK
 
 EXP = LOG = 4
-"""Roundings of an exponential or a logarithm: XLA's are good to two units in the last place."""
+"""Roundings of an exponential or a logarithm; XLA's are good to two units in the last place."""
 
 
 class Analysed(NamedTuple):
-    """Values in float64 and bounds of their float32 errors, as `schedule` returns them; whether
-    every decision is sure.
+    """A schedule's values in float64, bounds of their float32 errors, and whether decisions are
+    sure.
     """
 
     features: np.ndarray
@@ -31,8 +31,9 @@ class Analysed(NamedTuple):
 
 
 def analyse(splats, lists, grid, config, g, g_transmittance) -> Analysed:
-    """Arguments: as of a schedule, float32 numbers in float64; the cotangents of features (t, 4, p)
-    and T (t, p).
+    """Returns values and bounds for a schedule's arguments, float32 numbers in float64.
+
+    `g` and `g_transmittance` are the cotangents of features (t, 4, p) and transmittance (t, p).
     """
     items, starts, counts = (np.asarray(a) for a in lists)
     t, p = len(counts), grid.pixels

@@ -1,10 +1,11 @@
-"""Gaussian splatting in float64 numpy, written from the formulas and sharing no code with the
-package, but for `NEAR` and the like, which are repeated here as numbers. A reference for small
-images: everything is held for every Gaussian on every pixel.
+"""Gaussian splatting in float64 numpy, a reference for small images.
+
+It is written from the formulas and shares no code with the package; `NEAR` and similar constants
+are repeated as numbers. It holds everything for every Gaussian on every pixel.
 
 EWA projection (Zwicker et al. 2001): cov2d = J W Sigma W^T J^T + eps2d I. With the singular value
 decomposition M = U S V^T of M = J W R diag(s), (2, 3), the quadratic form is sum_i (u_i . d)^2 /
-(S_i^2 + eps2d): accurate for needles of any length, and another formula than both the renderer's
+(S_i^2 + eps2d). This is accurate for needles of any length, and another formula than the renderer's
 (Cholesky) and the reference's (cross products).
 """
 
@@ -14,9 +15,9 @@ NEAR, EPS2D, ALPHA_MIN, ALPHA_MAX, STOP, LARGEST = 0.01, 0.3, 1 / 255, 0.999, 1e
 
 
 def splat(means, quats, scales, opacities, colors, K, cam_from_world, background, width, height):
-    """(rgb (h, w, 3), alpha (h, w)) of g Gaussians.
+    """Returns (rgb (h, w, 3), alpha (h, w)) of g Gaussians.
 
-    All arguments in float64; quats wxyz of any norm.
+    All arguments are float64; quaternions wxyz may have any norm.
     """
     in_camera = means @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
     drawn = in_camera[:, 2] > NEAR
@@ -48,8 +49,9 @@ def splat(means, quats, scales, opacities, colors, K, cam_from_world, background
 
 
 def rotations(quats):
-    """Rotation matrices (g, 3, 3): v + 2 w (q x v) + 2 q x (q x v) applied to the axes; a zero
-    quaternion turns nothing.
+    """Returns rotation matrices (g, 3, 3) of quaternions; a zero quaternion turns nothing.
+
+    v + 2 w (q x v) + 2 q x (q x v) is applied to the axes.
     """
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     w, q = np.split(

@@ -1,5 +1,6 @@
-"""Small scenes for the tests of splatting: every awkward Gaussian there is, in an image that no
-tile size divides.
+"""Small scenes for tests of splatting, with difficult Gaussians.
+
+No tile size divides the image.
 """
 
 import jax
@@ -16,8 +17,9 @@ COUNT = 32
 
 
 def random_gaussians(seed, dtype=np.float64, count=COUNT) -> Gaussians:
-    """Gaussians 2 to 4 m before the camera at the origin: blobs, and a few of each kind that asks
-    for care.
+    """Returns Gaussians 2 to 4 m before the camera at the origin.
+
+    Most are blobs; a few of each difficult kind are among them.
     """
     rng = np.random.default_rng(seed)
     z = rng.uniform(2, 4, count)
@@ -46,13 +48,13 @@ def random_gaussians(seed, dtype=np.float64, count=COUNT) -> Gaussians:
 
 
 def with_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
-    """Some of the colors become negative from here, and are drawn as 0."""
+    """Returns the Gaussians with harmonics, some of whose colors are negative and drawn as 0."""
     values = np.random.default_rng(count).normal(size=(len(gaussians.means), count, 3))
     return replace(gaussians, harmonics=jnp.asarray(values, gaussians.means.dtype))
 
 
 def camera(dtype=np.float64, width=WIDTH, height=HEIGHT) -> Camera:
-    """At the origin, looking along z, a little turned and off centre."""
+    """Returns a camera near the origin that looks along z, a little turned and off centre."""
     K = jnp.asarray([[22.0, 0, 0.52 * width], [0, 24.0, 0.45 * height], [0, 0, 1]], dtype)
     angle = 0.05
     pose = np.eye(4)
@@ -62,11 +64,11 @@ def camera(dtype=np.float64, width=WIDTH, height=HEIGHT) -> Camera:
 
 
 def tile_centers(grid: TileGrid) -> np.ndarray:
-    """(t, 2): x and y of the tiles' centres, pixels."""
+    """Returns x and y (t, 2) of the tiles' centres, pixels."""
     rows, columns = np.divmod(np.arange(grid.tiles), grid.columns)
     return (np.stack([columns, rows], axis=-1) + 0.5) * grid.tile_size
 
 
 def few(gaussians: Gaussians, indices: np.ndarray) -> Gaussians:
-    """Some of the Gaussians, or all in another order."""
+    """Returns some of the Gaussians, or all in another order."""
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[indices]), gaussians)

@@ -1,6 +1,4 @@
-"""Compositing of hand-made lists of splats, and its gradient, against the formula and autodiff of
-the formula.
-"""
+"""Compositing of made-up lists of splats and its gradient, against the formula and autodiff."""
 
 import functools
 
@@ -15,7 +13,7 @@ from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import TileGrid, TileLists
 
 EXACT = 1e-10
-"""float64, sums over 16 pixels."""
+"""Rounding of float64 sums over 16 pixels."""
 
 GRID = TileGrid(12, 8, 4)  # six tiles
 LENGTHS = [4, 0, 5, 1, 0, 2]
@@ -26,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def make(seed):
-    """Splats and lists: nine splats, the first few (in depth order) on each tile."""
+    """Returns (nine splats, lists); the first few in depth order are on each tile."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(7, 12, 9), rng.uniform(0, 4, 9)
     shape = np.stack(
@@ -47,7 +45,7 @@ def make(seed):
 
 
 def formula(splats, lists):
-    """Tile by tile, splat by splat."""
+    """Returns (features, transmittances) by the formula, splat by splat on each tile."""
     offsets, centers = GRID.offsets(np.float64), tile_centers(GRID)
     features, transmittances = [], []
     for tile, (start, count) in enumerate(

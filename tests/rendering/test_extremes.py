@@ -1,5 +1,6 @@
-"""Every extreme of docs/numerics.md, and random scenes over many decades: finite, and float32 close
-to float64.
+"""Every extreme of docs/numerics.md, and random scenes over many decades.
+
+Results are finite, and float32 is close to float64.
 """
 
 import dataclasses
@@ -18,23 +19,29 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.splatting import SplatConfig, render
 
 DECISION = 1e-5
-"""An image error beyond rounding: somewhere an alpha at 1/255, a transmittance at the stop or two
-depths fell the other way. Behind an alpha of 0.999 that may be a tenth: 2 of 3,000 scenes of the
-second sweep."""
+"""Least image error that is no rounding.
+
+An alpha at 1/255, a transmittance at the stop or two depths were then decided otherwise. Behind an
+alpha of 0.999 the error may be a tenth, as in 2 of 3,000 scenes of the second sweep.
+"""
 
 SWEEP_GRADIENT = 5e-2
-"""Relative L2 of any one gradient, natural units. Of 1,500 scenes of the first sweep, half are
-below 1.4e-5, 99 % below 9e-4, all below 9e-3; of the second, with needles of 1e10 that are 1e8
-pixels long, 1.1e-5, 7e-3, and one has 0.3."""
+"""Largest relative L2 error of any one gradient, in natural units.
+
+Of 1,500 scenes of the first sweep half are below 1.4e-5, 99 % below 9e-4 and all below 9e-3. The
+second, with needles of 1e10 that are 1e8 pixels long, has 1.1e-5 and 7e-3, and one of 0.3.
+"""
 
 TYPICAL_GRADIENT = 1.4e-5
-"""Relative L2 of a gradient of an ordinary scene: the median of the sweep above. Without a bias the
-mean of n such errors has a standard deviation of TYPICAL_GRADIENT |g| / n; a biased one would be as
-large as TYPICAL_GRADIENT times the mean of |g|."""
+"""Relative L2 error of an ordinary scene's gradient: the median of the sweep above.
+
+Without a bias the mean of n such errors has a standard deviation of TYPICAL_GRADIENT |g| / n. With
+one it would be as large as TYPICAL_GRADIENT times the mean of |g|.
+"""
 
 
 SMALL = SplatConfig(block=4, chunk=4, max_pairs=256)
-"""Quick to compile."""
+"""A configuration that compiles quickly."""
 
 
 CASES = [
@@ -67,7 +74,7 @@ QUICK = [param for param in CASES if not param.marks]
 
 @pytest.mark.parametrize("case", QUICK)
 def test_case_against_plain_numpy(case):
-    """The image of a splatter that shares no code with ours (numpy_splatter.py)."""
+    """The image is that of a splatter that shares no code with ours (numpy_splatter.py)."""
     scene = case.build()
     wide = lambda a: np.asarray(a, np.float64)
     arguments = dict(
@@ -101,9 +108,11 @@ def check_sweep(scene):
 
 
 def anything(seed, focal, nearest, farthest, smallest, largest):
-    """A random scene: every Gaussian has its own depth and three scales (metres), log-uniform
-    within these ranges, any opacity (some 0, 1 and 1 - 1e-7), a quaternion of any norm from 1e-20
-    to 1e15, and a place on or beside the image.
+    """Returns a random scene.
+
+    Every Gaussian has a depth and three scales (metres), log-uniform within these ranges; any
+    opacity, some 0, 1 and 1 - 1e-7; a quaternion of a norm from 1e-20 to 1e15; and a place on or
+    beside the image.
     """
     rng, count = np.random.default_rng(seed), cases.COUNT
     scene = cases.ordinary(seed)
@@ -130,7 +139,7 @@ def anything(seed, focal, nearest, farthest, smallest, largest):
     st.integers(0, 2**20), decade(0, 6), decade(-1.99, 6), decade(0, 3), decade(-7, 3), decade(0, 2)
 )
 def test_random_scenes_over_many_decades(seed, focal, nearest, depths, smallest, ratio):
-    """Scales within two decades of each other, depths within three."""
+    """Scales lie within two decades of each other, depths within three."""
     check_sweep(
         anything(
             seed, focal, nearest, min(nearest * depths, 1e7), smallest, min(smallest * ratio, 1e3)
@@ -139,7 +148,7 @@ def test_random_scenes_over_many_decades(seed, focal, nearest, depths, smallest,
 
 
 def test_random_scenes_of_every_size_at_every_depth_at_once():
-    """Always the same hundred: decisions fall the other way in one of 1,500 such scenes."""
+    """The scenes are always the same hundred: one in 1,500 has other decisions."""
     rng = np.random.default_rng(0)
     for seed, exponent in zip(rng.integers(0, 2**20, 100), rng.uniform(0, 6, 100), strict=True):
         check_sweep(anything(int(seed), float(10**exponent), 0.0101, 1e6, 1e-7, 1e3))
@@ -161,7 +170,7 @@ def test_gradients_have_no_signed_bias():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ordinary: nothing special", "order: coincident depths"])
 def test_decisions_are_the_same_without_jit(name):
-    """Operation by operation, in one program, and in one that XLA compiles with other options."""
+    """The image is drawn by `render`, within a larger program, and operation by operation."""
     scene = cases.CASES[name].build()
     gaussians, K, pose, background = scene.arguments()
     view = Camera(K, pose, scene.width, scene.height)

@@ -1,5 +1,6 @@
-"""The accelerator's schedule of compositing against the CPU's, on the renderer's own lists and on
-lists made by hand.
+"""The accelerator's schedule of compositing against the CPU's.
+
+Lists are the renderer's own and made-up ones.
 """
 
 from unittest import mock
@@ -19,9 +20,9 @@ from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import TileGrid, TileLists
 
 EXACT = 1e-10
-"""In float64, relative to the largest entry.
+"""Largest float64 error, relative to the largest entry.
 
-In float32 each entry has its own bound, see compositing_rounding.py.
+In float32 each entry has its bound, see compositing_rounding.py.
 """
 
 K = accelerators.CHUNK
@@ -31,13 +32,11 @@ SPLATS, CAPACITY = 4 * K, 6 * 4 * K
 THIN = cpu.forward_by_blocks, cpu.backward_by_blocks
 FAT = accelerators.forward_by_chunks, accelerators.backward_by_chunks
 PER_STEP = 3
-"""Chunks per step, so that lists run on from step to step and the last step has padding."""
+"""Chunks in a step: lists continue from step to step, and the last step has padding."""
 
 
 def by_hand(seed, lengths, dtype, grid=GRID, opacities=(0.05, 1.0)):
-    """Splats around the first tiles, and for each tile a list of as many of them as `lengths` says,
-    in depth order.
-    """
+    """Returns (splats around the first tiles, lists in depth order of these `lengths`)."""
     rng, tile = np.random.default_rng(seed), grid.tile_size
     xy = rng.uniform(-0.6, 3.1, (SPLATS, 2)) * tile
     shape = rng.uniform([0.16, -0.8, 0.16], 0.8, (SPLATS, 3)) / tile
@@ -60,7 +59,7 @@ def cotangents(grid, dtype):
 
 
 def schedule(functions, splats, lists, grid=GRID, config=None, per_step=1024):
-    """Everything a schedule computes, for a random cotangent."""
+    """Returns everything that a schedule computes, for a random cotangent."""
     config = config or SplatConfig(tile_size=grid.tile_size, block=4, chunk=4, visibility=True)
     forward, backward = functions
     with mock.patch.object(accelerators, "STEP_CHUNKS", per_step):
@@ -75,7 +74,7 @@ run = jax.jit(schedule, static_argnums=(0, 3, 4, 5))
 
 
 def assert_equal(ours, expected, counts, tolerance=EXACT):
-    """Channel by channel, and column by column of the sums: their sizes differ."""
+    """Compares channels, and columns of the sums, each relative to its size."""
     for name, a, b in zip(
         ("features", "transmittance", "sums", "peaks"), ours, expected, strict=False
     ):
@@ -89,13 +88,13 @@ def assert_equal(ours, expected, counts, tolerance=EXACT):
 
 
 def assert_lengths(ours, expected, counts):
-    """What counts of each list, in whole chunks: those of this schedule are the larger ones."""
+    """Compares the used lengths of lists, in whole chunks: this schedule's are the larger ones."""
     used, needed = np.asarray(ours), np.asarray(expected)
     assert (needed <= used).all() and (used < needed + K).all() and (used <= counts).all()
 
 
 def assert_rounded(found, exact):
-    """Float32 results within the bounds of their float64 analysis."""
+    """Checks float32 results against the bounds of their float64 analysis."""
     assert (
         exact.decided
     )  # no alpha at its threshold, no pixel at its stop: float32 decides as float64
@@ -108,10 +107,10 @@ def assert_rounded(found, exact):
 
 
 def assert_equal_in_float32(splats, lists, grid, config, per_step=1024):
-    """Each schedule against the same numbers in float64, entry by entry.
+    """Compares each schedule with the same numbers in float64, entry by entry.
 
-    Measured: errors reach 0.2 of the bounds of the images, 0.04 of those of the sums, whose first
-    columns cancel. A mistake in a formula would show in float64, to 1e-10.
+    Errors of up to 0.2 of the images' bounds were measured, and 0.04 of those of the sums, whose
+    first columns cancel. A wrong formula would show in float64, to 1e-10.
     """
     ours, expected = (
         run(FAT, splats, lists, grid, config, per_step),
@@ -191,7 +190,7 @@ def test_a_batch_is_one_call():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("stop", [0.0, 1e-4])
 def test_opaque_to_the_last_bit(dtype, stop):
-    """1 - alpha_max is 0 in float32: its logarithm must not make a NaN elsewhere."""
+    """1 - alpha_max is 0 in float32; its logarithm must not make a NaN elsewhere."""
     with jax.enable_x64(dtype == np.float64):
         config = SplatConfig(alpha_max=1 - 1e-9, transmittance_stop=stop, visibility=True)
         splats, lists = by_hand(3, LENGTHS, dtype, opacities=(0.9, 1.0))

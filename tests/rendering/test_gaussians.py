@@ -1,4 +1,4 @@
-"""Gaussians moved by skinning; as free parameters, and back."""
+"""Gaussians that skinning moves, and Gaussians as free parameters and back."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from humangs_jax.rendering.gaussians import (
 )
 
 RTOL = 1e-10
-"""float64 throughout."""
+"""Rounding of float64."""
 
 
 def some_gaussians(rng, count=12):
@@ -63,9 +63,7 @@ def test_both_modes_agree_on_rigid_transforms():
 
 
 def test_a_blend_of_rotations_leaves_a_short_quaternion():
-    """As published: half a turn of 90 degrees and none at all is no rotation, and the norm shows
-    it.
-    """
+    """As published: the mean of a quarter turn and none is no rotation, and the norm shows it."""
     rng = np.random.default_rng(2)
     quarter = quaternion.matrix_from_axis_angle(jnp.asarray([0.0, 0.0, np.pi / 2]))
     blend = transform.make(0.5 * (quarter + jnp.eye(3)), jnp.zeros(3))
@@ -92,7 +90,7 @@ def test_what_is_deformed_has_no_parameters_and_no_rotation():
 
 
 ROUNDING = 2e-6
-"""Of a logarithm and an exponential, a logit and a sigmoid, in float32."""
+"""Rounding of a logarithm and an exponential, a logit and a sigmoid, in float32."""
 COUNT = 50
 
 
@@ -128,7 +126,7 @@ def test_bounds_are_met_within_the_margins():
 
 
 def test_parameters_of_constants_have_types_of_their_own():
-    """Weakly typed ones would compile a step of an optimizer twice."""
+    """Weakly typed parameters would compile a step of an optimizer twice."""
     n = 4
     flat = Gaussians(
         jnp.zeros((n, 3)),

@@ -1,6 +1,4 @@
-"""Colors that depend on the direction of sight: the functions against scipy's, what turns them,
-what is drawn of them.
-"""
+"""Colors that depend on the viewing direction: the functions, how they turn, and what is drawn."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +24,7 @@ def directions(count=50):
 
 
 def by_scipy(d, degree):
-    """Real harmonics of complex ones, which have the sign of Condon and Shortley."""
+    """Returns real harmonics from scipy's complex ones, with the sign of Condon and Shortley."""
     theta, phi = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
     found = []
     for n in range(1, degree + 1):
@@ -55,8 +53,8 @@ def test_the_functions_are_scipys_in_both_renderers(degree):
 
 
 def test_signs_and_order_are_the_published_ones():
-    """https://github.com/graphdeco-inria/diff-gaussian-rasterization: -y, z, -x; then -yz second,
-    the zonal one in the middle.
+    """They are -y, z, -x; then -yz is second and the zonal one in the middle
+    (https://github.com/graphdeco-inria/diff-gaussian-rasterization).
     """
     x, y, z = np.asarray([0.6, 0.0, 0.8]).tolist()
     got = np.stack(harmonics.basis(x, y, z, 15))

@@ -1,8 +1,7 @@
-"""The preset `inria` against its conventions written out in numpy: what diff-gaussian-rasterization
-draws.
+"""The preset `inria` draws what diff-gaussian-rasterization does, here in numpy.
 
-Pixels, tiles and squares are counted as there: pixel centres at whole numbers, tiles of 16, a splat
-on all pixels of the tiles that its square of three standard deviations meets, and on no other.
+Pixel centres are at whole numbers and tiles have 16 pixels. A splat is drawn on all pixels of the
+tiles that its square of three standard deviations meets, and on no other.
 """
 
 import dataclasses
@@ -16,7 +15,7 @@ from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig, drawn
 from humangs_jax.rendering.splatting import render
 
 SAME = 1e-9
-"""float64."""
+"""Rounding of float64."""
 
 WIDTH, HEIGHT, TILE = 75, 53, 16
 INRIA = dataclasses.replace(SPLAT_PRESETS["inria"], block=4, chunk=4)
@@ -36,7 +35,7 @@ def test_drawing_as_weights_were_trained_keeps_the_other_knobs():
 
 
 def rotation(quat):
-    """Of a quaternion as it is: not normalised."""
+    """Returns the matrix of a quaternion that is not normalised."""
     r, x, y, z = quat
     return np.asarray(
         [
@@ -48,7 +47,7 @@ def rotation(quat):
 
 
 def project(gaussians, i, view):
-    """Centre, conic, radius and depth of one splat; None if it is not drawn."""
+    """Returns (centre, conic, radius, depth) of a splat, or None if it is not drawn."""
     K, pose = np.asarray(view.K), np.asarray(view.cam_from_world)
     p = pose[:3, :3] @ np.asarray(gaussians.means)[i] + pose[:3, 3]
     if p[2] <= 0.2:
@@ -72,7 +71,7 @@ def project(gaussians, i, view):
 
 
 def draw(gaussians, view, background):
-    """Splat by splat, over its rectangle of tiles."""
+    """Draws splat by splat, each over its rectangle of tiles."""
     splats = [(i, project(gaussians, i, view)) for i in range(len(gaussians.means))]
     splats = sorted(((s[3], i, *s[:3]) for i, s in splats if s is not None), key=lambda s: s[:2])
     color, transmittance = np.zeros((HEIGHT, WIDTH, 3)), np.ones((HEIGHT, WIDTH))

@@ -1,6 +1,4 @@
-"""Lenses of cameras: OpenCV's formulas, how far they reach, what is drawn through them, and the
-motion of cameras by twists.
-"""
+"""Lenses of cameras: OpenCV's formulas, their range, what is drawn, and cameras moved by twists."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +16,7 @@ from humangs_jax.rendering.splatting import render
 
 EXACT = 1e-12
 FLOAT64 = 1e-9
-"""Relative to the largest entry, through the compositing."""
+"""Error after compositing, relative to the largest entry."""
 RADIAL = (-0.12, 0.03, 0.01, -0.02, -0.004)
 RATIONAL = (*RADIAL, 0.05, -0.02, 0.006, 0.002, -0.001, 0.003, 0.0005)
 FISHEYE = (0.05, -0.02, 0.008, -0.001)
@@ -40,7 +38,7 @@ def lensed(kind, view):
 
 
 def opencv(points, name, c):
-    """cv2.projectPoints and cv2.fisheye.projectPoints for K = 1, written from OpenCV's manual."""
+    """Returns cv2.projectPoints or cv2.fisheye.projectPoints for K = 1, by OpenCV's manual."""
     x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
     r = np.hypot(x, y)
     if name == "orthographic":
@@ -60,9 +58,7 @@ def opencv(points, name, c):
 
 @pytest.mark.parametrize("kind", LENSES)
 def test_points_fall_where_opencv_puts_them_and_footprints_turn_with_them(kind):
-    """The covariance of a tiny Gaussian is that of its points, projected one by one: finite
-    differences of the whole camera.
-    """
+    """The covariance of a tiny Gaussian is found by differences of projected points."""
     with jax.enable_x64(True):
         view = lensed(kind, camera())
         gaussians = random_gaussians(0)
@@ -106,8 +102,8 @@ def test_no_distortion_is_the_pinhole_and_the_axis_of_a_fisheye_is_smooth():
 
 
 def test_what_a_lens_would_fold_back_is_not_drawn():
-    """r (1 - 0.1 r^2) grows up to r^2 = 10 / 3; a fisheye without coefficients reaches
-    everything in front.
+    """r (1 - 0.1 r^2) grows up to r^2 = 10 / 3; a fisheye without coefficients reaches all that is
+    in front.
     """
     u = jnp.asarray([0.0, 1.0, 1.82, 1.84, 10.0, 1e30, jnp.nan])
     reached = lens.within_reach("pinhole", jnp.asarray([-0.1, 0.0, 0.0, 0.0]), u, 0 * u)
@@ -150,9 +146,7 @@ def test_images_and_all_gradients_are_those_of_the_reference(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rational and prism", "fisheye", "orthographic"])
 def test_gradients_through_a_lens_are_derivatives(kind):
-    """Along a random direction of means, K, the pose and the coefficients, with nothing near a
-    decision.
-    """
+    """The direction moves means, K, pose and coefficients; nothing is close to a decision."""
     with jax.enable_x64(True):
         smooth = SplatConfig(
             block=4, chunk=4, max_pairs=2000, alpha_min=1e-9, transmittance_stop=0.0

@@ -1,6 +1,4 @@
-"""The rasterizer against rays: every face meets every pixel's ray in float64 numpy, without edge
-functions.
-"""
+"""The rasterizer against rays: in float64 numpy every face meets the ray of every pixel."""
 
 import itertools
 from typing import NamedTuple
@@ -21,19 +19,18 @@ from humangs_jax.rendering.mesh.rasterizer import (
 )
 
 PIXEL_ERROR = 1e-4
-"""Float32 positions of pixels: coordinates of tens of pixels are rounded to 4e-6, after a few
-operations each.
-"""
+"""Error of float32 pixel positions: tens of pixels round to 4e-6, after a few operations each."""
 DEPTH_TIE = 1e-5
-"""Relative depth difference below which float32 may order two faces either way."""
+"""Relative difference of depths below which float32 may order two faces either way."""
 SMALL_STEPS = RasterConfig(rows_per_step=64, fragments_per_step=128)
-"""Many steps of both loops even on small meshes."""
+"""A configuration that makes many steps of both loops on small meshes."""
 WIDTH, HEIGHT = 33, 21
 
 
 class RayReference(NamedTuple):
-    """What rays hit: (h, w) maps; `unsure` where an edge is within PIXEL_ERROR or two depths are
-    within DEPTH_TIE.
+    """Maps (h, w) of what rays hit.
+
+    `unsure` marks pixels with an edge within PIXEL_ERROR, or two depths within DEPTH_TIE.
     """
 
     face_ids: np.ndarray
@@ -44,8 +41,9 @@ class RayReference(NamedTuple):
 
 
 def ray_reference(vertices, faces, camera, near=0.01):
-    """A ray z d hits the plane of a face where z d = [v0 v1 v2] b with the weights b adding up to
-    1.
+    """Intersects the rays of all pixels with all faces.
+
+    A ray z d hits the plane of a face where z d = [v0 v1 v2] b, with weights b that add up to 1.
     """
     transform, K = np.asarray(camera.cam_from_world, np.float64), np.asarray(camera.K, np.float64)
     points = np.asarray(vertices, np.float64) @ transform[:3, :3].T + transform[:3, 3]
@@ -113,7 +111,7 @@ def check_against_rays(
 
 
 def sphere(rows=12, columns=18, radius=1.0):
-    """A closed sphere: shared vertices at the seam and at the poles."""
+    """Returns a closed sphere, whose vertices at the seam and at the poles are shared."""
     polar = np.pi * np.arange(1, rows) / rows
     around = 2 * np.pi * np.arange(columns) / columns
     ring = np.stack([np.cos(around), 0 * around, np.sin(around)], -1)
@@ -139,13 +137,14 @@ def some_camera(seed=0, distance=3.0, width=WIDTH, height=HEIGHT):
 
 
 def flat_camera(width=WIDTH, height=HEIGHT):
-    """Points (x, y, 1) are seen at the pixel position (x, y), exactly."""
+    """Returns a camera that sees the point (x, y, 1) at exactly the pixel position (x, y)."""
     return Camera.from_opencv(np.eye(3), np.eye(4), width, height)
 
 
 def draw(vertices, faces, camera, config=SMALL_STEPS):
-    """Padded by faces without area (harmless: see `test_bad_faces_are_harmless`), so that many
-    tests share one compilation.
+    """Rasterizes a mesh that is padded by faces without area, so that tests share a compilation.
+
+    Such faces do no harm, see `test_bad_faces_are_harmless`.
     """
     vertices, faces = jnp.asarray(vertices), jnp.asarray(faces, jnp.int32)
     vertices = jnp.pad(vertices, ((0, -len(vertices) % 128), (0, 0)))
@@ -199,8 +198,9 @@ def test_float64():
 
 
 def grid(x, y):
-    """A sheet at z = 1 through the points x[i, j], y[i, j], cells cut along alternating
-    diagonals.
+    """Returns a sheet at z = 1 through the points x[i, j], y[i, j].
+
+    Cells are cut along alternating diagonals.
     """
     rows, columns = x.shape
     vertices = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3).astype(np.float32)
@@ -223,7 +223,7 @@ def grid(x, y):
     st.sampled_from([1.0, 1.4]),
 )
 def test_sheet_has_no_holes(seed, jitter, spacing):
-    """Vertices on pixel centres, edges through pixel centres, or both missed by roundings."""
+    """Vertices or edges lie on pixel centres, or miss them by roundings."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[-1:23, -1:35].astype(np.float64)
     x, y = (spacing * a + 0.5 - (spacing - 1) + jitter * rng.normal(size=a.shape) for a in (x, y))
@@ -264,7 +264,7 @@ def test_edges_belong_to_the_face():
 
 
 def test_near_plane_drops_and_counts():
-    """A face behind the camera, one that crosses the near plane, one beyond it."""
+    """One face is behind the camera, one crosses the near plane, and one is beyond it."""
     vertices = np.concatenate([SQUARE[:3] * [1, 1, -1], SQUARE[:3], SQUARE[:3]]).astype(np.float32)
     vertices[3, 2] = 0.0
     fragments = draw(vertices, np.arange(9).reshape(3, 3), flat_camera())
@@ -277,9 +277,7 @@ def test_near_plane_drops_and_counts():
 
 @pytest.mark.slow
 def test_bad_faces_are_harmless():
-    """Points, segments, NaN, infinity and coordinates near the largest float leave the other faces
-    as they are.
-    """
+    """Points, segments, NaN, infinity and huge numbers leave the other faces as they are."""
     bad = np.array(
         [
             [7, 7, 1],
@@ -315,9 +313,7 @@ def test_bad_faces_are_harmless():
 
 
 def test_faces_without_area_cover_nothing():
-    """Three points on a line through a pixel centre, exactly, whose edge functions there are
-    nothing but roundings.
-    """
+    """Three points lie on a line through a pixel centre, where edge functions are roundings."""
     rng = np.random.default_rng(0)
     step = rng.integers(1, 1 << 18, (40, 1, 2)) * rng.choice([-1, 1], (40, 1, 2)) * 2.0**-20
     points = 0.5 + step * np.array([-3, 1, 5])[:, None]
@@ -429,11 +425,11 @@ def test_gradients_reach_attributes_and_nothing_else():
 
 
 TEXEL_ROUNDING = 2e-6
-"""Texel positions of up to 16 texels in float32, times color steps of up to 1."""
+"""Rounding of float32 positions of up to 16 texels, times color steps of up to 1."""
 
 
 def lookup(texture, u, v):
-    """Bilinear, texel by texel, v up, border repeated."""
+    """Returns a bilinear sample, texel by texel, with v up and the border repeated."""
     height, width = texture.shape[:2]
     x, y = np.clip(u * width - 0.5, 0, width - 1), np.clip((1 - v) * height - 0.5, 0, height - 1)
     total = 0

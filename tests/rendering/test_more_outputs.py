@@ -1,6 +1,4 @@
-"""What a rendering holds only if asked: radii, centres, sums and medians of depth, distortion;
-opacities without aliasing.
-"""
+"""Outputs of a rendering on request: radii, centres, depths, distortion, antialiased opacities."""
 
 import dataclasses
 from unittest import mock
@@ -28,7 +26,7 @@ DRAWN = ("rgb", "alpha", "depth", "depth_sum", "distortion", "features")
 
 
 def measured(draw, gaussians, config):
-    """What is drawn, and the gradients of a random sum of it by everything, shifts included."""
+    """Returns (what is drawn, gradients of a random sum of it by all arguments and shifts)."""
     rng = np.random.default_rng(7)
     weights = {name: rng.normal(size=(HEIGHT, WIDTH, 3)) for name in DRAWN}
 
@@ -87,7 +85,7 @@ def test_nothing_is_returned_that_was_not_asked_for():
 
 
 def wall(depths, opacities):
-    """Wide Gaussians on the axis, one behind the other; the nearest is not the first."""
+    """Returns wide Gaussians on the axis, one behind the other; the nearest is not the first."""
     n = len(depths)
     return Gaussians(
         jnp.stack([jnp.zeros(n), jnp.zeros(n), jnp.asarray(depths, float)], axis=-1),
@@ -163,9 +161,7 @@ def test_shifts_move_the_image_and_their_shape_is_checked():
 
 @pytest.mark.slow
 def test_antialiased_opacities_keep_what_a_small_gaussian_weighs():
-    """A blob far below a pixel: its weight is opacity times its area, whatever eps2d makes of
-    its width.
-    """
+    """The weight of a blob far below a pixel is opacity times area, whatever eps2d is."""
     with jax.enable_x64(True):
         point = replace(wall([2.0], [1.0]), scales=jnp.full((1, 3), 0.004))
         view = replace(camera(), K=camera().K.at[0, 0].set(22.0).at[1, 1].set(22.0))

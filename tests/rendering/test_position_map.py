@@ -1,5 +1,6 @@
-"""Position maps against the release's own rasterizer (see `provenance` in data/mesh_crops.npz) and
-against geometry.
+"""Position maps against the release's rasterizer and against geometry.
+
+data/mesh_crops.npz has the release's maps, see its `provenance`.
 """
 
 from pathlib import Path
@@ -19,10 +20,11 @@ from humangs_jax.rendering.mesh.rasterizer import (
 STORED_AS_FLOAT16 = 5e-4
 """Half of float16's spacing below 1."""
 DEPTH_ERROR = 1e-5
-"""Two float32 rasterizers; depths are about 2.5."""
+"""Difference of two float32 rasterizers at depths of about 2.5."""
 GOURAUD_ERROR = 5e-5
-"""The highlight's 64th power magnifies roundings of the normals (1e-7) by 64, the interpolation
-adds a little.
+"""Difference of colors.
+
+The highlight's 64th power magnifies roundings of normals (1e-7) by 64; interpolation adds a little.
 """
 
 
@@ -68,7 +70,7 @@ def test_maps_equal_the_release(golden, view):
 
 
 def test_vertex_normals():
-    """An octahedron's normals are its vertices; a vertex without faces, or of faces without area,
+    """An octahedron's normals are its vertices. A vertex without faces, or of faces without area,
     has none.
     """
     corners = np.concatenate([np.eye(3), -np.eye(3), np.full((2, 3), 5.0)])

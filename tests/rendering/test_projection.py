@@ -1,5 +1,6 @@
-"""EWA projection against the derivative of the pinhole camera, and where float32 and gradients are
-in danger.
+"""EWA projection against the derivative of the pinhole camera.
+
+It also covers places where float32 and gradients lose accuracy.
 """
 
 import jax
@@ -19,7 +20,7 @@ from humangs_jax.rendering.tiling import squared_reach
 project = jax.jit(project_gaussians)
 
 FLOAT64 = 1e-9
-"""float64 rounding, grown by 1/z^2 near the camera."""
+"""Rounding of float64, which grows by 1/z^2 near the camera."""
 
 FLOAT32 = 1e-5
 
@@ -126,7 +127,7 @@ def test_zero_quaternion_is_the_identity_and_degenerate_scales_have_gradients():
 
 
 def test_clamped_jacobian_bounds_the_footprint_beside_a_near_camera(float64):
-    """INRIA's is that of the point at 1.3 times half the field of view."""
+    """INRIA's Jacobian is that of the point at 1.3 times half the field of view."""
     ball = replace(
         few(random_gaussians(5), np.asarray([15])), deformations=None, scales=jnp.full((1, 3), 0.01)
     )
@@ -152,7 +153,7 @@ def test_reach_is_where_alpha_meets_its_threshold(float64):
 
 
 def test_gradient_along_the_long_axis_of_a_needle_is_accurate_in_float32():
-    """12 million pixels by 600.
+    """The needle has 12 million pixels by 600.
 
     Autodiff through the determinant makes the gradient along as large as that across.
     """

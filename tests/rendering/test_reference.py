@@ -1,6 +1,4 @@
-"""The reference against closed forms: one Gaussian, two behind each other, the rules at their
-thresholds.
-"""
+"""The reference renderer against closed forms: one Gaussian, two Gaussians, thresholds."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +10,7 @@ from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.reference import render_reference
 
 EXACT = 1e-12
-"""float64, a handful of operations."""
+"""Rounding of a handful of float64 operations."""
 
 FOCAL, SIZE = 10.0, 9
 
@@ -21,14 +19,14 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def axis_camera():
-    """The pixel (4, 4) of 9 x 9 lies on the axis."""
+    """Returns a camera of 9 x 9 pixels with the pixel (4, 4) on its axis."""
     return Camera(
         jnp.asarray([[FOCAL, 0, 4.5], [0, FOCAL, 4.5], [0, 0, 1.0]]), jnp.eye(4), SIZE, SIZE
     )
 
 
 def on_axis(depths, opacities, colors, scale=0.2):
-    """Four Gaussians (one shape, one compilation); those not asked for are transparent."""
+    """Returns four Gaussians on the axis, for one compiled shape; the rest is transparent."""
     n, more = 4, 4 - len(depths)
     depths, opacities, colors = (
         [*depths, *[9.0] * more],

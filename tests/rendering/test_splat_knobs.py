@@ -1,4 +1,4 @@
-"""What each knob of SplatConfig does to the image, the visibility of Gaussians."""
+"""What each field of SplatConfig does to the image, and the visibility of Gaussians."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.splatting import render, visible_gaussians
 
 FLOAT64 = 1e-9
-"""float64 rounding, relative to the largest entry."""
+"""Rounding of float64, relative to the largest entry."""
 
 SMALL = SplatConfig(block=4, chunk=4)
 
@@ -29,7 +29,7 @@ def knobs(**values):
 
 @pytest.mark.slow
 def test_visibility_is_the_largest_weight():
-    """With one color channel that only Gaussian i has, that channel is the weight of i."""
+    """A color channel that only Gaussian i has shows the weight of i."""
     with jax.enable_x64(True):
         gaussians = random_gaussians(3)
         weights = jax.vmap(
@@ -47,8 +47,9 @@ def test_visibility_is_the_largest_weight():
 
 
 def wall_before(gaussians):
-    """An opaque wall, in three layers, between one camera and the Gaussians; another camera looks
-    past it.
+    """Returns the Gaussians and an opaque wall of three layers before them.
+
+    One camera looks through the wall, another one past it.
     """
     n = 3
     wall = Gaussians(

@@ -1,5 +1,6 @@
-"""The tiled renderer against the reference, and as a JAX function: jit, vmap, grad, checkpoint,
-export, its buffers.
+"""The tiled renderer against the reference, and as a JAX function with buffers.
+
+JAX's transformations are jit, vmap, grad, checkpoint and export.
 """
 
 import dataclasses
@@ -28,31 +29,31 @@ from humangs_jax.rendering.splatting import SplatConfig, render, render_views
 from humangs_jax.rendering.tiling import TileGrid, count_pairs, footprints_by
 
 FLOAT64 = 1e-9
-"""Relative to the largest entry; float64 rounding, grown by the 1 / (1 - alpha) <= 1000 of the
-gradient.
+"""Rounding of float64, relative to the largest entry.
+
+The gradient has 1 / (1 - alpha) <= 1000.
 """
 
 FLOAT32, FLOAT32_GRADIENT = 1e-4, 5e-3
-"""float32 against float64; gradients relative to the largest entry, Gaussians at the near plane
-included.
+"""Errors of float32 against float64; those of gradients are relative to the largest entry.
+
+Gaussians at the near plane are included.
 """
 
 CHUNKS = SplatConfig(block=4, chunk=4)
-"""Several blocks, and several chunks of each, in a small image; also quick to compile."""
+"""A configuration with several blocks of several chunks in a small image; it compiles quickly."""
 
 VIEW = (HEIGHT, WIDTH)
 
 
 def loss_weights():
-    """The loss is a random linear function of everything a rendering holds, so no gradient can
-    hide.
-    """
+    """Returns weights of the loss, a random linear function of everything in a rendering."""
     rng = np.random.default_rng(7)
     return rng.normal(size=(*VIEW, 3)), rng.normal(size=VIEW), rng.normal(size=VIEW)
 
 
 def evaluate(draw, gaussians, view, background):
-    """Rendering, and gradients with respect to everything."""
+    """Returns (rendering, gradients with respect to all arguments)."""
     weights = loss_weights()
 
     def loss(gaussians, K, pose, background):
@@ -87,7 +88,7 @@ def background(dtype=np.float64):
 
 
 def assert_close(ours, expected, tolerance):
-    """Leaf by leaf, relative to the largest entry of the leaf (or to 1)."""
+    """Compares leaves, relative to the larger of 1 and the largest entry of the leaf."""
 
     def check(path, a, b):
         a, b = np.asarray(a), np.asarray(b)
@@ -113,7 +114,7 @@ def test_equals_the_reference_with_all_gradients(seed, functions):
 
 @pytest.mark.slow
 def test_features_are_drawn_beside_the_colors():
-    """With gradients of all, as the reference has them."""
+    """Gradients of all are those of the reference."""
     rng = np.random.default_rng(4)
     with jax.enable_x64(True):
         gaussians, view = random_gaussians(13), camera()
@@ -150,9 +151,7 @@ def test_an_image_in_bands_is_the_image(most):
 
 @pytest.mark.slow
 def test_gradients_are_derivatives():
-    """Central differences, with decisions that do not flip at this seed and no alpha at the
-    clamp.
-    """
+    """Expected are central differences; at this seed no decision flips and no alpha is clamped."""
     with jax.enable_x64(True):
         gaussians, step = random_gaussians(11), 1e-6
         gaussians = replace(gaussians, opacities=gaussians.opacities.at[:15].multiply(0.9))
@@ -255,7 +254,7 @@ def views(dtype=np.float32):
 
 @pytest.mark.slow
 def test_batches_of_subjects_and_views_equal_the_loop():
-    """Gradients of a sum over nested vmaps, through a checkpoint."""
+    """Gradients are of a sum over nested vmaps, through a checkpoint."""
     with jax.enable_x64(True):
         subjects, cameras = [random_gaussians(seed) for seed in (1, 2)], views(np.float64)
         draw = jax.checkpoint(lambda g, c, b: render(g, c, CHUNKS, b))
@@ -299,7 +298,7 @@ def test_render_views_equals_the_loop_and_fits_the_largest_view():
 
 
 def needed(gaussians, view):
-    """Pairs by the error message's number."""
+    """Returns the number of pairs that an error message asks for."""
     with pytest.raises(ValueError, match="max_pairs >= ") as error:
         render(gaussians, view, dataclasses.replace(CHUNKS, max_pairs=1))
     return int(str(error.value).split("max_pairs >= ")[1].split()[0])
@@ -365,7 +364,7 @@ def test_lowers_for_every_platform():
 
 @functools.partial(jax.jit, static_argnames=("camera_size",))
 def pairs_in(gaussians, view, camera_size):
-    """How many pairs there are, by a program for one size of image."""
+    """Returns the number of pairs in an image of this size."""
     projected = project_gaussians(gaussians, view)
     footprints = footprints_by(projected, gaussians.opacities, DEFAULT_CONFIG)
     return count_pairs(footprints, TileGrid(*camera_size, DEFAULT_CONFIG.tile_size))[1]

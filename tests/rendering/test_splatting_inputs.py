@@ -1,5 +1,6 @@
-"""What `render` and `render_views` say of inputs that they cannot draw, and that transformations
-are left alone.
+"""Errors of `render` and `render_views` for inputs that they cannot draw.
+
+JAX's transformations of these functions are not refused.
 """
 
 import jax

@@ -1,8 +1,7 @@
-"""Tile lists against plain numpy: the same pairs in the same order, whether the packed key fits or
-not.
+"""Tile lists against plain numpy: the same pairs in the same order, with either kind of key.
 
-And the pairs of splats against geometry by brute force: the least d^T cov^-1 d over every tile's
-rectangle of pixel centres.
+Pairs of splats are checked by brute force as well: the least d^T cov^-1 d over the rectangle of
+pixel centres of every tile.
 """
 
 import functools
@@ -101,7 +100,7 @@ def test_pixel_positions_are_those_of_the_image(width, height, tile_size):
 
 GRID = TileGrid(WIDTH, HEIGHT, 4)
 SAMPLES = 400
-"""Points per side of a rectangle in the brute force search."""
+"""Points along each side of a rectangle in the search by brute force."""
 
 
 @jax.jit
@@ -122,8 +121,9 @@ def count(footprints, grid):
 
 
 def least_distance(e, i, tile):
-    """min of d^T cov^-1 d over the tile's rectangle: 0 if the centre is inside, else on its
-    border.
+    """Returns the least d^T cov^-1 d over a tile's rectangle.
+
+    It is 0 if the centre is inside, and else on the border.
     """
     cov = np.asarray([[e.xx[i], e.xy[i]], [e.xy[i], e.yy[i]]], np.float64)
     low = np.asarray([tile % GRID.columns, tile // GRID.columns]) * GRID.tile_size + 0.5

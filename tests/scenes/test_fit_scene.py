@@ -1,6 +1,4 @@
-"""`fit_scene`: what it takes and refuses, that it learns, grows, stops and continues bit for
-bit.
-"""
+"""`fit_scene`: what it accepts and refuses; it learns, grows, stops and continues bit for bit."""
 
 import dataclasses
 

@@ -1,5 +1,6 @@
-"""The strategy of fixed numbers of Gaussians: what it moves where, that nothing changes its
-look, and unused slots.
+"""The strategy of a fixed number of Gaussians: where it moves them, and unused slots.
+
+Moves do not change the look of the scene.
 """
 
 import jax
@@ -26,7 +27,7 @@ from humangs_jax.scenes.steps import begin_scene, drawn_gaussians
 
 
 def paper(o, n):
-    """Equation 9, term by term, in float64."""
+    """Returns the paper's equation 9 term by term, in float64."""
     new = 1 - (1 - o) ** (1 / n)
     total = sum(
         comb(i - 1, k) * (-1) ** k * new ** (k + 1) / np.sqrt(k + 1)
@@ -55,7 +56,7 @@ def test_an_opaque_gaussian_and_many_copies_are_finite():
 
 
 def slots(opacities, used=None):
-    """Slots of round Gaussians in a row, 10 cm apart."""
+    """Returns (parameters, used) of round Gaussians in a row, 10 cm apart."""
     n = len(opacities)
     gaussians = Gaussians(
         jnp.stack([0.1 * jnp.arange(n, dtype=jnp.float32), jnp.zeros(n), jnp.zeros(n)], axis=-1),
@@ -115,8 +116,8 @@ def test_sources_are_chosen_by_their_opacity():
 
 
 def test_a_scene_looks_the_same_after_relocation():
-    """A Gaussian and its copies on one place: the ray through the middle is the same, those
-    beside it nearly.
+    """A Gaussian and its copies have one place: the ray through the middle has the same color, and
+    those beside it nearly.
     """
     parameters, used = slots([0.8, 0.001, 0.001, 0.001])
     K = jnp.asarray([[300.0, 0, 16], [0, 300.0, 16], [0, 0, 1]])

@@ -1,6 +1,4 @@
-"""Textured meshes of dressed people: atlas, baked textures, skinning by few joints, scans that are
-read back.
-"""
+"""Textured meshes of dressed people: atlas, textures, skinning by few joints, exported scans."""
 
 import dataclasses
 import json
@@ -19,13 +17,15 @@ from humangs_jax.synthetic.subject import SPLITS
 DEMO = SPLITS["demo"]
 SIZE = 512
 LEAST_DENSITY = 0.4
-"""Charts may shrink faces that look aside, to `atlas.LEAST_COSINE` along one direction; measured
-0.5 for the worst percent.
+"""Least area of a face in the texture over that on the body, but for the worst percent.
+
+Charts may shrink faces that look aside, to `atlas.LEAST_COSINE` along one direction. 0.5 was
+measured.
 """
 SKINNING = 1.5e-3
-"""Metres; measured 0.4 mm with six joints a vertex."""
+"""Largest error, metres; 0.4 mm was measured with six joints a vertex."""
 SCAN_PSNR = 32
-"""A texture of 5 mm texels against colors per pixel, dB; measured 37 or more."""
+"""Least PSNR of texels of 5 mm against colors of pixels, dB; at least 37 was measured."""
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def baked(person):
 
 @pytest.fixture(scope="module")
 def shown(baked):
-    """Face and weights of every texel."""
+    """Returns face and weights of every texel."""
     return atlas.texels(baked.atlas)
 
 

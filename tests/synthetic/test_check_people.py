@@ -1,4 +1,4 @@
-"""The scripts that look at people: faults are found where they are made, sheets are drawn."""
+"""The scripts that check people find planted faults and draw sheets."""
 
 import dataclasses
 

@@ -1,5 +1,6 @@
-"""People on the fly: banks of one split; examples that are a pure function of a key and agree with
-the body.
+"""People on the fly: banks of one split, and examples.
+
+An example is a pure function of a key and agrees with its body.
 """
 
 import dataclasses
@@ -33,21 +34,26 @@ SEEDS = (DEMO[0], DEMO[4])
 CONFIG = on_the_fly.OnTheFlyConfig(input_views=2, target_views=1, input_size=48, target_size=48)
 SIZE = 96
 SKIN_DEPTH = 1e-3
-"""Metres between bare skin and the body: fewer joints a vertex (0.4 mm)."""
+"""Largest distance of bare skin from the body, metres: few joints a vertex leave 0.4 mm."""
 SEEN_ALIKE = 0.99
-"""Share of bare-skin pixels where the body is as near: elsewhere skin under cloth, which the
-dressed mesh lacks, is in front.
+"""Least share of bare-skin pixels where the body is as near.
+
+Elsewhere skin under cloth, which the dressed mesh lacks, is in front.
 """
 MIRRORED = 0.96
-"""Share of the body's pixels inside the mask; left and right of the body differ by up to 5 mm,
-edges by a pixel.
+"""Least share of the body's pixels inside the mask.
+
+Left and right of the body differ by up to 5 mm, edges by a pixel.
 """
 NEARER = 0.85
-"""Of the distance to the clothes before: what is left of it where the body moved by more than 5 mm.
-Up to 2.5 cm may be left everywhere (`OffsetFitConfig.inset`). Measured: 0.66 and 0.75."""
+"""Largest remaining share of the distance to the clothes, where the body moved by over 5 mm.
+
+Up to 2.5 cm may remain everywhere (`OffsetFitConfig.inset`). 0.66 and 0.75 were measured.
+"""
 LIKE_RENDERED = 30
-"""PSNR against `render_view` in the same light, dB; textures of 1 cm texels, other normals at
-folds. Measured 34 or more.
+"""Least PSNR against `render_view` in the same light, dB; at least 34 was measured.
+
+Texels have 1 cm, and normals differ at folds.
 """
 
 
@@ -206,9 +212,7 @@ def test_it_looks_like_the_rendering_on_the_host(bank, scene, body):
 
 @pytest.mark.slow
 def test_bare_skin_is_where_the_body_is(bank, scene, body):
-    """Depth and position maps are the body's: where no cloth is, the picture shows that very
-    surface.
-    """
+    """Depth and position maps are the body's: where no cloth is, the picture shows that surface."""
     camera = draw(scene, bank, 1, 0.0, SIZE)
     fragments = rasterize(scene.vertices[0], bank.faces[scene.person].astype(jnp.int32), camera)
     ids = np.asarray(fragments.face_ids)
@@ -332,7 +336,7 @@ def test_dyes_leave_skin_alone_and_pieces_of_one_cloth_alike():
 
 
 def test_openness_is_how_empty_a_blurred_grid_is(bank, scene):
-    """Against scipy's box filter and interpolation."""
+    """Expected are scipy's box filter and interpolation."""
     from scipy.ndimage import map_coordinates, uniform_filter
 
     vertices, faces = np.asarray(scene.vertices[0]), bank.faces[scene.person].astype(jnp.int32)

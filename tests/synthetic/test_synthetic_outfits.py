@@ -1,4 +1,4 @@
-"""What people are and wear: descriptions, every kind of garment built, letters, light."""
+"""What people are and wear: descriptions, every kind of garment, letters, light."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,7 @@ from humangs_jax.synthetic.trimmings import EMBLEMS, bitmap, emblem, written
 
 DEMO = SPLITS["demo"]
 MILLIMETRES = 4e-3
-"""The stature is set by two vertices of the mean body; another one may be the highest."""
+"""Error of the stature: two vertices of the mean body set it, and another one may be highest."""
 
 
 @pytest.fixture(scope="module")

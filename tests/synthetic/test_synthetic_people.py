@@ -1,4 +1,4 @@
-"""Whole people: deterministic, dressed, in the frame, on the ground; and their capture folders."""
+"""Whole people are deterministic, dressed, in the frame, on the ground; folders of captures."""
 
 import jax
 import numpy as np
@@ -16,9 +16,9 @@ DEMO = SPLITS["demo"]
 SEEDS = [DEMO[i] for i in range(4)]
 SIZE = 96
 POKED = 0.01
-"""Share of a person's pixels where skin from under a hem may show: hems move in strong poses."""
+"""Largest share of a person's pixels with skin from under a hem: hems move in strong poses."""
 UNDER_CLOTH = 0.003
-"""Skin this far inside of a hem is meant to be covered, metres."""
+"""Distance from a hem at which skin has to be covered, metres."""
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def posed(people):
 
 @pytest.fixture(scope="module")
 def views(posed):
-    """For each person a batch of three cameras and the (images, masks) they take."""
+    """Returns for each person (three cameras, images, masks)."""
     result = []
     for i, p in enumerate(posed):
         rng = np.random.default_rng(i)
@@ -131,9 +131,7 @@ def test_hardly_any_skin_pokes_through(people, posed, views):
 
 
 def test_garments_move_with_the_pose(people):
-    """Raising the left thigh moves the cloth on the left thigh, and nothing on the head or the
-    right arm.
-    """
+    """Raising the left thigh moves the cloth on it, and none on the head or the right arm."""
     person = people[0]
     rotations = np.zeros((55, 3), np.float32)
     rest = person.posed_vertices(rotations, np.zeros(3))

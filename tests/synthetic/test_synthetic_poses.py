@@ -1,6 +1,4 @@
-"""The pose prior: limits, kinematics, soles on the ground, arms and legs clear of the body,
-hands.
-"""
+"""The prior of poses: limits, kinematics, soles on the ground, hands and limbs off the body."""
 
 import functools
 
@@ -25,12 +23,10 @@ from humangs_jax.synthetic.poses import (
 )
 
 CLOSE = 1e-4
-"""Metres or radians after 10 chained float32 rotations against float64."""
+"""Error of 10 chained float32 rotations against float64, metres or radians."""
 SEEDS = range(40)
 INSIDE = 0.012
-"""Share of the body's vertices inside another part, mean over poses: creases of armpits and groin
-are 0.7 % of them.
-"""
+"""Largest share of vertices inside another part, mean over poses; creases alone are 0.7 %."""
 
 
 @functools.cache
@@ -52,7 +48,7 @@ def drawn(build):
 
 @pytest.fixture(scope="module")
 def posed(body):
-    """Vertices (n, 3) of the mean body, without translation, for rotations (j, 3)."""
+    """Returns a function of rotations (j, 3) that gives the mean body's vertices (n, 3)."""
     rest = shape_body(body, jnp.zeros(0))
     pose = jax.jit(
         lambda rotations: pose_body(body, rest, BodyPose(rotations, jnp.zeros(3))).vertices
@@ -139,9 +135,7 @@ def test_legs_put_the_feet_where_they_are_to_be(x, z, yaw, pitch, lift, sink):
 
 
 def test_both_soles_are_on_the_ground(body, build, posed):
-    """Whatever the stance, the lowest points of both feet are at one height, unless one leg is
-    raised.
-    """
+    """The lowest points of both feet are at one height, unless one leg is raised."""
     part = np.asarray(body.skinning_weights).argmax(1)
     soles = [
         np.isin(part, (kin.Joint.LEFT_ANKLE + side, kin.Joint.LEFT_FOOT + side)) for side in (0, 1)
@@ -163,14 +157,15 @@ def test_both_soles_are_on_the_ground(body, build, posed):
 
 
 def test_hands_stay_clear_of_the_body(build, drawn):
-    """Forearms and hands lie outside of trunk, legs, head and the other arm in nearly all poses."""
+    """In nearly all poses forearms and hands lie outside of trunk, legs, head and the other arm."""
     clear = np.asarray([arm_clearance(build, rotations) for rotations in drawn])
     assert (clear < -0.01).mean() < 0.06
 
 
 def winding_numbers(points, vertices, faces):
-    """How often a mesh winds around each point: sum of the signed solid angles of its faces over 4
-    pi.
+    """Returns how often a mesh winds around each point.
+
+    This is the sum of the signed solid angles of its faces over 4 pi.
     """
     dot = lambda x, y: jnp.sum(x * y, axis=-1)
 
@@ -185,9 +180,9 @@ def winding_numbers(points, vertices, faces):
 
 @jax.jit
 def inside_itself(body, rotations):
-    """Which vertices lie inside of another part: 2 mm off along their normal.
+    """Returns which vertices lie inside of another part, 2 mm off along their normal.
 
-    Meshes are not quite closed (mouth, eyes).
+    Meshes are not quite closed at mouth and eyes.
     """
     vertices = pose_body(
         body, shape_body(body, jnp.zeros(0)), BodyPose(jnp.asarray(rotations), jnp.zeros(3))

@@ -1,4 +1,4 @@
-"""Sequences: smooth, within reach, feet that do not slide."""
+"""Sequences are smooth and within reach, and their feet do not slide."""
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +13,11 @@ from humangs_jax.synthetic.sequences import KINDS, sample_sequence
 FRAMES = 50
 CASES = [(kind, seed) for kind in KINDS for seed in (0, 1)]
 SLIDE = 1.2e-3
-"""Metres a frame (3.6 cm/s) that a planted sole may move: as a foot rolls, its round sole touches
-elsewhere.
+"""Largest move of a planted sole, metres a frame (3.6 cm/s): as a foot rolls, its round sole
+touches elsewhere.
 """
 SUNK = 5e-3
-"""Metres that a planted sole may be below the ground; the heel and the toes come up by more."""
+"""Largest depth of a planted sole below the ground, metres; heel and toes come up by more."""
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def drawn(build):
 
 @pytest.fixture(scope="module")
 def feet(body, drawn):
-    """Per case the vertices (m, 2, n, 3) of both feet."""
+    """Returns by case the vertices (m, 2, n, 3) of both feet."""
     part = np.asarray(body.skinning_weights).argmax(1)
     chosen = [np.flatnonzero(np.isin(part, (7 + side, 10 + side))) for side in (0, 1)]
     count = min(map(len, chosen))

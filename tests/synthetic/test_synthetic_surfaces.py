@@ -1,4 +1,4 @@
-"""Cuts, hems, silhouettes: the geometry under the garments."""
+"""Cuts, hems and silhouettes: the geometry under the garments."""
 
 import numpy as np
 import pytest
@@ -19,11 +19,11 @@ from humangs_jax.synthetic.surfaces import (
 )
 
 ROUNDING = 1e-5
-"""float32 sums of a few hundred numbers of size 1."""
+"""Rounding of float32 sums of a few hundred numbers of size 1."""
 
 
 def plane(rows=9, columns=12):
-    """The unit square in x and y, rows running down, seen from +z."""
+    """Returns the unit square in x and y, seen from +z, with rows that run down."""
     y, x = np.meshgrid(np.linspace(1, 0, rows), np.linspace(0, 1, columns), indexing="ij")
     vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1).astype(np.float32)
     weights = np.stack([vertices[:, 0], 1 - vertices[:, 0]], -1)

@@ -1,4 +1,4 @@
-"""Written sets: cameras of the protocol and close ones, resuming, processes, splits."""
+"""Written sets: the protocol's cameras and close ones, resuming, processes, splits."""
 
 import itertools
 import json
@@ -43,7 +43,7 @@ def folder(tmp_path_factory, body):
 
 
 def fast(monkeypatch, made=None):
-    """Writes folders with nothing but their seed: what is tested is who is written, not what."""
+    """Makes folders hold only their seed: tested is which people are written."""
 
     def write_person(folder, seed, body, layout):
         if made is not None:
@@ -242,7 +242,7 @@ def test_seeds_of_a_split_are_of_that_split_or_refused(split, first, count):
 
 
 def test_the_splits_share_no_seed():
-    """Ranges are intervals: what is not in order after sorting overlaps."""
+    """Splits are intervals: after sorting, overlaps are not in order."""
     ranges = sorted(SPLITS.values(), key=lambda r: r.start)
     assert all(a.stop <= b.start for a, b in itertools.pairwise(ranges))
     assert all(

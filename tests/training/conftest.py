@@ -1,4 +1,4 @@
-"""A body of 64 vertices and made-up captures of it: enough to train on in seconds."""
+"""A body of 64 vertices and made-up captures of it, on which training takes seconds."""
 
 import functools
 from unittest import mock
@@ -18,8 +18,9 @@ make_update = step.compiled_update.__wrapped__
 
 @functools.cache
 def quick_update():
-    """`compiled_update()` without LLVM's optimisations: 37 CPU seconds of compilation for `tiny`
-    instead of 74.
+    """Returns `compiled_update()` without LLVM's optimisations.
+
+    Compilation for `tiny` takes 37 CPU seconds instead of 74.
     """
     with mock.patch.dict(CPU_COMPILER_OPTIONS, {"xla_backend_optimization_level": 0}):
         return make_update()
@@ -27,7 +28,10 @@ def quick_update():
 
 @pytest.fixture(scope="module", autouse=True)
 def _compiled_quickly(request):
-    """Training steps are compiled quickly, unless a module says OPTIMIZED: most run a few times."""
+    """Compiles training steps without optimisations, unless a module defines OPTIMIZED.
+
+    Most steps run a few times only.
+    """
     if getattr(request.module, "OPTIMIZED", False):
         yield
         return
@@ -42,7 +46,7 @@ def body():
 
 @pytest.fixture(scope="session")
 def captures(body, tmp_path_factory):
-    """Folders of three subjects."""
+    """Returns the folders of three subjects."""
     root = tmp_path_factory.mktemp("captures")
     folders = [root / f"subject{i}" for i in range(3)]
     for i, folder in enumerate(folders):
@@ -52,8 +56,9 @@ def captures(body, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def variables():
-    """Fresh variables of `tiny`; without LLVM's optimisations the many small random draws compile
-    four times faster.
+    """Returns fresh variables of `tiny`.
+
+    Without LLVM's optimisations the many small random draws compile four times faster.
     """
     draw = jax.jit(
         init_humangs.__wrapped__,
@@ -65,7 +70,7 @@ def variables():
 
 @pytest.fixture
 def same():
-    """Whether two pytrees hold the same bits."""
+    """Returns a function that tells whether two pytrees hold the same bits."""
 
     def compare(a, b):
         assert jax.tree.structure(a) == jax.tree.structure(b)

@@ -1,4 +1,7 @@
-"""Checks that need eight devices, by name: python eight_devices.py a_linear_model."""
+"""Checks that need eight devices, by name.
+
+python eight_devices.py a_linear_model
+"""
 
 import dataclasses
 import sys
@@ -13,11 +16,11 @@ from jax.sharding import PartitionSpec
 from humangs_jax.training import sharding
 
 LOSSES = 1e-6
-"""Relative, float32 sums in another order."""
+"""Relative error of float32 sums in another order."""
 GRADIENTS = 1e-5
-"""Of the norm of all gradients, for most parameters."""
+"""Error relative to the norm of all gradients, for most parameters."""
 DECISIONS = 1e-2
-"""The same for all: rounding may decide otherwise whether a splat still reaches a pixel."""
+"""Error for the other ones: rounding may decide whether a splat still reaches a pixel."""
 
 
 def on_mesh(specs, mesh):
@@ -25,8 +28,9 @@ def on_mesh(specs, mesh):
 
 
 def a_linear_model():
-    """A state divided among 8 or 4 devices: values survive, the gradient of the mean is that of one
-    device.
+    """Divides a state among 8 or 4 devices.
+
+    Values come back, and the gradient of the mean is that of one device.
     """
     generator = np.random.default_rng(0)
     params = {
@@ -63,8 +67,11 @@ def a_linear_model():
 
 
 def a_training_step():
-    """Loss, gradients, batch statistics and metrics of 8 subjects on 8 devices, all dividing the
-    state or 4, are those of one device that works on all 8 at once."""
+    """Makes a step of 8 subjects on 8 devices, all of which or 4 divide the state.
+
+    Loss, gradients, batch statistics and metrics are those of one device that works on all 8 at
+    once.
+    """
     from training_cases import tube, write_subject
 
     from humangs_jax.data.loading import CaptureCache, CaptureSource, Loader

@@ -16,8 +16,9 @@ WITHOUT = {"no class token": {CLASS_TOKEN: False}}
 
 @pytest.fixture
 def trained(monkeypatch, tmp_path):
-    """The runs that were asked for; the score of one is its seed, and 1 more without the class
-    token and for seed 2.
+    """Replaces training; returns the list of the runs that were asked for.
+
+    The score of a run is its seed, and 1 more without the class token and for seed 2.
     """
     runs = []
 

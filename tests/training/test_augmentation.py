@@ -1,4 +1,4 @@
-"""Inputs of training with the faults of real captures."""
+"""Training inputs with the faults of real captures."""
 
 import dataclasses
 import functools
@@ -25,13 +25,13 @@ CONFIG = tiny()
 NOTHING = Augmentation(1.0, 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
 OTHER_MASKS = dataclasses.replace(NOTHING, mask_pixels=2)
 ROUNDING = 1e-6
-"""Of a few float32 operations on numbers up to 1."""
+"""Rounding of a few float32 operations on numbers up to 1."""
 VIEWS = 64
 
 
 @pytest.fixture(scope="module")
 def photos():
-    """Discs of random colors on white, with soft silhouettes."""
+    """Returns (images, masks) of discs of random colors on white, with soft silhouettes."""
     y, x = np.mgrid[:24, :24] - 11.5
     mask = np.clip(8.5 - np.hypot(x, y), 0, 1).astype(np.float32)
     colors = np.random.default_rng(0).random((VIEWS, 24, 24, 3), np.float32) * 0.8
@@ -99,7 +99,7 @@ def test_exposure_has_its_standard_deviation():
 
 
 def test_cameras_turn_about_the_person_wherever_it_stands(example):
-    """The posed pelvis stays where the photo shows it, also 5 m from the world's origin."""
+    """The posed pelvis stays at its pixel, also 5 m from the world's origin."""
     pelvis, views, settings = (
         np.float32([0.0, 0.9, 0.1]),
         example.inputs,
@@ -122,7 +122,7 @@ def test_cameras_turn_about_the_person_wherever_it_stands(example):
 
 
 def test_an_example_is_disturbed_by_one_draw_of_random_numbers(example, body):
-    """Each further draw of another shape costs 230 lines of program."""
+    """Each further draw of another shape adds 230 lines to the program."""
     settings = Augmentation(share=0.5)
     program = jax.make_jaxpr(lambda key: augmentation.augment(key, example, body, settings))
     assert str(program(jax.random.key(0))).count("random_bits[") == 1
@@ -166,8 +166,9 @@ def test_every_example_has_its_exposures_a_share_the_rest_and_targets_keep_photo
 
 
 def _check_one_gain_a_channel(images, before):
-    """Whole pixels of the person have the ratio of their photo, the background is as white as
-    before.
+    """Checks that a photo's person is multiplied by one gain in each channel.
+
+    The background stays as white as before.
     """
     for image, own, mask in zip(
         *map(np.asarray, (images, before.images, before.masks)), strict=True

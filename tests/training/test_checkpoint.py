@@ -1,4 +1,4 @@
-"""Checkpoints: bit for bit, the newest and the best, and never those of another run."""
+"""Checkpoints come back bit for bit: the newest and the best, and never those of another run."""
 
 import dataclasses
 import gc
@@ -23,7 +23,7 @@ from humangs_jax.training.config import tiny
 from humangs_jax.training.state import OptimizerConfig, TrainState, make_optimizer
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-"""Orbax leaves callbacks behind when a read fails."""
+"""Orbax leaves callbacks behind when reading fails."""
 
 
 LARGE = 300
@@ -86,7 +86,7 @@ def largest_file(step):
 
 
 def flip_a_bit(step):
-    """Of a number: only the checksum sees that."""
+    """Flips a bit of a number, which only the checksum detects."""
     file = largest_file(step)
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 4

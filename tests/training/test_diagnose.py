@@ -1,6 +1,4 @@
-"""Diagnosis of a step: its numbers are the step's, and what is planted in one place is named there
-and nowhere else.
-"""
+"""Diagnosis of a step: its numbers are the step's, and a planted fault is named at its place."""
 
 import dataclasses
 import functools
@@ -38,9 +36,9 @@ from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
 
 FLOAT32 = 1e-4
-"""Relative: the stages are fused otherwise than in the step."""
+"""Relative error: the stages are fused in another way than in the step."""
 BFLOAT16 = 2e-2
-"""The same in bfloat16."""
+"""Relative error in bfloat16."""
 CONFIG = tiny()
 
 
@@ -50,7 +48,7 @@ def batch(body, captures):
 
 
 def with_leaf(tree, path, change):
-    """The tree with the leaf of this path changed."""
+    """Returns the tree with the leaf of this path changed."""
     names = dict(inexact_leaves(tree))
     assert path in names, sorted(names)
     named = lambda p: jax.tree_util.keystr(p, simple=True, separator=".")
@@ -175,7 +173,7 @@ def test_moments_and_averages_are_looked_at(body, batch, variables):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*PIXELS, *DRIVEN])
 def test_networks_that_run_again_for_every_target_are_diagnosed(name):
-    """Traced only: every parameter's gradient belongs to a stage."""
+    """The network is only traced: every parameter's gradient belongs to a stage."""
     config = dataclasses.replace(CONFIG, model=small(name), target_size=SIZE)
     shapes = jax.eval_shape(lambda: init_state(config))
     example = Example(views(), views(seed=1))
@@ -208,7 +206,7 @@ nan_gradient.defvjp(
 
 
 class Network(nn.Module):
-    """Two layers; what lies between them spoils gradients."""
+    """A network of two layers, between which gradients become NaN."""
 
     @nn.compact
     def __call__(self, x):
@@ -217,8 +215,8 @@ class Network(nn.Module):
 
 
 def test_gradients_are_known_where_a_stage_takes_and_gives():
-    """Of modules by their path, and of a step beside the network, whose entries have their users
-    told apart.
+    """Stages are modules by their path, and a step beside the network, whose results have separate
+    gradients.
     """
 
     class Whole(nn.Module):

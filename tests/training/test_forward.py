@@ -1,4 +1,4 @@
-"""Gaussians drawn as a step of training sees them."""
+"""Gaussians drawn as a training step draws them."""
 
 import dataclasses
 
@@ -21,12 +21,12 @@ CONFIG = dataclasses.replace(tiny(), loss=dataclasses.replace(tiny().loss, disto
 
 
 def batched(tree):
-    """With a leading axis of one, as `vmap` makes it."""
+    """Returns the tree with a leading axis of one, as `vmap` makes it."""
     return jax.tree.map(lambda x: x[None], tree)
 
 
 def layered(seed=0):
-    """Translucent Gaussians in front of each other."""
+    """Returns translucent Gaussians in front of each other."""
     rng = np.random.default_rng(seed)
     places = [
         0.1 * rng.normal(size=COUNT),
@@ -62,8 +62,8 @@ def drawn_for_training(gaussians, targets):
 
 @pytest.mark.slow
 def test_the_spread_of_rays_does_not_depend_on_harmonics():
-    """It is that of the depths: drawn as a color, a depth would get harmonics added, and be cut at
-    0.
+    """The spread is that of depths: a depth that is drawn as a color would get harmonics, and be
+    cut at 0.
     """
     gaussians, targets = layered(), one_target()
     drawn = drawn_for_training(gaussians, targets)
@@ -83,9 +83,7 @@ def test_the_spread_of_rays_does_not_depend_on_harmonics():
 
 
 def test_without_harmonics_the_spread_is_what_it_was():
-    """The loss of weights that were trained with it: depths drawn as the first two channels of a
-    color.
-    """
+    """Weights were trained with it: depths were drawn as the first two channels of a color."""
     gaussians, targets = replace(layered(1), harmonics=None), one_target()
     drawn = drawn_for_training(gaussians, targets)
     z = gaussians.means[:, 2] - jnp.mean(gaussians.means[:, 2])

@@ -1,4 +1,4 @@
-"""Killed at any time, a run loses the steps since its last checkpoint and nothing else."""
+"""A run that is killed loses the steps since its last checkpoint, and nothing else."""
 
 import random
 import subprocess
@@ -17,8 +17,9 @@ def finished_checkpoints(out):
 
 
 def kill_in_a_checkpoint_write(arguments, out, delay):
-    """Start a run, wait until a checkpoint is being written, wait a little more, kill; the newest
-    checkpoint there was.
+    """Kills a run a little after a checkpoint began to be written.
+
+    Returns the newest checkpoint at that time.
     """
     process = subprocess.Popen(
         [*worker(), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

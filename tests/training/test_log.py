@@ -1,6 +1,4 @@
-"""The log: what a killed run wrote too much goes, what went wrong is reported, TensorBoard reads
-the same numbers.
-"""
+"""The log: a killed run's extra lines go, faults are reported, TensorBoard has the same numbers."""
 
 import json
 import re
@@ -25,7 +23,7 @@ def read(path):
 
 
 def tensorboard_events(folder):
-    """Events of all files, by the format of TFRecord: length, checksum, message, checksum."""
+    """Returns the events of all TFRecord files, each: length, checksum, message, checksum."""
     from tensorboardX.proto.event_pb2 import Event
 
     events = []
@@ -139,8 +137,10 @@ def test_a_bad_sample_is_named(tmp_path, body, captures, capsys):
 
 
 def watched(folder, steps, bad_samples=list, before=0):
-    """What the log has after `Watch` saw steps: number, skipped and nonfinite so far, loss, norm of
-    the gradient, and perhaps the (splat, tile) pairs without room.
+    """Returns the log after `Watch` saw steps.
+
+    A step is (number, skipped so far, nonfinite so far, loss, norm of the gradient), and perhaps
+    the number of (splat, tile) pairs without room.
     """
     names = ("skipped", "nonfinite", "loss", "grad_norm", "overflow")
     state = TrainState(

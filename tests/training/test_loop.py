@@ -1,5 +1,6 @@
-"""The loop: resume is bitwise, signals save, people it never saw are looked at, nothing is left out
-in silence.
+"""The training loop: resuming is bitwise, signals save, and unseen people are looked at.
+
+Nothing is left out without a message.
 """
 
 import dataclasses
@@ -31,7 +32,7 @@ def lines(out):
 
 @pytest.fixture(scope="module")
 def run(body, captures, variables):
-    """`train` on two of the captures, validated on the third."""
+    """Returns `train` on two of the captures, validated on the third."""
     options = {
         "training": captures[:2],
         "validation": captures[2:],
@@ -43,13 +44,13 @@ def run(body, captures, variables):
 
 @pytest.fixture(scope="module")
 def whole(run, tmp_path_factory):
-    """A run of four steps in one go, and its folder."""
+    """Returns (result, folder) of an uninterrupted run of four steps."""
     out = tmp_path_factory.mktemp("whole")
     return run(out, stop_at=4), out
 
 
 def losses(out):
-    """(step, loss) of every line, in order."""
+    """Returns (step, loss) of every line, in order."""
     return [(line["step"], line["loss"]) for line in lines(out) if "loss" in line]
 
 
@@ -123,7 +124,7 @@ def test_what_a_run_leaves_behind(whole):
 
 
 def quick(step=None):
-    """A step that computes nothing, and then does something else."""
+    """Returns a step that computes nothing and then calls `step` with its number."""
 
     def made(state, batch, body, config, networks, mesh):
         if step is not None:
@@ -136,7 +137,7 @@ def quick(step=None):
 
 @pytest.mark.parametrize(("at", "number"), [(1, signal.SIGINT), (3, signal.SIGTERM)])
 def test_a_signal_ends_a_run_when_all_is_saved(at, number, run, tmp_path, monkeypatch, caplog):
-    """Also one that comes in the last step, which is then done."""
+    """This holds for a signal in the last step, too, which is completed."""
     monkeypatch.setattr(
         loop, "train_step", quick(lambda done: done == at and signal.raise_signal(number))
     )

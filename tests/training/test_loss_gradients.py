@@ -1,5 +1,6 @@
-"""The gradient of every loss term against differences, in float64: relative error of derivatives in
-random directions.
+"""The gradient of every loss term against differences, in float64.
+
+Compared are derivatives in random directions, by relative error.
 """
 
 import dataclasses
@@ -16,18 +17,26 @@ from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.training.config import LossConfig, TrainConfig
 
 OWN = 1e-7
-"""Central differences of step h: h^2 of truncation and 1e-16 / h of rounding; terms with corners
-have some within a step.
+"""Largest relative error of terms alone.
+
+Central differences of step h have h^2 of truncation and 1e-16 / h of rounding. Some terms have
+corners within a step.
 """
 WHOLE = 1e-4
-"""Of thousands of pixels some cross a corner (an absolute value, a ReLU, a Gaussian's least alpha)
-within a step, and some Gaussians exchange places in the depth order."""
+"""Largest relative error through the network.
+
+Of thousands of pixels some cross a corner (an absolute value, a ReLU, a Gaussian's least alpha)
+within a step, and some Gaussians exchange places in the order of depths.
+"""
 NETWORKS = ("perceptual", "vgg16", "lpips")
 """Terms that need another network."""
 SIDE, TARGETS, VERTICES = 32, 2, 800
 STEP_SIZES = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9)
-"""Of central differences, relative to the size of what is varied. Thousands of Gaussians move:
-within the longer steps some exchange places in the depth order, and colors jump."""
+"""Steps of central differences, relative to the size of what is varied.
+
+Within longer steps some of thousands of Gaussians exchange places in the order of depths, and
+colors jump.
+"""
 TERMS = [
     each.name
     for each in dataclasses.fields(LossConfig)
@@ -37,14 +46,16 @@ PLAIN = [name for name in TERMS if name not in NETWORKS]
 
 
 def loss_of(names):
-    """A `LossConfig` with these terms and no others, for small images."""
+    """Returns a `LossConfig` with these terms and no others, for small images."""
     weights = dict.fromkeys(TERMS, 0.0) | dict.fromkeys(names, 1.0)
     return LossConfig(**weights, structural_scales=1, random_background=0.0)
 
 
 def agreement(values, point, names, directions=3, steps=STEP_SIZES):
-    """{term: relative error of its derivatives}. values: point -> {term: number}; differentiable.
-    point: a tree of float64.
+    """Returns {term: relative error of its derivatives} at a point.
+
+    `values` is a differentiable function of a point that gives {term: number}; a point is a tree of
+    float64.
     """
     vector = jax.jit(lambda point: jnp.stack([values(point)[name] for name in names]))
     gradient = jax.jit(jax.grad(lambda point, weights: jnp.dot(weights, vector(point))))

@@ -1,4 +1,4 @@
-"""The optimizer's groups, schedule and guard."""
+"""The optimizer's groups of parameters, schedule and guard."""
 
 import dataclasses
 import functools
@@ -121,7 +121,7 @@ def test_every_optimizer_by_name_goes_downhill_and_keeps_the_guard(name):
 
 @pytest.mark.parametrize("name", ["adamw", "nadamw", "lion", "lamb"])
 def test_elsewhere_than_on_a_cpu_the_steps_are_the_same_and_so_is_the_state(monkeypatch, name):
-    """A run that was begun on one kind of device goes on on the other."""
+    """A run that began on one kind of device continues on the other."""
     config = dataclasses.replace(CONFIG, name=name)
     generator = np.random.default_rng(0)
     gradients = [

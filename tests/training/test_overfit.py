@@ -1,7 +1,7 @@
-"""One subject, overfitted: what the network and its training are able to say at all.
+"""One overfitted subject shows how well network and training can reproduce a person at all.
 
-A synthetic person of the package, four photos of 128 x 128, which are inputs and targets alike. The
-network is small, has its upsampler, and starts from nothing.
+A synthetic person has four photos of 128 x 128, which are inputs and targets. The network is small,
+has its upsampler, and starts from fresh variables.
 """
 
 import dataclasses
@@ -28,10 +28,11 @@ from humangs_jax.training.step import train_step
 OPTIMIZED = True  # hundreds of steps
 SIZE, STEPS = 128, 280
 GOAL = 35.0
-"""dB, mean over the views."""
+"""Least mean PSNR over the views, dB."""
 CPU_SECONDS = 1200.0
-"""Limit, CPU seconds of all threads, with compilation: 342 on an idle machine, 814 beside three
-other programs.
+"""Most CPU seconds of all threads, with compilation.
+
+It took 342 on an idle machine and 814 beside three other programs.
 """
 
 

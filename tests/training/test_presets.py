@@ -1,5 +1,6 @@
-"""Every preset makes a step on all kinds of people that `humangs train` accepts: on disk, in a data
-set, made on the fly.
+"""Every preset makes a step on all people that `humangs train` accepts.
+
+These are people on disk, in a data set, and made on the fly.
 """
 
 import dataclasses
@@ -34,9 +35,7 @@ KINDS = ("captures", "data set", "mixture")
 
 
 def shrunk(name):
-    """The preset with its losses, conventions and schedule, and a network, views and bodies of the
-    smallest sizes.
-    """
+    """Returns the preset with its losses, conventions and schedule, at the smallest sizes."""
     config = fitting_losses(PRESETS[name](), NO_NETWORKS)
     parts = config.model.architecture
     upsampler = parts.encoder.upsampler and dataclasses.replace(parts.encoder.upsampler, hidden=8)
@@ -67,7 +66,7 @@ def shrunk(name):
 
 
 def with_depths(make):
-    """The same people with depths that are known."""
+    """Returns the same people with known depths."""
 
     class Known(CaptureSource):
         def example(self, *which):
@@ -86,12 +85,12 @@ def data_set(tmp_path_factory):
 
 
 MIXED = 1
-"""A step whose examples are of both kinds; those of step 0 all come from the first source."""
+"""A step whose examples are of both kinds; all those of step 0 come from the first source."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_default_preset_takes_people_of_every_kind(kind, captures, body, data_set, caplog):
-    """It compares depths, which people on disk do not have: a batch has them all the same, as 0."""
+    """It compares depths, which people on disk lack; in a batch theirs are 0."""
     people = captured_people(captures, body)
     if kind == "data set":
         people, _ = data_set
@@ -106,7 +105,7 @@ def test_the_default_preset_takes_people_of_every_kind(kind, captures, body, dat
 
 @pytest.fixture(scope="module")
 def mixture(tmp_path_factory):
-    """Two people on the fly and one on disk, and their body."""
+    """Returns (source of two people on the fly and one on disk, body)."""
     body, folder = load_body(), tmp_path_factory.mktemp("demo")
     save_capture(folder, load_capture("demo_capture").resized(SIZE))
     bank = build_bank(SPLITS["train"][:2], body, "train", texture_size=128, pose_count=2)

@@ -1,5 +1,6 @@
-"""A run that is interrupted and continued is the run that was not, on one device, on several, and
-of several processes.
+"""An interrupted and continued run equals one that was not interrupted.
+
+It runs on one device, on several, or in several processes.
 """
 
 import signal
@@ -15,12 +16,11 @@ from humangs_jax.training.checkpoint import Checkpoints
 from humangs_jax.training.state import init_state
 
 ACROSS = 1e-5
-"""Between arrangements of devices, whose sums run in other orders; parameters move by 1e-4 a step.
-"""
+"""Error between arrangements of devices, whose sums have other orders; a step moves by 1e-4."""
 
 
 def state_of(out, step):
-    """The checkpoint of a step, on this process's one device."""
+    """Returns the checkpoint of a step, on this process's one device."""
     checkpoints = Checkpoints(out / "checkpoints")
     state = checkpoints.restore(init_state(configuration()), step)
     checkpoints.close()

@@ -1,4 +1,4 @@
-"""How much room for (splat, tile) pairs a step of training has."""
+"""How much room for (splat, tile) pairs a training step has."""
 
 import dataclasses
 import inspect
@@ -28,8 +28,9 @@ CONFIG = tiny()
 
 @pytest.fixture
 def measured(monkeypatch, body):
-    """f(rows, pairs, config) -> the configuration where the targets need so many, a step has usual
-    room for 4000, and that is worth measuring.
+    """Returns a function (rows, pairs, config) -> configuration for targets that need so many.
+
+    The usual room is 4000, and any measurement is worth its time.
     """
     monkeypatch.setattr(room, "usual_room", lambda config, body: 4000)
     monkeypatch.setattr(room, "WORTH", 1)
@@ -86,7 +87,7 @@ def test_the_need_is_that_of_the_most_demanding_target(body, captures):
 
 @pytest.mark.slow
 def test_more_room_changes_no_bit_of_an_image_and_its_gradient():
-    """A run that goes on measures anew, and has to take the steps that it would have taken."""
+    """A resumed run measures again, and must make the same steps."""
     generator = np.random.default_rng(0)
     camera = Camera(jnp.asarray([[40.0, 0, 16], [0, 40, 16], [0, 0, 1]]), jnp.eye(4), 32, 32)
     gaussians = Gaussians(

@@ -1,5 +1,6 @@
-"""Divided states: what is gathered is whole, gradients come back as parts of the mean, eight
-devices agree with one.
+"""Divided states: gathered ones are whole, and gradients come back as parts of the mean.
+
+Eight devices agree with one.
 """
 
 import inspect
@@ -46,7 +47,7 @@ def test_a_mesh_of_what_does_not_divide_is_refused():
 
 
 def test_gradients_are_means_over_all_devices_whichever_hold_the_parts():
-    """Four devices, two by two, as nested maps with the names of a mesh's axes."""
+    """Four devices, two by two, are nested maps with the names of a mesh's axes."""
     gradients = jnp.asarray(
         np.random.default_rng(0).normal(size=(2, 2, 3, 4)), jnp.float32
     )  # data, fsdp, rows, columns
@@ -67,7 +68,7 @@ def test_gradients_are_means_over_all_devices_whichever_hold_the_parts():
 
 
 def on_eight_devices(name):
-    """Run a function of eight_devices.py in a process that has eight."""
+    """Runs a function of eight_devices.py in a process that has eight devices."""
     finished = subprocess.run(
         [sys.executable, str(EIGHT_DEVICES), name],
         capture_output=True,

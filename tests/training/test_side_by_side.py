@@ -1,4 +1,4 @@
-"""What an accelerator does side by side, and this CPU one after the other, is the same."""
+"""What an accelerator does side by side equals what this CPU does one after the other."""
 
 import dataclasses
 
@@ -21,7 +21,8 @@ CONFIG = dataclasses.replace(
     augmentation=Augmentation(share=0.5),
 )
 ROUNDING = 1e-4
-"""Of the length of a gradient: sums of float32 in another order, through a random network."""
+"""Error relative to a gradient's length: float32 sums in another order, through a random network.
+"""
 
 
 def gradients_of(state, body, batch):

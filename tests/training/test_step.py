@@ -1,4 +1,4 @@
-"""The training step: terms, backgrounds, gradients, and what a bad batch may do."""
+"""The training step: terms, backgrounds, gradients, and effects of a bad batch."""
 
 import dataclasses
 import functools
@@ -87,7 +87,7 @@ def test_it_draws_the_avatars_that_reconstruct_makes(body, source, variables):
 
 
 def losses_of(config):
-    """All terms of the loss, weighted, from the metrics of a step."""
+    """Returns a function of a step's metrics that gives the sum of all weighted terms."""
     weights = dataclasses.asdict(config.loss)
     return lambda metrics: sum(
         weights[name] * float(metrics[name]) for name in weights if name in metrics
@@ -256,8 +256,9 @@ PLAIN = dataclasses.replace(
 
 @pytest.fixture
 def plain_update(monkeypatch):
-    """f(state, loss) -> the state after `update` with a gradient of 1 and statistics that are
-    larger by 1, and the keys that it gave to the subjects of a batch of 2.
+    """Returns a function (state, loss) -> (state after `update`, keys of a batch of 2 subjects).
+
+    The gradient is 1, and statistics grow by 1.
     """
 
     def updated(state, loss=0.0):
@@ -291,7 +292,7 @@ def test_every_step_and_every_subject_has_random_numbers_of_its_own(plain_update
 
 
 def test_the_average_forgets_where_it_started(plain_update):
-    """A decay of 0.99 alone would keep 90 % of the start after 10 steps."""
+    """With a decay of 0.99 alone, 90 % of the start would remain after 10 steps."""
     state = replace(
         init_state(PLAIN, {"params": {"x": jnp.full(1, 100.0)}, "batch_stats": {}}),
         params={"x": jnp.zeros(1)},
@@ -329,7 +330,7 @@ def test_a_gradient_is_the_mean_over_subjects_whatever_the_microbatch(monkeypatc
 
 
 def test_augmentation_and_backgrounds_do_not_share_random_numbers(monkeypatch, source, body):
-    """Or the color of the background would tell how the photos were disturbed."""
+    """Else the color of the background would tell how the photos were disturbed."""
     keys = {}
     take = lambda name, value: (
         lambda key, *_: keys.update({name: jax.random.key_data(key)}) or value

@@ -1,6 +1,4 @@
-"""The comparison systems overfit to one person, by the same training step as the paper's
-network.
-"""
+"""The comparison systems overfit to one person with the training step of the paper's network."""
 
 import dataclasses
 

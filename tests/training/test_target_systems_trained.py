@@ -1,5 +1,6 @@
-"""Systems that run again for every target learn one person by the same loop, losses, validation and
-evaluator as all others.
+"""Systems that run again for every target learn one person.
+
+Loop, losses, validation and evaluator are those of all systems.
 """
 
 import dataclasses
@@ -26,10 +27,11 @@ from humangs_jax.training.step import train_step
 
 STEPS, VIEWS, SIZE = 80, 4, 32
 MORE_STEPS = {"lca": 240}
-"""Points that attend to tokens learn slowly."""
+"""Steps of systems whose points attend to tokens, which learn slowly."""
 FALL = 2.0
-"""Least factor by which the squared error falls; measured: lvsm 4.9, humanram 4.2, giga 4.6,
-animatable 3.4, lca 2.9.
+"""Least factor by which the squared error falls.
+
+Measured: lvsm 4.9, humanram 4.2, giga 4.6, animatable 3.4, lca 2.9.
 """
 
 

@@ -1,5 +1,6 @@
-"""What no run should die of: nothing to see, one view, one Gaussian per vertex, Gaussians far away,
-bad photos, wild rates.
+"""Extremes that must not end a run: nothing to see, one view, distant Gaussians, bad photos.
+
+Others are one Gaussian on each vertex and very high learning rates.
 """
 
 import dataclasses
@@ -17,7 +18,7 @@ from humangs_jax.training.step import train_step
 
 CONFIG = tiny()
 OUTSIDE = 100.0
-"""Metres that take any subject out of any image."""
+"""Metres that move any subject out of any image."""
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +31,7 @@ def finite(tree):
 
 
 def step_without_harm(state, batch, body, config=CONFIG):
-    """The state and metrics after one more step that had nothing to repair or to skip."""
+    """Returns (state, metrics) after another step, which had nothing to repair or skip."""
     before = int(state.opt_state.skipped)
     state, metrics = train_step(state, batch, body, config)
     metrics = {name: float(value) for name, value in metrics.items()}
@@ -40,8 +41,9 @@ def step_without_harm(state, batch, body, config=CONFIG):
 
 
 def without_person(views, which):
-    """Views (leading axis of subjects) of which some show background alone: nobody in the photo,
-    the body beside it.
+    """Returns the views, of which those of `which` show background alone.
+
+    The body stands beside these photos. The leading axis is that of subjects.
     """
     cameras = views.cameras
     return replace(
@@ -113,7 +115,7 @@ def test_black_photos_and_masks_that_cover_all(body, batch, variables):
     [("inputs", np.nan), ("targets", np.inf), ("inputs", 1e30), ("targets", 1e30)],
 )
 def test_a_bad_photo_costs_its_step_and_the_run_goes_on(body, batch, variables, views, value, same):
-    """A pixel of the person, so that the network sees it."""
+    """The bad pixel is one of the person, so that the network sees it."""
     row, column = np.argwhere(np.asarray(getattr(batch, views).masks[0, 0]) > 0.9)[0]
     shown = getattr(batch, views)
     bad = replace(
@@ -138,8 +140,9 @@ def test_a_bad_photo_costs_its_step_and_the_run_goes_on(body, batch, variables, 
 
 
 def with_geometry(state, free_offset=0.0, log_scale=None):
-    """A state whose free Gaussians start at an offset from their vertex, and all of them at a scale
-    (its softplus).
+    """Returns a state whose free Gaussians start at an offset, and all of them at a scale.
+
+    The offset is from the vertex; `log_scale` goes through a softplus.
     """
     bias = state.params["decoder"]["geometry_out"]["bias"]
     rows = bias.reshape(-1, 10)
@@ -187,7 +190,7 @@ def test_one_view(body, captures):
 
 @pytest.mark.slow
 def test_hundreds_of_free_gaussians_per_vertex_far_away(body, batch):
-    """Without a bound on offsets; near, in the distance, beyond float32's squares, and back."""
+    """Offsets have no bound: near, distant, beyond float32's squares, and near again."""
     config = decoder_of(tight=1, free=200, offset_scale=None)
     for offset in (0.0, 10.0, 1e4, 1e12, 1e25):
         state = with_geometry(init_state(config), free_offset=offset)

@@ -1,5 +1,6 @@
-"""Validation: the same views every time, as many as in the middle of the training's counts, and how
-they are laid out.
+"""Validation uses the same views every time, as many as the middle of training's counts.
+
+It also tests how they are laid out.
 """
 
 import dataclasses

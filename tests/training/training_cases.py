@@ -1,6 +1,4 @@
-"""A body of 64 vertices, made-up captures of it, and what runs on them: enough to train on in
-seconds.
-"""
+"""A body of 64 vertices, made-up captures of it, and what runs on them within seconds."""
 
 import dataclasses
 
@@ -20,7 +18,7 @@ SIDES, RINGS, SIZE, VIEWS, POSES = 8, 8, 32, 6, 2
 
 
 def without_upsampler(model):
-    """The network whose vertices read the token maps themselves."""
+    """Returns the network without upsampler: vertices read the token maps."""
     encoder, reader, _ = paper_parts(model.architecture)
     return model.with_parts(
         encoder=dataclasses.replace(encoder, upsampler=None),
@@ -29,7 +27,7 @@ def without_upsampler(model):
 
 
 def tube():
-    """An upright tube of 1.6 m that bends in the middle, with one shape direction: its girth."""
+    """Returns an upright tube of 1.6 m that bends in the middle; its shape direction is girth."""
     height = np.repeat(np.linspace(-0.8, 0.8, RINGS), SIDES)
     angle = np.tile(np.arange(SIDES) * 2 * np.pi / SIDES, RINGS)
     around = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
@@ -56,8 +54,9 @@ def tube():
 
 
 def draw_points(points, colors, camera):
-    """Points painted far to near into an image on white, with its mask; numpy, so that nothing
-    needs compiling.
+    """Returns (image on white, mask) of points painted from far to near.
+
+    It is in numpy, so that nothing needs compiling.
     """
     K, cam_from_world = np.asarray(camera.K), np.asarray(camera.cam_from_world)
     seen = points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
@@ -111,7 +110,7 @@ def write_subject(path, body, seed):
 
 @dataclasses.dataclass(frozen=True)
 class Spoilt(CaptureSource):
-    """Captures of which one example is not finite, and another one not in [0, 1]."""
+    """Captures of which one example is not finite, and another one is not in [0, 1]."""
 
     spoilt_at: int = -1
     bright_at: int = -1
@@ -136,7 +135,7 @@ def batch_of(body, captures, config, step=0):
 
 
 def random_networks():
-    """VGG-19, and LPIPS over VGG-16."""
+    """Returns random loss networks: VGG-19, and LPIPS over VGG-16."""
     from experiments.training import (
         random_weights,
     )  # not on the path of the programs that tests start

@@ -1,4 +1,4 @@
-"""Runs of `training_worker.py` in other processes."""
+"""Runs `training_worker.py` in other processes."""
 
 import contextlib
 import json
@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 SECONDS = 900
-"""Longest that a run of a few steps may take on a loaded machine, compilation included."""
+"""Most seconds of a run of a few steps on a loaded machine, with compilation."""
 
 
 def worker():
@@ -16,7 +16,7 @@ def worker():
 
 
 def run(*arguments):
-    """One process, to its end."""
+    """Runs one process to its end."""
     finished = subprocess.run(
         [*worker(), *map(str, arguments)],
         capture_output=True,
@@ -29,8 +29,9 @@ def run(*arguments):
 
 @contextlib.contextmanager
 def several(count, *arguments):
-    """So many processes that train together, as `Popen`s whose output can be read; killed on the
-    way out.
+    """Yields processes that train together, as `Popen`s whose output can be read.
+
+    They are killed at the end.
     """
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -55,7 +56,7 @@ def several(count, *arguments):
 
 
 def run_several(count, *arguments):
-    """All of them, to their end."""
+    """Runs several processes to their end."""
     with several(count, *arguments) as processes:
         outputs = [process.communicate(timeout=SECONDS)[0] for process in processes]
         assert [process.returncode for process in processes] == [0] * count, "\n".join(outputs)
@@ -66,7 +67,7 @@ def lines(out):
 
 
 def losses(out):
-    """Step -> loss, each step once."""
+    """Returns {step: loss}; each step occurs once."""
     found = [
         (line["step"], line["loss"])
         for line in lines(out)

@@ -1,8 +1,9 @@
-"""Trains `tiny` on made-up captures in a new process, alone or as one of several; prints
-"ready" before the first step.
+"""Trains `tiny` on made-up captures in a new process, alone or as one of several.
 
-python training_worker.py OUT CAPTURES --stop-at 4 [--devices 4] [--coordinator localhost:1234
---processes 2 --process 0]
+It prints "ready" before the first step.
+
+python training_worker.py OUT CAPTURES --stop-at 4
+    [--devices 4] [--coordinator localhost:1234 --processes 2 --process 0]
 """
 
 import argparse
@@ -15,8 +16,10 @@ import jax
 
 
 def configuration(checkpoint_every=1, batch_size=4, at_once=1, learning_rate=1e-4):
-    """`tiny`, with a batch for several devices, and no upsampler: what stands before a batch norm
-    has no gradient but rounding errors, which Adam makes large."""
+    """Returns `tiny` without upsampler, with a batch for several devices.
+
+    What stands before a batch norm has only rounding errors as gradient, which Adam makes large.
+    """
     from training_cases import without_upsampler
 
     from humangs_jax.training.config import tiny

@@ -1,7 +1,7 @@
-"""The page in a browser: its images against `hg.render`, motions dropped onto it, its controls.
-Software WebGL.
+"""The page in a browser with software WebGL.
 
-On Debian: `apt-get install chromium chromium-driver`.
+Its images are compared with `hg.render`; motions are dropped onto it; controls are used. On Debian:
+`apt-get install chromium chromium-driver`.
 """
 
 import base64
@@ -31,11 +31,15 @@ pytestmark = [
 ]
 
 WHOLE, PERSON = 55.0, 48.0
-"""dB. Asked for are 38 and 30; measured 65 and 56, which is what 8 bits of the screenshot leave (10
-log10(12 255^2) = 58.9 where there is anything to round)."""
+"""Least PSNR of the whole image and of the person, dB.
+
+38 and 30 are required; 65 and 56 were measured, as 8 bits of the screenshot allow (10 log10(12
+255^2) = 58.9 where there is something to round).
+"""
 SIZE = 384
 ANGLE = 2e-3
-"""Radians: motions are stored in steps of a ten thousandth, and a chain of joints adds them up."""
+"""Largest error, radians: motions have steps of a ten thousandth, which a chain of joints adds up.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -99,9 +103,7 @@ def test_the_page_asks_for_nothing(browser):
 
 
 def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
-    """The taller person's joints are where the body model has them, and the person stands on the
-    floor.
-    """
+    """The taller person's joints are the body model's, and the person stands on the floor."""
     browser.run("""document.querySelector("[data-mode=rest]").click();
         document.querySelector("#shape-section details").open = true;
         const slider = document.querySelector("#shape input[title=height]");
@@ -127,7 +129,7 @@ def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
 
 
 def content_height(browser):
-    """Pixels between the highest and lowest point of the person, left of the panel."""
+    """Returns pixels between the highest and the lowest point of the person, left of the panel."""
     image = browser.screenshot()[:, :980]
     colorful = np.ptp(image, axis=-1) > 0.15
     rows = np.flatnonzero(colorful.any(axis=1))
@@ -192,7 +194,7 @@ def test_keys_and_mouse_do_what_the_help_says(browser):
 
 
 def drop(browser, name, content):
-    """Drops a file; returns the page's words about it."""
+    """Drops a file onto the page; returns the page's message."""
     return browser.run(
         """const bytes = Uint8Array.from(atob(given[1]), (c) => c.charCodeAt(0));
         const data = new DataTransfer();
@@ -208,7 +210,7 @@ def drop(browser, name, content):
 
 
 def shown_pose(browser, frame):
-    """Rotations and translation of a whole frame of the motion on the page."""
+    """Returns (rotations, translation) of a whole frame of the motion on the page."""
     view = browser.run(
         """document.querySelector("[data-mode=motion]").click();
         const scrub = document.getElementById("scrub");
@@ -239,7 +241,7 @@ def random_motion(frames=4, columns=165, seed=3):
 
 
 def test_a_dropped_npz_is_read_as_python_reads_it(browser, avatar, tmp_path):
-    """The other formats: test_page_motions.py."""
+    """test_page_motions.py tests the other formats."""
     poses, trans = random_motion()
     content = npz(
         poses=np.asfortranarray(poses[:, :156] * 0.3), trans=trans.astype("f4"), mocap_frame_rate=60
@@ -261,7 +263,7 @@ BODY = tuple(name for name in JOINT_NAMES if name in CMU)
 
 
 def bone_directions(avatar, rotations):
-    """Unit vectors from each body joint to its children, by name."""
+    """Returns unit vectors from each body joint to its children, by name."""
     pose = BodyPose(jnp.asarray(rotations, jnp.float32), jnp.zeros(3))
     transforms = joint_transforms(avatar.rest_joints, PARENTS, pose.rotations, pose.translation)
     joints = np.asarray(transform.apply(transforms, avatar.rest_joints))

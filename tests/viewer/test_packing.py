@@ -1,4 +1,4 @@
-"""The avatar in 16-bit arrays: what the page reads is the avatar, to the step of its numbers."""
+"""The avatar in 16-bit arrays: the page reads the avatar, up to the step of its numbers."""
 
 import gzip
 
@@ -20,11 +20,11 @@ from humangs_jax.viewer import page as packing
 
 STEP = 1 / 65535
 HALF = 0.5 * (1 + 1e-6)
-"""A rounded number is half a step off at most; the rest is for rounding in float64."""
+"""Largest error in steps: half a step, and a margin for float64."""
 
 
 def unpack(packed):
-    """The arrays by name, as the page reads them."""
+    """Returns the arrays by name, as the page reads them."""
     entries = packed.header["arrays"].items()
     read = lambda e: np.frombuffer(
         packed.data, e["type"], int(np.prod(e["shape"])), e["offset"]
@@ -33,7 +33,7 @@ def unpack(packed):
 
 
 def decoded(packed):
-    """What the page makes of the arrays: dequantized as scene.js and project.frag do."""
+    """Returns the arrays dequantized, as scene.js and project.frag do it."""
     arrays, header = unpack(packed), packed.header
     spread = lambda name: (
         np.asarray(header[name]["low"])

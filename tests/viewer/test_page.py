@@ -1,6 +1,6 @@
 """The page as a file, on localhost and in a notebook; the commands that make it.
 
-What it draws: test_browser.py.
+test_browser.py tests what it draws.
 """
 
 import html
@@ -68,8 +68,8 @@ def test_a_joint_may_have_any_name():
 
 
 def test_shape_sliders_come_with_the_shipped_body_and_vertex_major_gaussians():
-    """Also where those between the legs have other weights; not where refinement has added
-    Gaussians.
+    """They also come if Gaussians between the legs have other weights; not if refinement added
+    some.
     """
     body, each = load_body(), 3
     rest = shape_body(body, jnp.zeros(body.shape_directions.shape[-1]))

@@ -1,6 +1,4 @@
-"""The face in the page: what is packed, and that its script moves Gaussians as `hg.animate`
-does.
-"""
+"""The face in the page: what is packed; its script moves Gaussians as `hg.animate` does."""
 
 import json
 import shutil

@@ -1,6 +1,4 @@
-"""What people do with the page in a browser: save, record, ask for help, embed it; and where it
-cannot work.
-"""
+"""Uses of the page in a browser: save, record, ask for help, embed; and browsers it cannot use."""
 
 import base64
 import io
@@ -32,7 +30,7 @@ const addressOf = URL.createObjectURL.bind(URL);
 URL.createObjectURL = (blob) => { window.saved.push({ blob }); return addressOf(blob); };
 HTMLAnchorElement.prototype.click = function () { window.saved.at(-1).name = this.download; };
 """
-"""Runs before the page: files that it saves are kept instead."""
+"""Script that runs before the page and keeps files that the page saves."""
 NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null;"
 NO_RECORDER = "delete window.MediaRecorder;"
 OLD = "delete window.DecompressionStream;"
@@ -40,7 +38,7 @@ CONTROLS = ("panel", "transport", "show-help", "toggle-panel", "about")
 
 
 def ball_person():
-    """A red ball of a metre above the floor: what covers it, and where it is, can be seen."""
+    """Returns a red ball a metre above the floor, whose place and cover can be seen."""
     avatar = small_avatar(per_vertex=32)
     directions = np.random.default_rng(0).normal(size=avatar.gaussians.means.shape)
     means = 0.4 * directions / np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -96,7 +94,7 @@ def before_the_page(browser, script):
 
 
 def saved(browser, button):
-    """Name and content of the file that the page saves after a click."""
+    """Returns name and content of the file that the page saves after a click."""
     name, content = browser.run(
         """saved.length = 0;
         document.getElementById(given[0]).click();
@@ -128,7 +126,7 @@ def redness(image):
 
 
 def middle_of_the_ball(image):
-    """Column and row, as shares of the image."""
+    """Returns (column, row) of the ball's middle, as shares of the image."""
     rows, columns = np.nonzero(redness(image) > 0.3)
     return (columns.min() + columns.max() + 1) / 2 / image.shape[1], (
         rows.min() + rows.max() + 1
@@ -144,7 +142,7 @@ def visible(browser, ids):
 
 
 def lower_the_resolution(browser):
-    """Play as on a machine that is too slow, until the page has halved its resolution."""
+    """Plays as on a slow machine until the page halves its resolution; returns its size."""
     return browser.run(
         """const canvas = document.getElementById("view");
         const slow = (time) => { while (performance.now() < time); };
@@ -199,7 +197,7 @@ def test_images_may_be_twice_as_large_and_transparent_with_the_person_in_the_mid
 
 
 def frames_of(video):
-    """The frames (n, HEIGHT, WIDTH, 3); fails if they have another size."""
+    """Returns the frames (n, HEIGHT, WIDTH, 3) of a video; fails if they have another size."""
     import imageio_ffmpeg
 
     arguments = [
@@ -286,7 +284,11 @@ def test_a_click_opens_the_help(browser, size):
 
 
 def wait_for(browser, condition):
-    """Until a JavaScript expression is true. Raises: TimeoutException."""
+    """Waits until a JavaScript expression is true.
+
+    Raises:
+        TimeoutException: after a minute.
+    """
     from selenium.webdriver.support.ui import WebDriverWait
 
     WebDriverWait(browser.driver, 60).until(lambda driver: browser.run(f"return {condition}"))
@@ -350,7 +352,10 @@ def test_a_motion_without_a_rate_is_a_question_not_an_end(browser, size):
 
 @pytest.fixture
 def embedded(shared, file, tmp_path):
-    """Opens a blue page with the page in it; returns what runs a script in the latter."""
+    """Yields a function that opens a blue page with the page in it.
+
+    It returns a function that runs a script in the inner page.
+    """
 
     def open_(query, size=(WIDTH - 100, HEIGHT - 100)):
         outer = tmp_path / "outer.html"

@@ -1,5 +1,6 @@
-"""The page's own readers of motions against Python's, on the same files: node runs the scripts as
-they are put into the page.
+"""The page's readers of motions against Python's, on the same files.
+
+node runs the scripts as they are put into the page.
 """
 
 import functools
@@ -27,9 +28,9 @@ from humangs_jax.viewer.page import page_script
 NODE = shutil.which("node")
 pytestmark = pytest.mark.skipif(NODE is None, reason="needs node (nodejs.org)")
 EXACT = 1e-5
-"""Entries of rotation matrices and metres: float32, and BVH's eight decimals."""
+"""Error of rotation matrices and metres in float32 and with BVH's eight decimals."""
 HOW_TO_CHANGE = ", which --motion-fps (in Python fps=) changes"
-"""Python alone adds this: the page has a field for it."""
+"""Text that only Python adds: the page has a field for it."""
 PROGRAM = """
 const given = JSON.parse(require("fs").readFileSync(0, "utf8")), { scene } = given;
 scene.order = jointOrder(scene.parents);
@@ -48,10 +49,10 @@ scene.order = jointOrder(scene.parents);
 
 
 def page_reads(files, names=JOINT_NAMES, parents=PARENTS, rest=None):
-    """What the page makes of files, [(name, bytes)]; frames per second and the index of the clip
-    may follow.
+    """Returns the motions that the page reads from files [(name, bytes)], as JSON.
 
-    Motions as JSON, or {"error": ..., "asksRate": ...}.
+    Frames per second and the index of the clip may follow the bytes. An error is {"error": ...,
+    "asksRate": ...}.
     """
     import base64
 
@@ -89,8 +90,9 @@ def dance(frames=4, names=MIXAMO, seed=0):
 
 
 def other_person():
-    """Longer shins, shorter thighs, wider hips; the lowest joint of the spine lies in the
-    pelvis.
+    """Returns joints of another person: longer shins, shorter thighs, wider hips.
+
+    The lowest joint of the spine lies in the pelvis.
     """
     rest, stretch = (
         shipped_joints(),
@@ -178,7 +180,10 @@ def skeletons():
 
 
 def array_files():
-    """Every format that the page knows, and people on the floor in worlds with y, z and -y up."""
+    """Returns arrays of every format that the page knows, by name.
+
+    They include people on the floor in worlds with y, z and -y up.
+    """
     rng = np.random.default_rng(0)
     poses, trans = rng.normal(0, 0.3, (4, 165)), rng.normal(0, 0.2, (4, 3))
     # random poses by the names of every data set
@@ -259,8 +264,9 @@ def array_files():
 
 
 def glb_files(folder):
-    """Skeletons as programs write them: below a turned node in centimetres, keys of all kinds,
-    names of VRM, no skin.
+    """Yields (name, file) of skeletons as programs write them.
+
+    Among them are a turned node in centimetres, keys of all kinds, and VRM's names.
     """
     rest, moves = other_person(), np.random.default_rng(2).normal(size=(5, 3))
     quarter = Rotation.from_euler("x", 90, degrees=True)
@@ -325,8 +331,9 @@ def test_any_of_the_animations_in_a_file_can_be_had(tmp_path):
 
 
 def animation_file(folder, times=None, turns=None, wrong=None, **document):
-    """A GLB file of one node that turns, or of something near it. wrong: changes what the writer's
-    views say.
+    """Returns a GLB file of one node that turns, or of a similar one with a fault.
+
+    `wrong` changes what the writer's views state.
     """
     writer = GlbWriter()
     times = writer.array("SCALAR", np.arange(2.0) if times is None else np.asarray(times, float))
@@ -402,7 +409,7 @@ def test_a_glb_that_is_no_motion_gets_one_line(tmp_path):
 
 
 def compare(tmp_path, caplog, files):
-    """files: (name, bytes) by what they are."""
+    """Compares motions of the page and of Python; `files` are {what: (name, bytes)}."""
     for (case, (name, content)), page in zip(
         files.items(), page_reads(files.values()), strict=True
     ):
@@ -512,7 +519,7 @@ BAD = {
 
 
 def test_files_without_a_rate_are_read_at_the_one_that_is_asked_for():
-    """Without it the error says that a rate would do, and only then."""
+    """Without a rate the error says that one is needed, and only then."""
     asks = {"rate", "no rate", "slow", "negative", "instant"}
     files = {case: (name, content) for case, (name, content, _) in BAD.items()}
     for case, page in zip(files, page_reads(files.values()), strict=True):
@@ -552,7 +559,7 @@ def test_an_avatar_may_have_joints_of_any_name(name):
 
 
 def test_pictures_of_the_page_are_marked_as_ours(tmp_path):
-    """So that no command takes them for photos, and outputs may replace them."""
+    """Commands then do not take them for photos, and outputs may replace them."""
     write_png(tmp_path / "page.png", np.linspace(0, 1, 60).reshape(4, 5, 3))
     assert not is_own_picture(tmp_path / "page.png")
     program = f"""{page_script("saving")}

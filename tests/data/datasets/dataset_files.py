@@ -1,6 +1,4 @@
-"""Tiny data sets in every layout, from random numbers: nobody would recognise a person, but every
-file is as it should be.
-"""
+"""Writes tiny data sets in every layout, of random numbers: valid files without a real person."""
 
 import csv
 import io
@@ -23,7 +21,7 @@ ANGLES = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "r
 
 
 def model_arrays(seed=0):
-    """An SMPL-X model file of a few vertices."""
+    """Returns the arrays of an SMPL-X model file of a few vertices."""
     rng = np.random.default_rng(seed)
     joints = len(PARENTS)
     template = rng.normal(size=(VERTICES, 3)) * [0.2, 0.5, 0.1]
@@ -53,7 +51,7 @@ def write_model(folder, seed=0):
 
 
 def oracle(arrays, betas, rotations, translation):
-    """(rest, vertices, joint transforms) of SMPL-X's equations in numpy, joint by joint."""
+    """Returns (rest, vertices, joint transforms), from SMPL-X's equations in numpy."""
     rest = arrays["v_template"] + arrays["shapedirs"] @ betas
     joints = arrays["J_regressor"] @ rest
     local = Rotation.from_rotvec(rotations).as_matrix()
@@ -74,7 +72,7 @@ def oracle(arrays, betas, rotations, translation):
 
 
 def fit_values(kind, seed=0):
-    """smplx_param.pkl of random numbers."""
+    """Returns random values of a smplx_param.pkl of this kind."""
     rng = np.random.default_rng([seed, ord(kind)])
     values = {key: 0.3 * rng.normal(size=(1, size)) for key, size in ANGLES.items()}
     length = 12 if kind == "A" else 45
@@ -86,7 +84,10 @@ def fit_values(kind, seed=0):
 
 
 def scan_vertices(arrays, values):
-    """(rest, mesh_smplx.obj, joint transforms) by the table of docs/datasets.md: in scan units."""
+    """Returns (rest, vertices of mesh_smplx.obj, joint transforms) in units of the scan.
+
+    They follow the table of docs/datasets.md.
+    """
     hands = []
     for hand in HANDS:
         numbers = values[f"{hand}_hand_pose"][0].astype(float)
@@ -121,14 +122,14 @@ def write_obj(path, vertices, faces, uvs=None):
 
 
 def write_fit(folder, values, mesh, faces):
-    """smplx_param.pkl and mesh_smplx.obj."""
+    """Writes smplx_param.pkl and mesh_smplx.obj."""
     folder.mkdir(parents=True)
     (folder / "smplx_param.pkl").write_bytes(pickle.dumps(values))
     write_obj(folder / "mesh_smplx.obj", mesh, faces)
 
 
 def write_scan(folder, vertices, faces, uvs, texture):
-    """NAME.obj, material0.mtl and material0.jpeg."""
+    """Writes NAME.obj, material0.mtl and material0.jpeg."""
     folder.mkdir(parents=True)
     write_obj(folder / f"{folder.name}.obj", vertices, faces, uvs)
     (folder / "material0.mtl").write_text("newmtl material0\nmap_Kd material0.jpeg\n")
@@ -136,7 +137,7 @@ def write_scan(folder, vertices, faces, uvs, texture):
 
 
 def write_thuman(folder, arrays, kinds="ABC"):
-    """A scan for each kind of fit: a cube around the body."""
+    """Writes a scan for each kind of fit: a cube around the body."""
     for i, kind in enumerate(kinds):
         values, name = fit_values(kind, i), f"{i:04d}"
         _, mesh, _ = scan_vertices(arrays, values)
@@ -157,9 +158,11 @@ def write_thuman(folder, arrays, kinds="ABC"):
 
 
 class Recording(NamedTuple):
-    """A person seen by c cameras. K (3, 3) of all, pixel centres at whole numbers; R (c, 3, 3), T
-    (c, 3) of OpenCV; shot(c, f): photo and mask, 8 bits; parameters: by the names of
-    smpl_params.npz, a row a frame.
+    """A person seen by c cameras.
+
+    All cameras have the intrinsics K (3, 3), with pixel centres at whole numbers; R (c, 3, 3) and T
+    (c, 3) are OpenCV's. shot(c, f) gives photo and mask, 8 bits. `parameters` are arrays by the
+    names of smpl_params.npz with a row for each frame.
     """
 
     K: np.ndarray
@@ -172,7 +175,7 @@ class Recording(NamedTuple):
 
 
 def recording(frames=FRAMES):
-    """Grey photos of cameras that look at the origin from 3 m."""
+    """Returns a recording of grey photos by cameras that look at the origin from 3 m."""
     turns = []
     for azimuth in np.arange(CAMERAS) * 2 * np.pi / CAMERAS:
         s, c = np.sin(azimuth), np.cos(azimuth)
@@ -224,8 +227,10 @@ def calibration(names, made):
 
 
 def write_folders(folder, made, names, photos, masks, rig, every=1):
-    """A recording as photos in folders; `photos` and `masks` name those of a camera. every: photos
-    show every n-th row.
+    """Writes a recording as photos in folders.
+
+    `photos` and `masks` give the names for a camera. Photos show every n-th row of the parameters,
+    where n is `every`.
     """
     for c, name in enumerate(names):
         for frame in range(made.frames):
@@ -284,7 +289,7 @@ def write_actorshq(folder, frames=FRAMES):
 
 
 def h5py():
-    """The module, or the test is skipped."""
+    """Returns the module h5py, or skips the test."""
     import pytest
 
     return pytest.importorskip("h5py", exc_type=ImportError)
@@ -336,8 +341,9 @@ def write_dna(folder, frames=FRAMES):
 
 
 def write_scenes(folder, arrays, scale=1.3, views=3):
-    """One scene of two frames in unusual units; returns the list and what the arrays were made
-    from.
+    """Writes one scene of two frames in unusual units.
+
+    Returns (list of scenes, betas, what the arrays were made from).
     """
     rng = np.random.default_rng(5)
     made = recording()

@@ -1,4 +1,4 @@
-"""Synthetic people in layouts of real data sets, with the package's body as an SMPL-X file."""
+"""Synthetic people in layouts of real data sets, on the package's body as an SMPL-X file."""
 
 import dataclasses
 
@@ -27,19 +27,18 @@ from humangs_jax.synthetic.writer import sample_motion, sample_pose
 
 DEMO = SPLITS["demo"]
 SEEDS = (3_000_271, 3_000_584)
-"""People who are written, of the split "demo"."""
+"""Seeds of the people, of the split "demo"."""
 TIGHT = ("tank", "leggings", "socks")
-"""What all of them wear, with short hair: close to the skin, so that the body's silhouette tells
-whether it stands in its place."""
+"""Clothes of all of them, with short hair: the silhouette is close to that of the body."""
 HANDS = slice(25, 40), slice(40, 55)
 BACKGROUND = 0.45
-"""Grey of the room behind the people of videos."""
+"""Grey level of the room behind the people of videos."""
 
 
 def write_body(path, people, body, hand_poses):
-    """The package's body as an SMPL-X model file, in which person i has betas e_i, and its arrays.
+    """Writes the package's body as an SMPL-X model file; returns its arrays.
 
-    hand_poses: (people, 2, 45) that 12 components reach.
+    Person i has the betas e_i. `hand_poses` (people, 2, 45) are in the span of 12 components.
     """
     directions = np.zeros(
         (len(body.template), 3, 2 * COLUMNS), np.float32
@@ -57,9 +56,7 @@ def write_body(path, people, body, hand_poses):
 
 
 def make_people(seeds, vertices=None):
-    """Synthetic people, and the body of the model file: that which they are made of, decimated to
-    `vertices`.
-    """
+    """Returns (synthetic people, body of the model file), with the body decimated to `vertices`."""
     body = load_body()
     return [in_tight_clothes(seed, body) for seed in seeds], body if vertices is None else decimate(
         body, vertices
@@ -67,9 +64,7 @@ def make_people(seeds, vertices=None):
 
 
 def in_tight_clothes(seed, body):
-    """The person of a seed in `TIGHT` clothes of other people of the documentation, with hair that
-    is buzzed.
-    """
+    """Returns the person of a seed with short hair and the `TIGHT` clothes of other people."""
     person, wanted, garments, haircut = describe(seed, body), set(TIGHT), {}, None
     for other in DEMO:
         seen = describe(other, body)
@@ -88,7 +83,7 @@ def in_tight_clothes(seed, body):
 
 
 def placed(rotations, translations, world, arrays, i):
-    """Parameters of person i of a model file in another world."""
+    """Returns the parameters of person i of a model file in another world."""
     shape = np.eye(2 * COLUMNS)[i]
     rest = arrays["v_template"] + arrays["shapedirs"] @ shape
     return turned(
@@ -97,7 +92,7 @@ def placed(rotations, translations, world, arrays, i):
 
 
 def random_rigid(rng):
-    """A turn by up to a radian about any axis, and up to a metre."""
+    """Returns a random turn by up to a radian and a move by up to a metre, (4, 4)."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_rotvec(rng.uniform(-0.6, 0.6, 3)).as_matrix()
     matrix[:3, 3] = rng.uniform(-1, 1, 3)
@@ -109,10 +104,9 @@ def random_rigid(rng):
 
 
 def write_thuman(out, seeds=SEEDS, kinds="AC", texture_size=1024, vertices=None):
-    """out/body.npz and out/thuman with a scan for each seed, fits of these kinds; returns the data
-    set.
+    """Writes out/body.npz and out/thuman with a scan for each seed; returns the data set's folder.
 
-    The world of the scans is another for each person: turned, moved, and in other units.
+    The world of each scan is turned, moved, and in other units. `kinds` are those of the fits.
     """
     people, small = make_people(seeds, vertices)
     posed = [sample_pose(person, 1) for person in people]
@@ -141,7 +135,7 @@ def write_thuman(out, seeds=SEEDS, kinds="AC", texture_size=1024, vertices=None)
 
 
 def fit_values(parameters, kind, scale, arrays, person):
-    """What smplx_param.pkl of that kind holds, as THuman writes it."""
+    """Returns what THuman's smplx_param.pkl of this kind holds."""
     rotations, translation = parameters.rotations[0].reshape(-1), parameters.translations[0]
     values, at = {}, 0
     for key, size in ANGLES.items():
@@ -165,8 +159,10 @@ def fit_values(parameters, kind, scale, arrays, person):
 
 
 class Video:
-    """A person who moves, seen by cameras around, as a `Recording` in a world that is turned
-    against ours, as calibrations leave it; writes out/body.npz. posed, cameras: ours.
+    """A `Recording` of a moving person by cameras around; makes out/body.npz.
+
+    The recording's world is turned against ours, as after a calibration. `posed` and `cameras` are
+    in ours.
     """
 
     def __init__(self, out, seed=SEEDS[0], frames=3, cameras=4, size=(150, 204), vertices=None):
@@ -219,8 +215,9 @@ class Video:
 
 
 def write_avatarrex(out, **how):
-    """out/body.npz and out/avatarrex_zzr with photos of every 10th frame; returns the subject's
-    folder. how: of a `Video`.
+    """Writes out/body.npz and out/avatarrex_zzr with photos of every 10th frame.
+
+    Returns the subject's folder; `how` are arguments of `Video`.
     """
     video = Video(out, **how)
     serials = [f"220{i:05d}" for i in range(len(video.cameras))]
@@ -228,8 +225,9 @@ def write_avatarrex(out, **how):
 
 
 def write_thuman4(out, size=(166, 144), **how):
-    """out/body.npz and out/subject00, a photo of which is listed as missing; returns the subject's
-    folder. how: of a `Video`.
+    """Writes out/body.npz and out/subject00, of which one photo is listed as missing.
+
+    Returns the subject's folder; `how` are arguments of `Video`.
     """
     video = Video(out, size=size, **how)
     names, last = [f"cam{i:02d}" for i in range(len(video.cameras))], len(video.posed) - 1

@@ -1,7 +1,6 @@
-"""Damage to every layout: one error line that names the file and, where there is one, the key.
+"""Damage to a data set is one line that names the file and, where there is one, the key.
 
-What can be done to any file (cut, other bytes, code in it, size) is done to these ones by
-`tests/hostile`.
+Damage that any file can have (cut, other bytes, code, size) is in `tests/hostile`.
 """
 
 import json
@@ -28,9 +27,7 @@ def body(tmp_path_factory):
 
 
 def read(layout, folder, body):
-    """Everything that is there; of scans all that preprocessing reads and computes before it
-    renders.
-    """
+    """Reads everything; of scans what preprocessing reads and computes before it renders."""
     missing = {}
     if layout == "thuman":
         names, missing = open_thuman(folder)
@@ -56,7 +53,7 @@ WRITE = {
 
 
 def damage_by(change):
-    """A maker of damages: change(path, ...) is done to a path of the data set's folder."""
+    """Returns a maker of damages that apply `change` to a path of the data set's folder."""
     return lambda path, *values, **changes: lambda folder: change(folder / path, *values, **changes)
 
 
@@ -108,7 +105,7 @@ PHOTO, MASK = "22010708/00000001.jpg", "22010708/mask/pha/00000001.jpg"
 
 
 def rig(key, change):
-    """A value of a camera changed; None removes it."""
+    """Changes a value of a camera; a change of None removes it."""
     return jsn(
         RIG,
         lambda c: (
@@ -323,7 +320,7 @@ CASES = {
 
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory):
-    """An honest data set of each layout, written once."""
+    """Returns a function that gives the folder of a valid data set, which is written once."""
     written = {}
 
     def folder(layout):
@@ -335,7 +332,7 @@ def honest(tmp_path_factory):
 
 
 OF_CAPTURE = ("avatarrex", "thuman4")
-"""Layouts whose calibration a reader in capture/ reads."""
+"""Layouts whose calibration is read by a module of capture/."""
 
 
 def marks(layout):
@@ -371,7 +368,7 @@ def test_honest_sets_are_read(layout, honest, body):
 
 @pytest.mark.wings
 def test_preprocessing_names_all_damage_and_makes_the_rest(honest, body, tmp_path):
-    """All of a layout's damage at once: each case is a subject, beside an honest one."""
+    """Each damage is a subject's, and one subject is valid."""
     shutil.copytree(honest("avatarrex"), tmp_path / "in" / "honest")
     for name, (damage, *_) in AVATARREX.items():
         shutil.copytree(honest("avatarrex"), tmp_path / "in" / name)

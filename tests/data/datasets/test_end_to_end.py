@@ -1,5 +1,6 @@
-"""Synthetic people in the layouts of real data sets: preprocessed, loaded, reconstructed and
-animated; and in videos: fitted.
+"""Synthetic people in layouts of real data sets: preprocessed, loaded, reconstructed, animated.
+
+Videos of them are fitted.
 """
 
 import json
@@ -29,7 +30,7 @@ from humangs_jax.network.presets import tiny
 from humangs_jax.synthetic.subject import render_view
 
 TIGHT_IOU = 0.9
-"""Least mean overlap of the posed body and the silhouette of a person in tight clothes."""
+"""Least mean overlap of the body with the silhouette of a person in tight clothes."""
 SIZE = 256
 SETTINGS = {
     "thuman": PreprocessConfig(
@@ -73,12 +74,12 @@ def test_a_person_goes_all_the_way(layout, tmp_path):
 
 
 FIT_ERROR = 0.015
-"""Metres, mean over vertices, of bodies fitted to exact keypoints of three cameras."""
+"""Largest mean vertex error of bodies fitted to exact keypoints of three cameras, metres."""
 
 
 @pytest.mark.slow
 def test_videos_and_keypoints_become_a_capture_of_several_frames(tmp_path):
-    """Imported and fitted by the command line: every frame has the pose of the person."""
+    """The command line imports and fits them: every frame has the person's pose."""
     names, frames, size = ("a", "b", "c"), 3, (288, 400)
     video = made_up.Video(tmp_path, made_up.SEEDS[0], frames, len(names), size, None)
     poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in video.cameras])

@@ -1,6 +1,4 @@
-"""`humangs preprocess`: what is written, what is skipped and why; interrupted, resumed, in
-shards.
-"""
+"""`humangs preprocess`: what it writes and skips, and how it goes on after interruptions."""
 
 import importlib
 import json
@@ -49,13 +47,13 @@ def body(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def few_vertices(monkeypatch):
-    """Scans of boxes are not padded to thousands of vertices."""
+    """Pads scans to few vertices instead of thousands."""
     monkeypatch.setattr(protocol, "STEP", 16)
 
 
 @pytest.fixture(scope="module")
 def videos(tmp_path_factory):
-    """Two subjects, one with a photo that cannot be read."""
+    """Returns a folder of two subjects, one of which has a photo that cannot be read."""
     folder = tmp_path_factory.mktemp("videos")
     write_avatarrex(folder / "avatarrex_a")
     write_avatarrex(folder / "avatarrex_b")
@@ -291,9 +289,7 @@ def test_the_split_is_that_of_all_scans_also_where_one_lacks_a_file(tmp_path, bo
 
 
 def test_a_data_set_is_one_line_of_the_table(tmp_path, body, monkeypatch, capsys):
-    """Known to the choices and the help of the command, to `preprocess`, and to what opens people
-    for training.
-    """
+    """The command's choices and help, `preprocess`, and the loader of people know a new row."""
     found = lambda folder: tuple(sorted(folder.glob("*.toy")))
     opened = lambda path, own: open_people(path.with_suffix(""), own)[0].subject
     monkeypatch.setitem(DATASETS, "toy", DataSetFormat("made up", opened, find=found))

@@ -1,5 +1,6 @@
-"""The published protocol: alignment, cameras, splits and evaluation indices, against independent
-computations.
+"""The published protocol against independent computations.
+
+Tested are alignment, cameras, splits and indices of the evaluation.
 """
 
 import random
@@ -22,7 +23,7 @@ from humangs_jax.data.preprocess import protocol
 from humangs_jax.data.preprocess.run import PreprocessConfig, scan_content
 
 PUBLISHED = 2e-4
-"""Of the body's size, the bound that the arrays have to keep."""
+"""Largest error that the arrays may have, as a share of the body's size."""
 UP = np.asarray([0.0, 1.0, 0.0])
 vectors = (
     st.lists(st.floats(-1, 1), min_size=3, max_size=3)
@@ -92,9 +93,7 @@ def test_evaluation_indices_are_those_of_pythons_seed_777():
 
 
 def test_preprocessing_reproduces_the_published_arrays(tmp_path):
-    """By an independent computation: SMPL-X's equations joint by joint, the protocol's steps one
-    after the other.
-    """
+    """Expected arrays follow SMPL-X's equations joint by joint and the protocol step by step."""
     arrays, body = model_arrays(), write_model(tmp_path)
     folder = write_thuman(tmp_path / "thuman", arrays)
     for i, (name, kind) in enumerate(zip(open_thuman(folder)[0], "ABC", strict=True)):

@@ -1,6 +1,4 @@
-"""Every layout is read as it was written; nothing is decoded before it is asked for; what is
-missing is counted.
-"""
+"""Every layout is read as it was written, photos only when needed; missing parts are counted."""
 
 import dataclasses
 import json
@@ -43,7 +41,7 @@ from humangs_jax.training.sources import people_on_disk, training_people
 
 FLOAT32 = 1e-6
 JPEG = 3
-"""Levels that JPEG images of one grey are off."""
+"""Largest error in levels of JPEG images of one grey."""
 SIZE = 16
 
 
@@ -56,7 +54,7 @@ VIDEOS = {"avatarrex": write_avatarrex, "thuman4": write_thuman4, "actorshq": wr
 
 
 OF_CAPTURE = ("avatarrex", "thuman4")
-"""Layouts whose calibration a reader in capture/ reads."""
+"""Layouts whose calibration is read by a module of capture/."""
 
 
 @pytest.mark.parametrize(
@@ -297,7 +295,7 @@ def test_training_takes_a_scene_list_and_a_data_set(tmp_path, body):
 
 
 def test_the_evaluator_compares_views_of_a_scene_list(tmp_path, body):
-    """By the published indices; predictions have the names of the views."""
+    """The indices are the published ones; predictions are named like the views."""
     file = write_scenes(tmp_path / "scenes", model_arrays())[0]
     (name,) = read_scene_list(file)
     (person,) = open_people(file, body)
