@@ -40,7 +40,7 @@ def upright_body():
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 180, -120])
 def test_regions_turn_with_the_person_and_have_the_same_size(degrees):
-    for region in (face_region, lambda body: hand_region(body, 0)):
+    for region in (face_region, lambda body: hand_region(body, 0, 1.9)):
         upright, after = region(upright_body()), region(turned(upright_body(), degrees))
         assert after.side == pytest.approx(upright.side) and after.side > 60
         np.testing.assert_allclose(after.center, turned(upright.center, degrees), atol=1e-6)
@@ -113,3 +113,16 @@ def test_a_photo_without_anybody_has_no_face_and_no_hands():
     assert parts.face(noise.astype(np.float32), body) is None
     assert parts.hands(noise.astype(np.float32), body, np.ones(33))[1] is None
     assert parts.hands(noise.astype(np.float32), body, np.zeros(33)) == (None, None)
+
+
+def test_a_hand_that_the_small_region_does_not_show_is_looked_for_in_the_large_one(monkeypatch):
+    looked = []
+
+    def hand_in(self, photo, crop, wrist):
+        looked.append(crop.side)
+        return hand(3.0) if crop.side > 200 else None
+
+    monkeypatch.setattr(FaceAndHands, "_hand_in", hand_in)
+    photo, body = np.zeros((8, 8, 3), np.float32), upright_body()
+    found, _ = FaceAndHands().hands(photo, body, 1.0 * (np.arange(33) == 15))
+    assert found is not None and np.diff(looked) > 0 and len(looked) == 2
