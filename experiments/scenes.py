@@ -1,5 +1,5 @@
-"""Scenes of Gaussians fitted to photos: the strategy of fixed numbers beside Adam alone, on a
-garden made from a seed.
+"""Fits scenes of Gaussians to photos of a garden made from a seed, with relocation of Gaussians and
+with Adam alone.
 """
 
 import dataclasses
@@ -20,11 +20,11 @@ from humangs_jax.scenes.config import SCENE_SPLAT, SceneConfig
 from humangs_jax.scenes.fitting import SceneFit, fit_scene
 
 HELD_OUT = 4
-"""Photos that no fit sees."""
+"""Number of photos that no fit sees."""
 FOUND = 0.03
-"""Metres by which points of structure from motion are off here."""
+"""Metres by which the points that structure from motion would find are off."""
 NUMBERS = 24
-"""Relocations after which the capacity is reached."""
+"""Number of relocations after which the capacity is reached."""
 
 
 @entry
@@ -39,20 +39,20 @@ def scene_fits(
     checkpoints: Path | None = None,
     only: tuple[str, ...] = (),
 ) -> None:
-    """Photos of a garden of Gaussians, fitted from few points, from none, and from points of the
-    true number.
+    """Fits photos of a garden of Gaussians from few points, from none, and from the true number of
+    points.
 
-    "True number" begins with a grey Gaussian at each Gaussian of the scene, 3 cm off, and is what
-    Adam alone then reaches.
+    "true number" begins with a grey Gaussian 3 cm off each Gaussian of the scene, and shows what
+    Adam alone reaches from there.
 
     Options:
-    gaussians: of the scene, and the capacity of the fits
-    photos: that are fitted
-    size: of the photos, pixels
-    steps: of each fit, a photo each
+    gaussians: number of Gaussians of the scene, and capacity of the fits
+    photos: number of photos that are fitted
+    size: width and height of the photos, pixels
+    steps: steps of each fit, of one photo each
     points: share of the scene's Gaussians that structure from motion finds
-    seed: of the scene
-    checkpoints: folder, where fits that were interrupted continue
+    seed: seed of the scene
+    checkpoints: folder with checkpoints, from which interrupted fits continue
     only: names of the cases
     """
     scene = garden(gaussians, seed)
@@ -60,6 +60,8 @@ def scene_fits(
     # gloss may exceed 1, which no photo shows
     truth = np.clip(np.asarray(render_views(scene, cameras, SCENE_SPLAT, "black").rgb), 0, 1)
     shown, hidden = np.arange(photos), np.arange(photos, photos + HELD_OUT)
+
+    # points that structure from motion would find, and the configurations of the fits
     rng = np.random.default_rng(seed + 1)
     found = np.asarray(scene.means) + rng.normal(0, FOUND, scene.means.shape)
     few = found[rng.choice(gaussians, int(points * gaussians), replace=False)]
@@ -98,9 +100,11 @@ def scene_fits(
 
 
 COLUMNS = ("gaussians", "photos", "held_out", "seconds", "gib")
+"""Names of the numbers of a row."""
 
 
 def checkpoint_of(folder: Path | None, name: str) -> Path | None:
+    """Returns the checkpoint of a case in a folder, which is made, or None without a folder."""
     if folder is None:
         return None
     folder.mkdir(parents=True, exist_ok=True)
@@ -116,8 +120,19 @@ def measured(
     hidden: np.ndarray,
     checkpoint: Path | None,
 ) -> list[str]:
-    """A row: Gaussians, dB of the photos and of those held out, seconds of all calls, peak
-    memory of the process.
+    """Fits a scene, and returns the cells of its row: Gaussians, PSNR of the fitted photos and of
+    those held out in dB, seconds, and peak memory of the process in GiB.
+
+    Args:
+        points: (n, 3) points to begin with, None: without points
+        config: configuration of the fit
+        truth: (v, h, w, 3) all photos
+        cameras: cameras of all photos
+        shown: indices of the photos that are fitted
+        hidden: indices of the photos that are held out
+        checkpoint: file to continue from
+
+    Raises: KeyboardInterrupt if the fit was interrupted.
     """
     began = time.perf_counter()
     fit: SceneFit = fit_scene(
@@ -126,6 +141,8 @@ def measured(
     if fit.interrupted:
         raise KeyboardInterrupt
     seconds = time.perf_counter() - began
+
+    # views that no fit has seen
     drawn = render_views(fit.gaussians, cameras[hidden], SCENE_SPLAT, "black").rgb
     errors = jnp.mean(jnp.square(drawn - truth[hidden]), axis=(1, 2, 3))
     held_out = float(np.mean([float(decibels(error)) for error in errors]))
@@ -135,7 +152,7 @@ def measured(
 
 
 def around(count: int, width: int, height: int) -> Camera:
-    """Cameras on a circle of two heights, every one in its place by chance."""
+    """Returns cameras on a circle around the table, at random heights and in random order."""
     rng = np.random.default_rng(count)
     azimuths = rng.permutation(count) * 2 * np.pi / count
     K = jnp.asarray([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
@@ -145,12 +162,16 @@ def around(count: int, width: int, height: int) -> Camera:
 
 
 def garden(count: int, seed: int) -> Gaussians:
-    """A table with a vase on a lawn, a hedge around it: flat, round and thin Gaussians with
-    textures, some of them glossy.
+    """Makes a table with a vase on a lawn, with a hedge around it.
+
+    The Gaussians are flat, round and thin, and have textures. Those of the vase are glossy.
     """
+    # which thing each Gaussian belongs to
     rng = np.random.default_rng(seed)
     kinds = rng.choice(5, count, p=[0.3, 0.2, 0.1, 0.3, 0.1])
     angle, u, v = rng.uniform(0, 2 * np.pi, count), rng.random(count), rng.random(count)
+
+    # where it is, metres
     radius = 4.5 * np.sqrt(u)
     lawn = np.stack([radius * np.cos(angle), -0.6 + 0.04 * v, radius * np.sin(angle)], axis=-1)
     disk = 0.9 * np.sqrt(u)
@@ -160,17 +181,14 @@ def garden(count: int, seed: int) -> Gaussians:
     out = 4.5 + 0.5 * u
     hedge = np.stack([out * np.cos(angle), -0.6 + 2.2 * v, out * np.sin(angle)], axis=-1)
     leg = np.floor(4 * u) * np.pi / 2
-    legs = np.stack(
-        [
-            0.6 * np.cos(leg) + 0.03 * np.cos(angle),
-            -0.6 * v,
-            0.6 * np.sin(leg) + 0.03 * np.sin(angle),
-        ],
-        axis=-1,
-    )
+    legs_x = 0.6 * np.cos(leg) + 0.03 * np.cos(angle)
+    legs_z = 0.6 * np.sin(leg) + 0.03 * np.sin(angle)
+    legs = np.stack([legs_x, -0.6 * v, legs_z], axis=-1)
     means = np.stack([lawn, table, vase, hedge, legs])[kinds, np.arange(count)]
     spacing = 2.6 / np.sqrt(count) * np.asarray([3.0, 0.7, 0.3, 3.0, 0.35])[kinds]
     scales = spacing[:, None] * np.exp(rng.normal(0, 0.4, (count, 3)))
+
+    # colors with waves of three lengths
     waves = rng.normal(size=(3, 3, 3)) * np.asarray([3.0, 9.0, 25.0])[:, None, None]
     shades = [np.sin(means @ wave + rng.uniform(0, 6, 3)) for wave in waves]
     base = np.asarray(

@@ -1,8 +1,8 @@
-"""How fast the package is, as ratios that machines have in common, and whether a change made it
-slower.
+"""Measures how fast the package is, in a unit that machines have in common, and whether a change
+made it slower.
 
-The unit is the CPU time of a plain product of two matrices by the same JAX, which a faster or a
-busier machine changes alike.
+The unit is the CPU time of a plain product of two matrices by the same JAX. A faster or busier
+machine changes this time as much as the others.
 """
 
 import ast
@@ -27,8 +27,9 @@ MEASURED = {
     "compile_render": "compile the image",
     "compile_gradient": "compile image and gradient",
 }
-"""Key of a measurement -> how the table calls it."""
+"""{measurement: its name in the table}."""
 PUBLIC = "public names"
+"""Row of the number of names that `import humangs_jax` offers."""
 WORKER = REPOSITORY / "experiments" / "speed_worker.py"
 
 
@@ -40,19 +41,20 @@ def speed(
     repeats: int = 5,
     slower: float = 1.3,
 ) -> int:
-    """CPU time of drawing, gradients, reconstruction and compilation, in plain matrix products; and
-    how much code there is, by room.
+    """Measures the CPU time of drawing, gradients, reconstruction and compilation in plain matrix
+    products, and counts the code of each room.
 
-    With --before each turn measures the other commit, too, in another process, by the same file
-    and by public names. The exit status is 1 if something takes longer by more than --slower; what
-    the other commit cannot do is not compared.
+    With --before each turn also measures the other commit in another process, by the same file
+    through public names. The exit status is 1 if something takes more than --slower times as long
+    as before. What the other commit cannot do is not compared.
 
     Options:
     before: commit, branch or tag to compare with, for instance the last release
-    turns: processes of each
+    turns: number of processes of each
     repeats: timed iterations in a process
-    slower: factor of a ratio from which on the change is too slow
+    slower: largest ratio of the times now and before
     """
+    # both places take turns
     with checkout(before) as other:
         places = {"before": other} if other else {}
         places["now"] = REPOSITORY
@@ -61,18 +63,16 @@ def speed(
             for name, place in places.items():
                 samples[name].append(_measured(place, repeats))
         rooms = {name: code_by_room(place) for name, place in places.items()}
+
+    # a row for each measurement, then for each room
     ratios = {name: _ratios(each) for name, each in samples.items()}
     rows = [
         [title, *(_shown(own.get(key)) for own in ratios.values())]
         for key, title in MEASURED.items()
     ]
-    rows += [
-        [
-            room if room == PUBLIC else f"code tokens, {room}",
-            *(f"{own.get(room, 0):,}" for own in rooms.values()),
-        ]
-        for room in rooms["now"]
-    ]
+    for room in rooms["now"]:
+        title = room if room == PUBLIC else f"code tokens, {room}"
+        rows.append([title, *(f"{own.get(room, 0):,}" for own in rooms.values())])
     numbers = {name: {"ratios": ratios[name], "code": rooms[name]} for name in places}
     run.show(markdown_table(["in plain products", *places], rows), numbers)
     too_slow = slower_than(ratios.get("before", {}), ratios["now"], slower)
@@ -82,7 +82,7 @@ def speed(
 
 
 def slower_than(before: dict[str, float], now: dict[str, float], factor: float) -> list[str]:
-    """A line for each measurement that takes longer than before by more than a factor."""
+    """Returns a line for each measurement that takes more than `factor` times as long as before."""
     return [
         f"{MEASURED[key]}: {now[key]:.2f} plain products, {before[key]:.2f} before:"
         f" {now[key] / before[key]:.2f} times, allowed are {factor:g}"
@@ -92,7 +92,7 @@ def slower_than(before: dict[str, float], now: dict[str, float], factor: float) 
 
 
 def code_by_room(root: Path) -> dict[str, int]:
-    """Tokens of code of each folder of the package at a place, and its public names."""
+    """Counts the tokens of code of each folder of the package at a place, and its public names."""
     from experiments.count import code_tokens
 
     package = root / "humangs_jax"
@@ -105,7 +105,7 @@ def code_by_room(root: Path) -> dict[str, int]:
 
 
 def public_names(root: Path) -> list[str]:
-    """What `import humangs_jax` offers at a place."""
+    """Returns the names that `import humangs_jax` offers at a place."""
     tree = ast.parse((root / "humangs_jax" / "__init__.pyi").read_text(encoding="utf-8"))
     return [
         each.asname or each.name
@@ -117,7 +117,9 @@ def public_names(root: Path) -> list[str]:
 
 @contextmanager
 def checkout(commit: str | None) -> Generator[Path | None]:
-    """The files of a commit in a folder that is gone afterwards; None for no commit."""
+    """Yields a folder with the files of a commit, which is removed afterwards, or None for no
+    commit.
+    """
     if commit is None:
         yield None
         return
@@ -132,9 +134,9 @@ def checkout(commit: str | None) -> Generator[Path | None]:
 
 
 def _measured(place: Path, repeats: int) -> dict[str, float]:
-    """What a process with the package of a place measures: CPU milliseconds.
+    """Returns the CPU milliseconds that a process measures with the package of a place.
 
-    Raises: OSError with the end of its errors.
+    Raises: OSError with the end of the process's errors.
     """
     environment = os.environ | {"PYTHONPATH": str(place), "OMP_WAIT_POLICY": "passive"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)  # compilation is what is measured
@@ -146,7 +148,7 @@ def _measured(place: Path, repeats: int) -> dict[str, float]:
 
 
 def _ratios(samples: list[dict[str, float]]) -> dict[str, float]:
-    """Each measurement over the plain product of its process: medians over the processes."""
+    """Returns each measurement in plain products of its process, as medians over the processes."""
     found = {}
     for key in MEASURED:
         if all(key in each for each in samples):
@@ -155,4 +157,5 @@ def _ratios(samples: list[dict[str, float]]) -> dict[str, float]:
 
 
 def _shown(ratio: float | None) -> str:
+    """Formats a ratio, with a dash for one that was not measured."""
     return "-" if ratio is None else f"{ratio:.3g}"

@@ -1,6 +1,7 @@
-"""What `python -m experiments speed` measures in a process, with the package that this one imports.
+"""Measures for `python -m experiments speed` in a process, with the package that the process
+imports.
 
-It is run as a file, for the package of another commit, too: it uses public names alone.
+It is run as a file, also for the package of another commit, so it uses almost only public names.
 """
 
 import json
@@ -15,29 +16,30 @@ import humangs_jax as hg
 from humangs_jax.core.processes import compiler_options, keep_freed_memory
 
 SIDE = 1024
-"""Of the matrices of a plain product, float32."""
+"""Side of the matrices of a plain product, float32."""
 IMAGE = 512
-"""Pixels a side, of the image that is drawn."""
+"""Side of the image that is drawn, pixels."""
 
 
 def cpu(function: Callable[[], object]) -> float:
-    """CPU milliseconds, all threads, of one call."""
+    """Returns the CPU milliseconds of one call, of all threads."""
     began = time.process_time()
     jax.block_until_ready(function())
     return 1e3 * (time.process_time() - began)
 
 
 def usual(function: Callable[[], object], repeats: int) -> float:
-    """CPU milliseconds of a call that has nothing to compile.
+    """Returns the CPU milliseconds of a call that has nothing to compile.
 
-    The least of several is taken: other programs only ever add to it.
+    The least of several is taken, because other programs only add to it.
     """
     function()
     return min(cpu(function) for _ in range(repeats))
 
 
 def measure(repeats: int) -> dict[str, float]:
-    """CPU milliseconds of everything that is compared, by name."""
+    """Returns {name: CPU milliseconds} of everything that is compared."""
+    # the unit
     keep_freed_memory()
     matrix = jax.random.normal(jax.random.key(0), (SIDE, SIDE))
     product = jax.jit(jnp.matmul)
@@ -59,6 +61,7 @@ def measure(repeats: int) -> dict[str, float]:
     def draw(g):
         return hg.render(g, camera, splat).rgb
 
+    # an image and its gradient, with the time to compile them
     programs = {"render": draw, "gradient": jax.grad(lambda g: jnp.mean(draw(g) ** 2))}
     for name, function in programs.items():
         lowered = jax.jit(function).lower(gaussians)

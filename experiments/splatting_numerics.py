@@ -1,15 +1,15 @@
-"""The extremes that splatting has to survive, as small scenes: is everything finite, and how far is
-float32 from float64?
+"""Checks on small scenes the extremes that splatting has to survive: whether everything is finite,
+and how far float32 is from float64.
 
-A case is a scene in float32 (or narrower), and bounds on how far its image and gradients may be
-from those of the same numbers in float64. Most scenes are 32 Gaussians in 24 x 16 pixels, so that
-one compilation serves nearly all of them.
+A case is a scene in float32 or a narrower type, and bounds on how far its image and gradients may
+be from those of the same numbers in float64. Most scenes have 32 Gaussians and 24 x 16 pixels, so
+that one compilation serves nearly all of them.
 
-Gradients are compared in natural units, so that no Gaussian counts for nothing because it is large
-or far: with respect to mean / depth, log scale and direction of the quaternion; the others as they
-are. Errors are relative to the norm of the same gradient; that of the quaternions, which vanishes
-for spheres, to that of the log scales if it is larger. The loss is a random linear function of rgb,
-alpha and depth.
+Gradients are compared in natural units, so that large and distant Gaussians count as much as
+others: with respect to mean / depth, to log scale, and to the direction of the quaternion. Other
+gradients have no such unit. Errors are relative to the norm of the same gradient. The gradient of
+the quaternions vanishes for spheres, so its error is relative to the gradient of the log scales if
+that is larger. The loss is a random linear function of rgb, alpha and depth.
 """
 
 import dataclasses
@@ -34,115 +34,135 @@ WIDTH, HEIGHT, COUNT = 24, 16, 32
 FOCAL, UNTURNED = 24.0, np.eye(4, dtype=np.float32)
 
 IMAGE, GRADIENT = 1e-5, 1e-4
-"""Bounds of a case that is nothing special to float32: largest error of a color or of alpha, and
-the largest relative L2 error among the eight gradients. Roundings of 6e-8, through a few hundred
-operations."""
+"""Bounds of a case that is not special to float32: the largest error of a color or of alpha, and
+the largest relative L2 error among the eight gradients. They allow for roundings of 6e-8 through a
+few hundred operations.
+"""
 
 FAR, FARTHER = (2e-4, 1e-3), (3e-2, 2e-1)
-"""The same for a scene 1e3 and 1e5 m from the world's origin: a position is known to 6e-8 of its
-distance, 6e-5 and 6e-3 m, where the small Gaussians here are 3e-2 m wide."""
+"""The same bounds for a scene 1e3 m and 1e5 m from the world's origin. A position is known to 6e-8
+of its distance, which is 6e-5 m and 6e-3 m, and the small Gaussians are 3e-2 m wide.
+"""
 
 NEEDLE_GRADIENT = 2e-3
-"""Scales far below a pixel across and far above the image along: what they matter, in log scale, is
-1e-4 of what a visible scale would, and rounding is relative to that."""
+"""Bound for Gaussians that are far below a pixel across and far larger than the image along. Their
+gradient in log scale is 1e-4 of that of a visible scale, and rounding is relative to it.
+"""
 
 CROWD_GRADIENT = 5e-4
-"""50,000 alphas at one place: the gradients of all but the first few are sums that cancel to nearly
-nothing.
+"""Bound for 50,000 alphas at one place. The gradients of all but the first few are sums that cancel
+to nearly nothing.
 """
 
 BFLOAT16_GRADIENT, FLOAT16_GRADIENT = 4e-3, 5e-4
-"""The gradient is returned in the input's dtype, which rounds it by 2^-9 or 2^-11."""
+"""Bounds for gradients in the input's dtype, which rounds them by 2^-9 or 2^-11."""
 
 FLOAT64 = 1e-9
-"""The tiled renderer in float64 against the reference, images absolute and gradients relative:
-every case.
+"""Bound of every case for the tiled renderer in float64 against the reference, absolute for images
+and relative for gradients.
 """
 
 
 class Arrays(NamedTuple):
-    """The fields of `Gaussians`, as numpy arrays."""
+    """The fields of `Gaussians` as NumPy arrays."""
 
     means: np.ndarray
+    """(n, 3) centres in metres."""
     quats: np.ndarray
+    """(n, 4) quaternions of any length."""
     scales: np.ndarray
+    """(n, 3) standard deviations in metres."""
     opacities: np.ndarray
+    """(n,) opacities."""
     colors: np.ndarray
+    """(n, 3) colors."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What is drawn; its dtypes are the input's dtypes. unit: the loss sees depths in it,
-    metres.
-    """
+    """What is drawn. Its arrays have the dtypes of the renderer's input."""
 
     gaussians: Arrays
+    """The Gaussians in the world."""
     K: np.ndarray
+    """(3, 3) intrinsics."""
     pose: np.ndarray
+    """(4, 4) matrix camera from world."""
     background: np.ndarray
+    """(3,) color of the background."""
     width: int = WIDTH
+    """Width of the image in pixels."""
     height: int = HEIGHT
+    """Height of the image in pixels."""
     unit: float = 1.0
+    """Metres of the unit in which the loss sees depths."""
 
     def arguments(self, dtype: type | None = None) -> tuple:
-        """(gaussians, K, cam_from_world, background) as JAX arrays, of `dtype` if one is given."""
+        """Returns (gaussians, K, cam_from_world, background) as JAX arrays, of `dtype` if it is
+        given.
+        """
         leaves = (self.gaussians, self.K, self.pose, self.background)
-        gaussians, *rest = jax.tree.map(
-            lambda a: jnp.asarray(a if dtype is None else np.asarray(a, dtype)), leaves
-        )
+        if dtype is not None:
+            leaves = jax.tree.map(lambda array: np.asarray(array, dtype), leaves)
+        gaussians, *rest = jax.tree.map(jnp.asarray, leaves)
         return Gaussians(*gaussians), *rest
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """image, gradient: bounds (see `IMAGE`). drawn: whether anything is to be seen. slow: takes
-    seconds.
-    """
+    """A scene and its bounds."""
 
     group: str
+    """What the case is about."""
     name: str
+    """Name within the group."""
     build: Callable[[], Scene]
+    """Function that makes the scene."""
     image: float = IMAGE
+    """Bound of the image, see `IMAGE`."""
     gradient: float = GRADIENT
+    """Bound of the gradients, see `IMAGE`."""
     drawn: bool = True
+    """Whether the image shows anything."""
     slow: bool = False
+    """Whether the case takes seconds."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """One case, measured. image: largest error of rgb and alpha. gradient: largest relative L2
-    error, that of `worst`.
-
-    depth: relative L2 error of the depth image. coverage: fraction of the pixels with anything on
-    them.
-    """
+    """Errors of a case that was drawn."""
 
     finite: bool
+    """Whether all numbers are finite."""
     image: float
+    """Largest error of rgb and alpha."""
     depth: float
+    """Relative L2 error of the depth image."""
     gradient: float
+    """Largest relative L2 error of a gradient."""
     worst: str
+    """Name of the gradient with that error."""
     coverage: float
+    """Share of the pixels that show anything."""
     overflow: int
+    """Number of (splat, tile) pairs that did not fit in the buffers."""
 
     def passes(self, case: Case) -> bool:
-        """Whether everything is finite, within the case's bounds, complete, and there to be seen
-        (or not).
+        """Whether everything is finite, within the case's bounds, complete, and visible or not as
+        the case wants it.
         """
         within = self.image <= case.image and self.gradient <= case.gradient
         return self.finite and within and (self.coverage > 0) == case.drawn and self.overflow == 0
 
 
 def ordinary(seed: int = 0, count: int = COUNT, width: int = WIDTH, height: int = HEIGHT) -> Scene:
-    """Gaussians 2 to 4 m before a camera that is slightly turned: the scene that every extreme
-    starts from.
+    """Returns Gaussians 2 to 4 m in front of a camera that is slightly turned, the scene that all
+    extremes start from.
     """
     rng = np.random.default_rng(seed)
     z = rng.uniform(2, 4, count)
-    means = np.stack(
-        [*(rng.uniform(-0.5, 0.5, (2, count)) * z * np.array([[width], [height]]) / FOCAL), z],
-        axis=-1,
-    )
+    places = rng.uniform(-0.5, 0.5, (2, count)) * z * np.array([[width], [height]]) / FOCAL
+    means = np.stack([*places, z], axis=-1)
     arrays = (
         means,
         rng.normal(size=(count, 4)),
@@ -162,6 +182,7 @@ def ordinary(seed: int = 0, count: int = COUNT, width: int = WIDTH, height: int 
 
 
 def changed(scene: Scene, **arrays: np.ndarray) -> Scene:
+    """Returns a scene with other arrays of its Gaussians, in float32."""
     gaussians = scene.gaussians._replace(
         **{name: np.asarray(a, np.float32) for name, a in arrays.items()}
     )
@@ -169,29 +190,34 @@ def changed(scene: Scene, **arrays: np.ndarray) -> Scene:
 
 
 def scaled(size: float) -> Scene:
-    """Scales around `size` metres, each Gaussian with its own three."""
+    """Returns a scene whose scales are around `size` metres and differ by axis and Gaussian."""
     scene = ordinary()
     return changed(scene, scales=size * scene.gaussians.scales / 0.1)
 
 
 def stretched(long: float, middle: float, short: float) -> Scene:
-    """Needles or discs, turned any way."""
+    """Returns a scene of needles or discs in random directions, with these scales in metres."""
     return changed(ordinary(), scales=np.broadcast_to([long, middle, short], (COUNT, 3)))
 
 
 def opaque(opacity: float) -> Scene:
+    """Returns a scene whose Gaussians all have one opacity."""
     return changed(ordinary(), opacities=np.full(COUNT, opacity))
 
 
 def turned(norm: float) -> Scene:
+    """Returns a scene whose quaternions all have one norm."""
     quats = ordinary().gaussians.quats.astype(np.float64)
     return changed(ordinary(), quats=norm * quats / np.linalg.norm(quats, axis=1, keepdims=True))
 
 
 def at_depth(z: float, size: float, offset: float = 0.0) -> Scene:
-    """Gaussians on one plane before an unturned camera, spread over the image, `size` pixels large.
+    """Returns Gaussians on one plane in front of an unturned camera, spread over the image.
 
-    offset: how much farther every second Gaussian lies, metres.
+    Args:
+        z: depth of the plane in metres
+        size: typical scale in pixels
+        offset: metres by which every second Gaussian lies farther away
     """
     scene = ordinary()
     depth = np.full(COUNT, float(z))
@@ -203,7 +229,7 @@ def at_depth(z: float, size: float, offset: float = 0.0) -> Scene:
 
 
 def across_near_plane() -> Scene:
-    """Large Gaussians whose centres lie within a few centimetres before and behind the near
+    """Returns large Gaussians whose centres lie within a few centimetres on both sides of the near
     plane.
     """
     z = NEAR + np.linspace(-0.03, 0.08, COUNT)
@@ -213,8 +239,9 @@ def across_near_plane() -> Scene:
 
 
 def seen_through(focal: float, zoomed: bool) -> Scene:
-    """Another focal length. zoomed: the scene shrinks with the field of view, so the image stays
-    about the same.
+    """Returns a scene with another focal length in pixels.
+
+    If `zoomed`, the scene shrinks with the field of view, so that the image stays about the same.
     """
     scene = ordinary()
     K = scene.K.copy()
@@ -230,7 +257,7 @@ def seen_through(focal: float, zoomed: bool) -> Scene:
 
 
 def far_from_origin(distance: float) -> Scene:
-    """Scene and camera moved together, away from the world's origin."""
+    """Returns a scene whose Gaussians and camera are `distance` metres from the world's origin."""
     scene = ordinary()
     pose = scene.pose.astype(np.float64)
     pose[:3, 3] -= pose[:3, :3] @ np.array([distance, 0, 0])
@@ -239,10 +266,14 @@ def far_from_origin(distance: float) -> Scene:
 
 
 def crowd(count: int, opacity: tuple[float, float], spread: float) -> Scene:
-    """`count` Gaussians on one pixel of an 8 x 8 image (a single tile, so a single list), thinner
-    than a pixel.
+    """Returns `count` Gaussians on one pixel of an 8 x 8 image, thinner than a pixel.
 
-    opacity: range. spread: of their centres, pixels.
+    The image is a single tile, so that all of them are in one list.
+
+    Args:
+        count: number of Gaussians
+        opacity: range of their opacities
+        spread: range of their centres in pixels
     """
     rng = np.random.default_rng(1)
     scene = ordinary(count=count, width=8, height=8)
@@ -256,23 +287,23 @@ def crowd(count: int, opacity: tuple[float, float], spread: float) -> Scene:
 
 
 def over_everything(count: int = COUNT) -> Scene:
-    """One Gaussian that covers the image many times over; the others are invisible."""
+    """Returns a scene with a Gaussian that is much larger than the image, and invisible others."""
     scene = ordinary(count=count)
-    means, scales, opacities = (
-        np.array(a) for a in (scene.gaussians.means, scene.gaussians.scales, np.zeros(count))
-    )
+    means, scales = np.array(scene.gaussians.means), np.array(scene.gaussians.scales)
+    opacities = np.zeros(count)
     means[0], scales[0], opacities[0] = [0.1, 0.2, 3.0], [50.0, 80.0, 30.0], 0.7
     return changed(scene, means=means, scales=scales, opacities=opacities)
 
 
 def behind() -> Scene:
+    """Returns a scene whose Gaussians are all behind the camera."""
     means = ordinary().gaussians.means
     return changed(ordinary(), means=means * np.array([1, 1, -1]))
 
 
 def coincident(reverse: bool = False) -> Scene:
-    """All at one depth, overlapping: the image depends on their order, which is that of their
-    index.
+    """Returns Gaussians that overlap at one depth, so that the image depends on their order, which
+    is that of their indices.
     """
     scene = at_depth(3.0, 3.0)
     order = np.arange(COUNT)[::-1] if reverse else np.arange(COUNT)
@@ -280,7 +311,7 @@ def coincident(reverse: bool = False) -> Scene:
 
 
 def narrow(dtype: DTypeLike, *others: str) -> Scene:
-    """Gaussians, and other arrays of the scene, in another dtype."""
+    """Returns a scene with its Gaussians, and other arrays by name, in another dtype."""
     scene = ordinary()
 
     def cast(name):
@@ -290,12 +321,15 @@ def narrow(dtype: DTypeLike, *others: str) -> Scene:
 
 
 def narrow_everything(dtype: DTypeLike) -> Scene:
+    """Returns a scene with all its arrays in another dtype."""
     return narrow(dtype, "K", "pose", "background")
 
 
 def _cases() -> list[Case]:
+    """Returns all cases, by group."""
     one = functools.partial
 
+    # the number next to the near plane
     def ulp(towards):
         return float(np.nextafter(np.float32(NEAR), np.float32(towards)))
 
@@ -397,33 +431,33 @@ def _cases() -> list[Case]:
 CASES = {f"{case.group}: {case.name}": case for case in _cases()}
 
 NAMES = ("means", "quats", "scales", "opacities", "colors", "K", "cam_from_world", "background")
+"""Names of the gradients in the order of the leaves."""
 
 
 @functools.partial(jax.jit, static_argnames=("draw", "width", "height"))
 def evaluate(draw, gaussians, K, pose, background, unit, width, height):
-    """Rendering, and the gradients of a random linear function of its rgb, alpha and depth with
-    respect to everything.
+    """Returns a rendering, and the gradients of a random linear function of its rgb, alpha and
+    depth with respect to everything.
     """
     rng = np.random.default_rng(7)
-    weights = [
-        rng.normal(size=shape) for shape in ((height, width, 3), (height, width), (height, width))
-    ]
+    shapes = (height, width, 3), (height, width), (height, width)
+    weights = [rng.normal(size=shape) for shape in shapes]
 
     def loss(gaussians, K, pose, background):
         rendering = draw(gaussians, Camera(K, pose, width, height), background=background)
         images = rendering.rgb, rendering.alpha, rendering.depth / unit
-        return sum(
-            jnp.sum(w.astype(a.dtype) * a) for w, a in zip(weights, images, strict=True)
-        ), rendering
+        pairs = zip(weights, images, strict=True)
+        return sum(jnp.sum(weight.astype(x.dtype) * x) for weight, x in pairs), rendering
 
-    (_, rendering), gradients = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(
-        gaussians, K, pose, background
-    )
+    with_gradients = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)
+    (_, rendering), gradients = with_gradients(gaussians, K, pose, background)
     return rendering, gradients
 
 
 def tiled(scene: Scene, draw: Callable = render, dtype: type | None = None):
-    """(rendering, gradients) of a renderer, from the scene's own dtypes or in another one."""
+    """Returns the rendering and the gradients of a renderer, in the scene's dtypes or in another
+    one.
+    """
     out = evaluate(
         draw, *scene.arguments(dtype), scene.unit, width=scene.width, height=scene.height
     )
@@ -431,7 +465,7 @@ def tiled(scene: Scene, draw: Callable = render, dtype: type | None = None):
 
 
 def tiled_in_float64(scene: Scene, draw: Callable = render):
-    """The same from the same numbers in float64."""
+    """Returns the rendering and the gradients of a renderer from the same numbers in float64."""
     with jax.enable_x64(True):
         return tiled(scene, draw, np.float64)
 
@@ -440,8 +474,9 @@ reference_in_float64 = functools.partial(tiled_in_float64, draw=render_reference
 
 
 def relative_l2(found: np.ndarray, expected: np.ndarray) -> float:
-    """|found - expected| / |expected|; 0 if both are 0, infinite if only the second is or the first
-    is not finite.
+    """Returns |found - expected| / |expected|.
+
+    It is 0 if both are equal, and infinite if `found` is not finite, or if only `expected` is 0.
     """
     found, expected = (np.asarray(a, np.float64).ravel() for a in (found, expected))
     if not np.isfinite(found).all():
@@ -449,11 +484,14 @@ def relative_l2(found: np.ndarray, expected: np.ndarray) -> float:
     error, largest = np.linalg.norm(found - expected), np.abs(expected).max(initial=0)
     if error == 0:
         return 0.0
-    return float(error / (largest * np.linalg.norm(expected / largest))) if largest > 0 else np.inf
+    if not largest > 0:  # 0 or NaN
+        return np.inf
+    # the division keeps squares from an overflow
+    return float(error / (largest * np.linalg.norm(expected / largest)))
 
 
 def natural(scene: Scene, gradients: tuple) -> dict[str, np.ndarray]:
-    """Gradients by name, in float64 and in the units of the module docstring."""
+    """Returns the gradients by name, in float64 and in the units of the module's docstring."""
 
     def wide(tree):
         return jax.tree.map(lambda a: np.asarray(a, np.float64), tree)
@@ -469,7 +507,7 @@ def natural(scene: Scene, gradients: tuple) -> dict[str, np.ndarray]:
 
 
 def compare(scene: Scene, found: tuple, expected: tuple) -> Outcome:
-    """One (rendering, gradients) with another."""
+    """Compares a (rendering, gradients) of a scene with the expected one."""
 
     def wide(a):
         return np.asarray(a, np.float64)
@@ -481,14 +519,10 @@ def compare(scene: Scene, found: tuple, expected: tuple) -> Outcome:
     absolute = float(np.linalg.norm(pairs[0]["quats"] - pairs[1]["quats"]))
     errors["quats"] = min(errors["quats"], absolute / (float(max(turn, stretch)) or np.inf))
     worst = max(errors, key=errors.__getitem__)
+    pixels = (image.rgb, exact.rgb), (image.alpha, exact.alpha)
     return Outcome(
         finite=all(np.isfinite(wide(leaf)).all() for leaf in jax.tree.leaves(found)),
-        image=float(
-            max(
-                np.abs(wide(a) - b).max()
-                for a, b in ((image.rgb, exact.rgb), (image.alpha, exact.alpha))
-            )
-        ),
+        image=float(max(np.abs(wide(a) - b).max() for a, b in pixels)),
         depth=relative_l2(image.depth, exact.depth),
         gradient=errors[worst],
         worst=worst,
@@ -498,49 +532,47 @@ def compare(scene: Scene, found: tuple, expected: tuple) -> Outcome:
 
 
 def measure(case: Case, in_float64: bool = False) -> Outcome:
-    """Draws one case in float32 (or float64) and by the reference in float64, and compares."""
+    """Draws a case in its dtypes or in float64, and compares with the reference in float64."""
     scene = case.build()
-    return compare(
-        scene, tiled_in_float64(scene) if in_float64 else tiled(scene), reference_in_float64(scene)
-    )
+    found = tiled_in_float64(scene) if in_float64 else tiled(scene)
+    return compare(scene, found, reference_in_float64(scene))
 
 
 @entry
 def splatting_numerics(run: Run, only: str = "") -> int:
-    """The extremes of splatting: is everything finite, and how far is float32 from float64?
+    """Checks at the extremes of splatting whether everything is finite, and how far float32 is from
+    float64.
 
     Every case is rendered, with the gradients of a random loss with respect to everything, by the
-    tiled renderer in float32 and by the reference in float64 from the same numbers; and by the
-    tiled renderer in float64, which shows that only rounding remains. Exit status 1 if a number is
-    not finite, a bound is exceeded, or something is visible that should not be. Three minutes.
+    tiled renderer in float32 and by the reference in float64 from the same numbers. The tiled
+    renderer in float64 shows that only rounding remains. The exit status is 1 if a number is not
+    finite, a bound is exceeded, or something is visible that should not be. Takes three minutes.
 
     Options:
     only: cases whose names contain this
     """
-    rows, numbers, number = [], [], lambda x: "0" if x == 0 else f"{x:.0e}"
+    rows, numbers = [], []
+
+    def number(x):
+        return "0" if x == 0 else f"{x:.0e}"
+
+    # each case in float32, and in float64 to see that the rest is rounding
     for name, case in CASES.items():
-        if only in name:
-            single, double = measure(case), measure(case, in_float64=True)
-            passes = single.passes(case) and max(double.image, double.gradient) <= FLOAT64
-            numbers.append(
-                {
-                    "case": name,
-                    "image_bound": case.image,
-                    "gradient_bound": case.gradient,
-                    "passes": passes,
-                }
-            )
-            numbers[-1] |= {
+        if only not in name:
+            continue
+        single, double = measure(case), measure(case, in_float64=True)
+        passes = single.passes(case) and max(double.image, double.gradient) <= FLOAT64
+        numbers.append(
+            {
+                "case": name,
+                "image_bound": case.image,
+                "gradient_bound": case.gradient,
+                "passes": passes,
                 "float32": dataclasses.asdict(single),
                 "float64": dataclasses.asdict(double),
             }
-            rows.append(
-                [
-                    name + ("" if passes else " **FAILED**"),
-                    number(single.image),
-                    number(single.gradient),
-                    single.worst,
-                ]
-            )
+        )
+        title = name if passes else f"{name} **FAILED**"
+        rows.append([title, number(single.image), number(single.gradient), single.worst])
     run.show(markdown_table(("case", "image error", "gradient error", "of"), rows), numbers)
     return 0 if rows and all(row["passes"] for row in numbers) else 1

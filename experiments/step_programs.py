@@ -1,5 +1,5 @@
-"""How large the program of a training step is, on a CPU and for CUDA, and how long a step takes on
-this CPU: before and now.
+"""Measures how large the program of a training step is, on a CPU and for CUDA, and how long a step
+takes on this CPU, before and now.
 """
 
 import json
@@ -22,34 +22,34 @@ COUNTS = {
     "while": "loops",
     "convolutions": "convolutions",
 }
-"""Key of what is counted in a program -> how the table calls it."""
+"""{count of a program: its name in the table}."""
 TIMES = {
     "lower": "CPU: trace and lower, CPU s",
     "compile": "CPU: compile, CPU s",
     "step": "CPU: a step, CPU ms",
     "temporary MiB": "CPU: MiB of temporaries",
 }
-"""The same of what is measured; the least of all turns is shown."""
+"""{measurement: its name in the table}, which shows the least of all turns."""
 PLATFORMS = {"cuda": "CUDA, 8 people", "cpu": "CPU, 8 people"}
-"""Platforms that programs are lowered for."""
+"""{platform that programs are lowered for: its name in the table}."""
 
 
 @entry
 def step_programs(run: Run, before: str | None = None, turns: int = 1, repeats: int = 3) -> None:
-    """The size of the program of `train_by_clock`'s step, with 8 people, and its time on this CPU
-    with one, now and at another commit.
+    """Measures the size of the program of `train_by_clock`'s step with 8 people, and its time on
+    this CPU with one person, now and at another commit.
 
-    Programs are counted as they are traced and lowered, for CUDA without a GPU: fusion comes
-    afterwards. Operations in loops count as often as the loop runs; where data decide, loops of
-    compositing are taken to run four times, others once. Both commits work at the same time, so
-    that other programs slow both down alike. With --json the rows that are there are kept. Six
-    CPU minutes.
+    Programs are counted after tracing and lowering and before fusion, for CUDA without a GPU.
+    Operations in loops count as often as the loop runs. Where data decide, loops of compositing are
+    assumed to run four times, and others once. Both commits work at the same time, so that other
+    programs slow both down by as much. Takes six CPU minutes.
 
     Options:
     before: commit to compare with
-    turns: times that each is timed
-    repeats: steps that are timed in each
+    turns: number of times that each commit is timed
+    repeats: number of steps that are timed in each turn
     """
+    # all programs read one batch, which is made when it is first needed
     with checkout(before) as other, tempfile.TemporaryDirectory() as folder:
         places = {"before": other} if other else {}
         places["now"] = REPOSITORY
@@ -78,13 +78,15 @@ def step_programs(run: Run, before: str | None = None, turns: int = 1, repeats: 
 
 
 def _together(places: dict[str, Path], *words: str) -> dict[str, Any]:
-    """What the worker finds with the package of each place, all at the same time."""
+    """Runs the worker with the package of each place at the same time, and returns {place: its
+    numbers}.
+    """
     running = {name: _started(place, *words) for name, place in places.items()}
     return {name: json.loads(_finished(process)) for name, process in running.items()}
 
 
 def _started(place: Path, *words: str) -> subprocess.Popen[str]:
-    """The worker with the package of a place."""
+    """Starts the worker with the package of a place."""
     environment = os.environ | {"PYTHONPATH": str(place), "OMP_WAIT_POLICY": "passive"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)  # compilation is what is measured
     return subprocess.Popen(
@@ -99,7 +101,10 @@ def _started(place: Path, *words: str) -> subprocess.Popen[str]:
 
 
 def _finished(process: subprocess.Popen[str]) -> str:
-    """The last line that a worker prints. Raises: OSError with the end of its errors."""
+    """Waits for a worker, and returns the last line that it prints.
+
+    Raises: OSError with the end of the worker's errors.
+    """
     out, errors = process.communicate()
     if process.returncode:
         raise OSError(f"{process.args}: {errors[-2000:]}")

@@ -1,5 +1,5 @@
-"""What `python -m experiments step_programs` finds out in a process, with the package and the
-experiments that this process imports: those of another commit, too.
+"""Measures for `python -m experiments step_programs` in a process, with the package and the
+experiments that the process imports, which may be those of another commit.
 
     step_programs_worker.py batch FILE               a batch of one person, which all others read
     step_programs_worker.py count FILE PLATFORM      the size of the step's program, as JSON
@@ -22,17 +22,18 @@ import jax
 from jax.interpreters.partial_eval import dce_jaxpr
 
 ROUNDS = {"compositing": 4}
-"""Beginning of the name of a file with a loop whose length the data decide -> how often the loop is
-taken to run; elsewhere once."""
+"""{beginning of a file's name: how often a loop in the file is assumed to run, if data decide}.
+Loops in other files are assumed to run once.
+"""
 BACKENDS = {"cpu": "cpu", "cuda": "gpu"}
-"""Platform that a program is lowered for -> what JAX calls the backend."""
+"""{platform that a program is lowered for: JAX's name of the backend}."""
 PEOPLE = 8
-"""People a step in the program that is counted."""
+"""Number of people of a step in the program that is counted."""
 
 
 def prepared(people: int) -> tuple[Any, tuple[Any, ...], Any]:
-    """The configuration of `train_by_clock` for a number of people, what its step is given beside
-    state and batch, and the shipped variables.
+    """Returns the configuration of `train_by_clock` for a number of people, the arguments of its
+    step after state and batch, and the shipped variables.
     """
     from experiments import train_by_clock
     from humangs_jax.body.library import load_body
@@ -64,7 +65,7 @@ def make_batch(file: Path) -> None:
 
 
 def count(file: Path, platform: str) -> dict[str, int]:
-    """The size of the step's program for a platform, with `PEOPLE` people."""
+    """Returns the size of the step's program for a platform, with `PEOPLE` people."""
     from experiments import train_by_clock
     from humangs_jax.training.state import init_state
 
@@ -90,11 +91,12 @@ def count(file: Path, platform: str) -> dict[str, int]:
 
 
 def executed(jaxpr: Any, platform: str) -> int:
-    """How many primitives run, those of loops as often as the loop does."""
+    """Returns the number of primitives that run. Those of a loop count as often as it runs."""
     return sum(_executed(equation, platform) for equation in jaxpr.eqns)
 
 
 def _executed(equation: Any, platform: str) -> int:
+    """Returns the number of primitives that an equation runs, of a conditional the most."""
     name, given = equation.primitive.name, equation.params
     if name == "scan":
         return given["length"] * executed(given["jaxpr"].jaxpr, platform)
@@ -103,7 +105,9 @@ def _executed(equation: Any, platform: str) -> int:
         return _rounds(equation) * sum(executed(part.jaxpr, platform) for part in parts)
     if name == "cond":
         chosen = _branch_of(given, platform)
-        branches = [given["branches"][chosen]] if chosen is not None else given["branches"]
+        branches = given["branches"]
+        if chosen is not None:
+            branches = [branches[chosen]]
         return max(executed(branch.jaxpr, platform) for branch in branches)
     for key in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call"):
         if key in given:
@@ -113,7 +117,7 @@ def _executed(equation: Any, platform: str) -> int:
 
 
 def _branch_of(given: dict[str, Any], platform: str) -> int | None:
-    """Which branch of a conditional a platform takes; None where data decide."""
+    """Returns the index of the branch that a platform takes, or None where data decide."""
     platforms = given.get("branches_platforms")
     if platforms is None:
         return None
@@ -124,9 +128,12 @@ def _branch_of(given: dict[str, Any], platform: str) -> int | None:
 
 
 def _rounds(equation: Any) -> int:
-    """How often a loop is taken to run, by the innermost of the files that wrote it."""
+    """Returns how often a loop is assumed to run, by the innermost file of `ROUNDS` that wrote
+    it.
+    """
     traceback = equation.source_info.traceback
-    for frame in traceback.frames if traceback is not None else ():
+    frames = () if traceback is None else traceback.frames
+    for frame in frames:
         for beginning, rounds in ROUNDS.items():
             if Path(frame.file_name).name.startswith(beginning):
                 return rounds
@@ -134,9 +141,10 @@ def _rounds(equation: Any) -> int:
 
 
 def measure(file: Path, repeats: int) -> dict[str, Any]:
-    """CPU seconds to compile a step with one person, CPU milliseconds of a step, and its numbers.
+    """Returns the CPU seconds to compile a step with one person, the CPU milliseconds of a step,
+    and the metrics of the first step.
 
-    The least of several is taken: other programs only ever add to it.
+    The least time of several steps is taken, because other programs only add to it.
     """
     from experiments import train_by_clock
     from humangs_jax.core.processes import keep_freed_memory
@@ -155,11 +163,13 @@ def measure(file: Path, repeats: int) -> dict[str, Any]:
         "compile": time.process_time() - middle,
         "temporary MiB": step.memory_analysis().temp_size_in_bytes / 2**20,
     }
+
+    # the metrics are those of the first step, which begins with the shipped weights
     least, first = math.inf, None
     for _ in range(repeats + 1):
         began = time.process_time()
         state, average, metrics = jax.block_until_ready(step(state, average, batch, *given, 1.0))
-        if first is None:  # of the first step, which begins with the shipped weights
+        if first is None:
             first = {name: float(value) for name, value in metrics.items()}
         else:
             least = min(least, time.process_time() - began)

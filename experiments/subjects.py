@@ -1,13 +1,14 @@
-"""People to evaluate on: who they are, their photos and held-out views, the network, and what their
-rows depend on.
+"""Makes the people to evaluate on, with their photos and held-out views, loads the network, and
+scores drawn views.
 
-Photos are from a ring of `RING` cameras of the published protocol, evenly spaced but for the
-generator's jitter, number 0 the most frontal one. N photos are every (RING / N)-th camera, so each
-person is rendered once for all numbers of photos. Held-out cameras and novel poses are those of
-`humangs_jax.synthetic.writer.write_person` for the same seed; images have 8 bits as on disk.
+Photos are from a ring of `RING` cameras of the published protocol. They are evenly spaced except
+for the generator's jitter, and number 0 is the most frontal one. N photos are every (RING / N)-th
+camera, so that each person is rendered once for all numbers of photos. Held-out cameras and novel
+poses are those of `humangs_jax.synthetic.writer.write_person` for the same seed. Images have 8 bits
+as on disk.
 
-A row of scores is {"novel": scores, "animation": scores}: held-out views in the pose of the photos,
-and in poses that no photo shows; means over views, under the protocol "humangs".
+A row of scores is {"novel": scores, "animation": scores}, for held-out views in the pose of the
+photos and in poses that no photo shows. Scores are means over views, under the protocol "humangs".
 """
 
 import dataclasses
@@ -44,8 +45,9 @@ from humangs_jax.synthetic.surroundings import cameras_around, spread_azimuths
 from humangs_jax.synthetic.writer import Stream, View, capture_views, sample_pose
 
 RING = 12
-"""Cameras that photos are taken from; numbers of photos divide it."""
+"""Number of cameras that photos are taken from. Numbers of photos divide it."""
 TASKS = {"novel": "novel views", "animation": "novel poses"}
+"""{task: its name in tables}."""
 Scores = dict[str, float | None]
 
 
@@ -74,11 +76,12 @@ class People:
     lpips_net: Literal["vgg", "alex"] = "alex"
 
     def start(self) -> "Start":
-        """Reads what is needed. Raises: ValueError that names the option that is out of range."""
-        if (
-            min(self.subjects, self.held_out, self.pose_views) < 1
-            or min(self.first, self.poses) < 0
-        ):
+        """Loads the body, the network and LPIPS, and chooses the seeds.
+
+        Raises: ValueError if an option is out of range.
+        """
+        too_few = min(self.subjects, self.held_out, self.pose_views) < 1
+        if too_few or min(self.first, self.poses) < 0:
             raise ValueError(
                 "--subjects, --held-out and --pose-views must be at least 1, --first and --poses at"
                 " least 0"
@@ -105,21 +108,29 @@ class People:
 
 
 class Start(NamedTuple):
-    """What an evaluation begins with. settings: what the rows depend on."""
+    """What an evaluation begins with."""
 
     body: BodyModel
+    """The body of all people."""
     variables: Variables
+    """Variables of the network."""
     config: HumanGSConfig
+    """Configuration of the network."""
     seeds: list[int]
+    """Seeds of the people."""
     held_out: "HeldOut"
+    """Views and poses to compare with."""
     size: int
+    """Side of the photos in pixels."""
     lpips: Lpips | None
+    """Network of LPIPS, None if its weights are not installed."""
     settings: dict[str, Any]
+    """What the rows depend on."""
 
     def subject(
         self, seed: int, counts: Sequence[int], size: int | None = None
     ) -> "EvaluationSubject":
-        """The person of a seed, with photos for these numbers of views: see
+        """Returns the person of a seed with photos for these numbers of views, see
         `make_evaluation_subject`.
         """
         return make_evaluation_subject(seed, self.body, counts, size or self.size, self.held_out)
@@ -131,82 +142,96 @@ class Start(NamedTuple):
         settings: Mapping[str, Any] | None = None,
         again: bool = False,
     ) -> list[Any]:
-        """What `measure` gives of the seed of each person, see `Run.rows`."""
+        """Returns what `measure` returns for the seed of each person, see `Run.rows`."""
         cases = {str(seed): functools.partial(measure, seed) for seed in self.seeds}
         return list(run.rows(cases, self.settings | dict(settings or {}), again).values())
 
     def about(self) -> str:
+        """Describes the people, the views and the network in a sentence."""
         s = self.settings
-        return (
+        text = (
             f"{len(self.seeds)} people of the {s['split']} seeds, {self.size} x {self.size} pixels,"
             f" white; {s['held_out']} held-out views in the pose of the photos, {s['poses']} x"
             f" {s['pose_views']} in novel poses; weights {s['weights'][:12]}, tokens: {s['tokens']}"
-            + (f"; LPIPS {s['lpips_net']}." if s["lpips_net"] else ".")
         )
+        if s["lpips_net"]:
+            text += f"; LPIPS {s['lpips_net']}"
+        return f"{text}."
 
 
 def shipped_person(max_edge_length: float | None = None) -> Avatar:
-    """The person of the demo from four photos, feed-forward."""
+    """Returns the person of the demo from four photos, feed-forward.
+
+    `max_edge_length` in metres splits the body further than the weights want, None: not further.
+    """
     variables, config = load_weights()
-    return reconstruct(
-        variables, config.with_runtime(max_edge_length=max_edge_length), load_capture(DEMO_CAPTURE)
-    )
+    config = config.with_runtime(max_edge_length=max_edge_length)
+    return reconstruct(variables, config, load_capture(DEMO_CAPTURE))
 
 
 def shipped_digest(asset: str) -> str:
+    """Returns the SHA-256 sum of a file that ships with the package."""
     with resources.as_file(resources.files("humangs_jax").joinpath(asset)) as path:
         return file_digest(path)
 
 
 def file_digest(path: Path) -> str:
+    """Returns the SHA-256 sum of a file as hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @dataclasses.dataclass(frozen=True)
 class HeldOut:
-    """What a reconstruction is compared with: `views` of the pose of the photos, `pose_views` of
-    each of `poses` others.
-    """
+    """What a reconstruction is compared with."""
 
     views: int = 8
+    """Number of views of the pose of the photos."""
     poses: int = 2
+    """Number of other poses."""
     pose_views: int = 4
+    """Number of views of each of the other poses."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EvaluationSubject:
-    """A person. photos: of pose 0, by position on the ring. held_out: frame 0 is that pose, frames
-    1, ... are others.
-    """
+    """A person with photos and held-out views."""
 
     seed: int
+    """Seed of the person."""
     photos: Capture
+    """Photos of pose 0."""
     positions: tuple[int, ...]
+    """Position of each photo on the ring."""
     held_out: Capture
+    """Held-out views. Frame 0 has the pose of the photos, frames 1, ... have other poses."""
 
     def inputs(self, count: int) -> Capture:
-        """Evenly spaced photos of the ring, the frontal one first.
+        """Returns `count` evenly spaced photos of the ring, the frontal one first.
 
-        Raises ValueError if they were not rendered.
+        Raises: ValueError if they were not rendered.
         """
         wanted = ring_positions(count)
-        if missing := set(wanted) - set(self.positions):
+        missing = set(wanted) - set(self.positions)
+        if missing:
             raise ValueError(
                 f"{count} photos need ring positions {sorted(missing)}, which the capture lacks"
             )
         return self.photos.select([self.positions.index(position) for position in wanted])
 
     def with_body(self, body: BodyModel) -> "EvaluationSubject":
-        """The same images with the parameters of another body, which has the same directions of
-        shape; the poses go to its joints by name, and joints that have none of that name rest.
+        """Returns the same images with the parameters of another body, see `with_body`.
+
+        The other body must have the same directions of shape.
         """
         captures = {name: with_body(getattr(self, name), body) for name in ("photos", "held_out")}
         return dataclasses.replace(self, **captures)
 
 
 def with_body(capture: Capture, body: BodyModel) -> Capture:
-    """A capture with another body, its poses carried over by the names of the joints."""
+    """Returns a capture with another body, whose joints get the rotations of the joints of the same
+    names. Joints with other names are not turned.
+    """
     names = capture.body.joint_names
     rotations = np.asarray(capture.poses.rotations)
     carried = np.zeros((len(rotations), len(body.joint_names), 3), rotations.dtype)
@@ -218,9 +243,9 @@ def with_body(capture: Capture, body: BodyModel) -> Capture:
 
 
 def ring_positions(count: int) -> tuple[int, ...]:
-    """Which cameras of the ring take `count` photos.
+    """Returns the positions on the ring of `count` photos.
 
-    Raises ValueError unless the count divides `RING`.
+    Raises: ValueError unless the count divides `RING`.
     """
     if count < 1 or RING % count:
         raise ValueError(f"{count} photos are not evenly spaced among {RING} cameras")
@@ -234,9 +259,17 @@ def make_evaluation_subject(
     image_size: int = 256,
     held_out: HeldOut | None = None,
 ) -> EvaluationSubject:
-    """The person of a seed, rendered from every camera that one of the numbers of photos asks
-    for.
+    """Renders the person of a seed from every camera that one of the numbers of photos needs, and
+    from held-out cameras.
+
+    Args:
+        seed: seed of the person
+        body: body of the person
+        counts: numbers of photos
+        image_size: side of the images in pixels
+        held_out: views to compare with; default: those of `HeldOut`
     """
+    # photos of pose 0 by cameras on the ring
     held_out = held_out or HeldOut()
     subject = make_subject(seed, body)
     posed = [sample_pose(subject, i) for i in range(1 + held_out.poses)]
@@ -246,6 +279,7 @@ def make_evaluation_subject(
     positions = tuple(sorted({position for count in counts for position in ring_positions(count)}))
     photos = [View(0, f"photo_{i:02d}", ring[(frontal + i) % RING]) for i in positions]
 
+    # held-out views of all poses by other cameras
     rng = np.random.default_rng([seed, Stream.HELD_OUT_CAMERAS])
     others = []
     for frame, pose in enumerate(posed):
@@ -261,7 +295,9 @@ def make_evaluation_subject(
 
 
 def frontal_camera(posed: PosedSubject, cameras: Camera) -> int:
-    """Index of the camera that looks the person in the face, as seen from above."""
+    """Returns the index of the camera that is most nearly in front of the person, seen from
+    above.
+    """
     facing = np.asarray(matrix_from_axis_angle(jnp.asarray(posed.rotations[0])))[:, 2]
     middle = 0.5 * (posed.vertices.min(0) + posed.vertices.max(0))
     towards = np.asarray([cameras[i].center for i in range(RING)]) - middle
@@ -270,7 +306,7 @@ def frontal_camera(posed: PosedSubject, cameras: Camera) -> int:
 
 
 def _as_stored(capture):
-    """The capture with images and masks of 8 bits."""
+    """Returns the capture with images and masks rounded to 8 bits."""
     rounded = {
         name: to_uint8(getattr(capture, name)).astype(np.float32) / 255
         for name in ("images", "masks")
@@ -279,8 +315,8 @@ def _as_stored(capture):
 
 
 def task_views(held_out: Capture) -> dict[str, np.ndarray]:
-    """Indices of the held-out views by task: those in the pose of the photos, which is frame 0, and
-    the others.
+    """Returns the indices of the held-out views of each task: those in the pose of the photos,
+    which is frame 0, and the others.
     """
     still = np.asarray(held_out.frames) == 0
     return dict(zip(TASKS, (np.flatnonzero(still), np.flatnonzero(~still)), strict=True))
@@ -292,16 +328,21 @@ def score_tasks(
     lpips: Lpips | None = None,
     alpha: np.ndarray | None = None,
 ) -> dict[str, Scores]:
-    """Mean scores of drawn held-out views (v, h, w, 3) by task, under the protocol "humangs"; tasks
-    without views are left out.
+    """Returns {task: mean scores} of drawn held-out views, under the protocol "humangs".
 
-    alpha: their coverage (v, h, w), for semi-transparent foreground and silhouettes.
+    Tasks without views are left out. LPIPS is None without its network.
+
+    Args:
+        drawn: (v, h, w, 3) drawn views
+        held_out: the true views
+        lpips: network of LPIPS
+        alpha: (v, h, w) coverage, for semi-transparent foreground and silhouettes
     """
-    net = "vgg" if lpips is None else lpips.net
+    net, networks = "vgg", {}
+    if lpips is not None:
+        net, networks = lpips.net, {lpips.net: lpips}
     protocol = dataclasses.replace(PROTOCOLS["humangs"], lpips=(net,))
-    rows = list(
-        score_views(drawn, held_out, protocol, alpha, {} if lpips is None else {net: lpips})
-    )
+    rows = list(score_views(drawn, held_out, protocol, alpha, networks))
     means = {
         task: mean_scores(rows[i] for i in views)
         for task, views in task_views(held_out).items()

@@ -1,12 +1,11 @@
-"""The systems that the paper compares with, and HumanGS itself, as configurations of parts: one
-bench for all.
+"""Configurations of HumanGS and of the systems that the paper compares with, built of parts.
 
     config = SYSTEMS["lhm"]("bench")
 
-"published" has the sizes of their papers where these are known, "bench" trains on two cores at 32
-pixels: the same body, width and losses for all, so that only the system differs. Sizes and sources:
-the modules of the parts. Each takes the data, the body and the loop of this package, and none of
-the pretrained networks that some of them have.
+The size "published" has the sizes of the systems' papers where they are known. "bench" trains on
+two cores at 32 pixels, with the same body, width and losses for all, so that only the system
+differs. The modules of the parts name sizes and sources. All systems use the data, the body and the
+training loop of this package. Pretrained networks, which some of them have, are left out.
 """
 
 import dataclasses
@@ -40,7 +39,7 @@ BENCH_WIDTH, BENCH_HEAD = 128, 32
 BENCH_TRANSFORMER = TransformerConfig(width=BENCH_WIDTH, layers=4, head_width=BENCH_HEAD)
 BENCH_BLOCKS = dataclasses.replace(BENCH_TRANSFORMER, class_token=False)
 BENCH = {"image_size": 32, "body_vertices": 800, "max_edge_length": None}
-"""Conventions of the bench; the others are the published ones."""
+"""Conventions of the bench that differ from the published ones."""
 
 
 def humangs(size: Size = "published") -> HumanGSConfig:
@@ -80,14 +79,15 @@ def ours(size: Size = "published") -> HumanGSConfig:
 
 
 def _scaled(conventions: Conventions) -> Conventions:
+    """Returns conventions for the photos and bodies of the bench."""
     return dataclasses.replace(conventions, **BENCH)
 
 
 def _sized(size: Size, conventions: Conventions, *parts: Any) -> HumanGSConfig:
-    """A system of these parts, at the bench for its photos and bodies."""
-    return HumanGSConfig(
-        Architecture(*parts), conventions if size == "published" else _scaled(conventions)
-    )
+    """Returns a system of these parts, with the conventions of its size."""
+    if size == "bench":
+        conventions = _scaled(conventions)
+    return HumanGSConfig(Architecture(*parts), conventions)
 
 
 def lvsm(size: Size = "published") -> HumanGSConfig:
@@ -108,13 +108,11 @@ def lvsm_latents(size: Size = "published") -> HumanGSConfig:
 
     12 + 12 layers, 3,072 latents.
     """
-    config, published = lvsm(size), size == "published"
-    blocks = (
-        TransformerConfig(layers=12, class_token=False)
-        if published
-        else dataclasses.replace(BENCH_BLOCKS, layers=2)
-    )
-    return config.with_parts(driver=QueryDriver(blocks, latents=3072 if published else 64))
+    if size == "published":
+        driver = QueryDriver(TransformerConfig(layers=12, class_token=False), latents=3072)
+    else:
+        driver = QueryDriver(dataclasses.replace(BENCH_BLOCKS, layers=2), latents=64)
+    return lvsm(size).with_parts(driver=driver)
 
 
 def humanram(size: Size = "published") -> HumanGSConfig:
@@ -136,12 +134,11 @@ def giga(size: Size = "published") -> HumanGSConfig:
     """GIGA-style (`surface_gaussians`): a texture of 512 texels, a U-Net for every pose, one
     Gaussian a texel.
     """
-    driver = (
-        TextureDriver()
-        if size == "published"
-        else TextureDriver((16, 32, 64, BENCH_WIDTH), BENCH_WIDTH, 8)
-    )
-    surface = SurfaceMap("atlas", 512 if size == "published" else 48)
+    if size == "published":
+        driver, surface = TextureDriver(), SurfaceMap("atlas", 512)
+    else:
+        driver = TextureDriver((16, 32, 64, BENCH_WIDTH), BENCH_WIDTH, 8)
+        surface = SurfaceMap("atlas", 48)
     return _sized(
         size,
         Conventions(pixels="person"),
@@ -157,8 +154,10 @@ def animatable(size: Size = "published") -> HumanGSConfig:
     person: train it on that person's photos alone, and anew for the next. Photos that
     reconstruction or evaluation give are ignored.
     """
-    driver = PoseMapDriver() if size == "published" else PoseMapDriver((16, 32, 64))
-    surface = SurfaceMap("front_back", 1024 if size == "published" else 96)
+    if size == "published":
+        driver, surface = PoseMapDriver(), SurfaceMap("front_back", 1024)
+    else:
+        driver, surface = PoseMapDriver((16, 32, 64)), SurfaceMap("front_back", 96)
     return _sized(
         size,
         Conventions(pixels="person"),
@@ -192,11 +191,9 @@ def cross_attention(size: Size = "published") -> HumanGSConfig:
     """The same with vertices that attend to all image tokens: what the paper's second claim is
     about.
     """
-    reader = (
-        CrossAttentionReader()
-        if size == "published"
-        else CrossAttentionReader(BENCH_WIDTH, 1, 4, BENCH_HEAD)
-    )
+    reader = CrossAttentionReader()
+    if size == "bench":
+        reader = CrossAttentionReader(BENCH_WIDTH, 1, 4, BENCH_HEAD)
     return back_projection(size).with_parts(reader=reader)
 
 
@@ -208,16 +205,12 @@ def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) 
     """
     if size == "published":
         encoder = _photo_encoder(TransformerConfig(width=1024, class_token=False), patch_size=16)
-        reader, decoder = (
-            TwoStreamReader(pooling=pooling, most_views=most_views),
-            VertexDecoder(hidden=512),
-        )
+        reader = TwoStreamReader(pooling=pooling, most_views=most_views)
+        decoder = VertexDecoder(hidden=512)
     else:
         encoder = _photo_encoder(BENCH_BLOCKS)
-        reader, decoder = (
-            TwoStreamReader(BENCH_WIDTH, 2, 4, BENCH_HEAD, pooling, most_views),
-            VertexDecoder(hidden=BENCH_WIDTH),
-        )
+        reader = TwoStreamReader(BENCH_WIDTH, 2, 4, BENCH_HEAD, pooling, most_views)
+        decoder = VertexDecoder(hidden=BENCH_WIDTH)
     decoder = decoder.clone(tight=1, free=0, offset_scale=0.5, initial_log_scale=-4.0)
     conventions = Conventions(tokens="foreground", pixels="person", max_edge_length=0.0128)
     return _sized(size, conventions, encoder, reader, decoder)
@@ -253,10 +246,12 @@ def gst(size: Size = "published") -> HumanGSConfig:
 
 def ghg(size: Size = "published") -> HumanGSConfig:
     """GHG-style (`shell_textures`): copied colors on five shells; no transformer."""
-    published = size == "published"
-    reader = ShellTextureReader(SurfaceMap("atlas", 1024 if published else 48))
-    # texels of the bench are 4 cm wide on the innermost shell
-    decoder = ShellDecoder() if published else ShellDecoder((16, 24, 48), largest_scale=0.04)
+    if size == "published":
+        reader, decoder = ShellTextureReader(SurfaceMap("atlas", 1024)), ShellDecoder()
+    else:
+        # texels of the bench are 4 cm wide on the innermost shell
+        reader = ShellTextureReader(SurfaceMap("atlas", 48))
+        decoder = ShellDecoder((16, 24, 48), largest_scale=0.04)
     return _sized(size, Conventions(pixels="person"), PlainPhotos(), reader, decoder)
 
 
@@ -271,8 +266,9 @@ def gps(size: Size = "published") -> HumanGSConfig:
 
 
 def _photo_encoder(transformer: TransformerConfig, patch_size: int = 8) -> PatchTransformer:
-    """Of photos without cameras and poses: nothing reads the neural texture, so it is as small as
-    can be.
+    """Returns an encoder of photos without cameras and poses.
+
+    Nothing reads the neural texture, so it is as small as possible.
     """
     return PatchTransformer(patch_size, "place", TriplaneConfig(2, 1), transformer, upsampler=None)
 
@@ -295,8 +291,8 @@ SYSTEMS: dict[str, Callable[[Size], HumanGSConfig]] = {
     "ghg": ghg,
     "gps": gps,
 }
-"""By name; each is called with a `Size`."""
+"""{system: function from a `Size` to its configuration}."""
 ONE_PHOTO = ("lhm", "gst")
-"""Systems that refuse a second photo."""
+"""Systems that take only one photo."""
 ADDED = ("gps",)
-"""Systems that came after the bench's queue had begun, and so are its last."""
+"""Systems that were added after the bench's queue had begun, and so are the last of the queue."""
