@@ -195,9 +195,12 @@ def wham(rotations=ROTATIONS, places=PLACES, **more):
 
 def gvhmr():
     camera = parts(*down(ROTATIONS, PLACES + 1))
-    body = lambda values: {
-        key: value for key, value in values.items() if "hand" not in key and "jaw" not in key
-    }
+
+    def body(values):
+        return {
+            key: value for key, value in values.items() if "hand" not in key and "jaw" not in key
+        }
+
     return {
         "smpl_params_incam": body(camera),
         "smpl_params_global": body(parts()),

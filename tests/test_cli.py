@@ -120,7 +120,7 @@ def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, mo
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "problem"),
     [
         (
             "reconstruct me --refin 15s",
@@ -133,8 +133,8 @@ def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, mo
         ("synth --zzz", "--zzz: no option of humangs synth"),
     ],
 )
-def test_a_wrong_option_is_one_line_with_the_nearest(words, said, humangs):
-    assert humangs(*words.split()) == (cli.BAD_USAGE, "", f"humangs: error: {said}\n")
+def test_a_wrong_option_is_one_line_with_the_nearest(words, problem, humangs):
+    assert humangs(*words.split()) == (cli.BAD_USAGE, "", f"humangs: error: {problem}\n")
 
 
 def test_version_and_unknown_commands(humangs):

@@ -248,17 +248,19 @@ BAD_USAGE = {
     ),
     f"{FIT} --smoothness -1 --out new": "--smoothness -1: expected at least 0",
 }
-REFUSED = [(line, cli.BAD_DATA, said) for line, said in BAD_DATA.items()]
-REFUSED += [(line, cli.BAD_USAGE, said) for line, said in BAD_USAGE.items()]
+REFUSED = [(line, cli.BAD_DATA, problem) for line, problem in BAD_DATA.items()]
+REFUSED += [(line, cli.BAD_USAGE, problem) for line, problem in BAD_USAGE.items()]
 
 
 def contents(folder):
     return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
-@pytest.mark.parametrize(("line", "expected", "said"), REFUSED, ids=[line for line, *_ in REFUSED])
+@pytest.mark.parametrize(
+    ("line", "expected", "problem"), REFUSED, ids=[line for line, *_ in REFUSED]
+)
 def test_what_cannot_be_meant_is_one_line_before_the_work(
-    line, expected, said, things, monkeypatch, humangs
+    line, expected, problem, things, monkeypatch, humangs
 ):
     """Bad usage ends with 2, bad data with 1."""
     monkeypatch.chdir(things)
@@ -267,9 +269,9 @@ def test_what_cannot_be_meant_is_one_line_before_the_work(
     # stages that take seconds are shown: a busy machine shows "starting ..."
     shown = [each for each in err.splitlines() if not each.endswith(" ...")]
     assert len(shown) == 1 and out == "", (out, err)
-    assert shown[0].startswith("humangs: error: ") and said in shown[0], err
+    assert shown[0].startswith("humangs: error: ") and problem in shown[0], err
     assert code == expected and (
-        expected == cli.BAD_DATA or said[:2] != "--" or f"error: {said}" in err
+        expected == cli.BAD_DATA or problem[:2] != "--" or f"error: {problem}" in err
     )
     assert contents(things) == before
 

@@ -89,10 +89,13 @@ def rounds_to(value, stated, zeros):
 def unfounded(notebook):
     """Returns what the prose states and neither outputs nor code have."""
     text, shown, code = prose(notebook), printed(notebook), "\n".join(cells(notebook, "code"))
-    numbers = lambda where, unit="": [
-        float(found.replace(",", ""))
-        for found in re.findall(rf"(?<![\w.,])({NUMBER}){unit}", where)
-    ]
+
+    def numbers(where, unit=""):
+        return [
+            float(found.replace(",", ""))
+            for found in re.findall(rf"(?<![\w.,])({NUMBER}){unit}", where)
+        ]
+
     wrong = [found[0] for found in IN_WORDS.finditer(text)]
     for found in STATED.finditer(text):
         zeros, number, unit = found.groups()
@@ -133,7 +136,7 @@ def test_numbers_of_the_prose_are_in_the_outputs(notebook):
 
 def test_time_of_the_prose_is_the_time_of_the_run(notebook):
     first = " ".join(cells(notebook, "markdown")[0].split())
-    least, most = next(bounds for said, bounds in DURATIONS.items() if first.endswith(said))
+    least, most = next(bounds for duration, bounds in DURATIONS.items() if first.endswith(duration))
     took = re.search(
         r"this notebook took \d+ s, (\d+) s of CPU", "".join(outputs(notebook)[-1]["text"])
     )

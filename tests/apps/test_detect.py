@@ -139,10 +139,10 @@ def test_without_litert_it_is_one_line(tmp_path, capsys, monkeypatch):
         cli.execute(["detect", str(tmp_path / "photos"), "--out", str(tmp_path / "found")])
         == cli.BAD_DATA
     )
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     assert (
-        "error: finding people in photos needs LiteRT: pip install 'humangs_jax[photos]'" in said
-        and said.count("\n") == 1
+        "error: finding people in photos needs LiteRT: pip install 'humangs_jax[photos]'" in message
+        and message.count("\n") == 1
     )
 
 

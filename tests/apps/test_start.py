@@ -151,11 +151,11 @@ def test_what_is_missing_comes_with_its_tools(names, mine, capsys):
         assert "pip install 'humangs_jax[photos]'" in missing(inspect_folder(mine))[-1].how[0]
     code = cli.execute(["start", str(mine), "--out", "me"])
     out, err = capsys.readouterr()
-    told = " and ".join(", ".join(names).rsplit(", ", 1))
+    kinds = " and ".join(", ".join(names).rsplit(", ", 1))
     assert (
         code == cli.BAD_DATA
         and err
-        == f"humangs: error: photos: {told} missing: make them as above and run the same command"
+        == f"humangs: error: photos: {kinds} missing: make them as above and run the same command"
         " again\n"
     )
     for other, lines in TOOLS.items():
@@ -181,7 +181,7 @@ def test_keypoints_have_to_be_of_photos_without_lens_distortion(mine, capsys):
 @pytest.fixture
 def detected(mine, monkeypatch):
     """Replaces the detector and the fit; returns the list of the arguments that the fit gets."""
-    capture, told = load_capture("demo_capture"), []
+    capture, arguments = load_capture("demo_capture"), []
     points = np.nan_to_num(landmarks_in(capture, MEDIAPIPE_33.names))
     shown = []
     for v, name in enumerate(capture.names):
@@ -202,14 +202,14 @@ def detected(mine, monkeypatch):
         )
 
     def stop(self, known, ahead):
-        told.append(known)
+        arguments.append(known)
         raise ValueError("the fit")
         yield
 
     monkeypatch.setattr(blazepose, "available", lambda: True)
     monkeypatch.setattr(detect, "found_in_capture", lambda folder: shown)
     monkeypatch.setattr(FromPhotos, "_fit", stop)
-    return told
+    return arguments
 
 
 @pytest.mark.parametrize("names", [("keypoints",), ("masks",), ("masks", "keypoints")])
@@ -337,9 +337,10 @@ def test_two_people_are_refused_with_the_sheet_that_numbers_them(
 ):
     without(mine, "masks", "keypoints", *([] if calibrated else ["cameras"]))
     found = detect.found_in_capture(Path("me"))
-    named = lambda names, photos: [
-        dataclasses.replace(p, name=n) for n, p in zip(names, found, strict=True)
-    ]
+
+    def named(names, photos):
+        return [dataclasses.replace(p, name=n) for n, p in zip(names, found, strict=True)]
+
     monkeypatch.setattr(detect, "detect_photos", named)
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     numbered = f"expected one. Person 0 to 1: numbers on {sheet}"
@@ -599,11 +600,14 @@ def test_the_photo_that_is_held_out_of_a_person_who_turns_is_the_one_with_the_ne
     capture = capture_from_arrays(
         np.ones((4, 8, 8, 3)), K, matrices, np.zeros((1, 55, 3)), np.zeros((1, 3))
     )
-    of = lambda cameras, rotations: start._distances(
-        dataclasses.replace(
-            capture, cameras=cameras, poses=poses(rotations), frames=order.astype(np.int32)
+
+    def distances(cameras, rotations):
+        return start._distances(
+            dataclasses.replace(
+                capture, cameras=cameras, poses=poses(rotations), frames=order.astype(np.int32)
+            )
         )
-    )
-    found = of(before, turning)
-    np.testing.assert_allclose(found, of(around, still), atol=1e-5)
+
+    found = distances(before, turning)
+    np.testing.assert_allclose(found, distances(around, still), atol=1e-5)
     assert set(np.argwhere(found == found.min())[0].tolist()) == {2, 3}

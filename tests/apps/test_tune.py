@@ -39,7 +39,7 @@ def test_settings_come_back_from_their_file(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "problem"),
     [
         ("{", "line 1: not valid JSON"),
         ("[]", 'expected "kind": "humangs_jax settings"'),
@@ -56,13 +56,13 @@ def test_settings_come_back_from_their_file(name, tmp_path):
         ('{"kind": "humangs_jax settings", "settings": {"splat": "blurred"}}', "config.splat"),
     ],
 )
-def test_what_is_wrong_in_a_file_of_settings_is_one_line(content, said, tmp_path):
+def test_what_is_wrong_in_a_file_of_settings_is_one_line(content, problem, tmp_path):
     file = tmp_path / "tuned.json"
     file.write_text(content)
     with pytest.raises(ValueError) as caught:
         load_settings(file)
     text = str(caught.value)
-    assert text.startswith(f"{file}: ") and said in text and "\n" not in text
+    assert text.startswith(f"{file}: ") and problem in text and "\n" not in text
 
 
 def test_presets_have_one_set_of_names():

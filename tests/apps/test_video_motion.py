@@ -159,7 +159,7 @@ def test_an_interrupted_run_goes_on_where_it_was(scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "problem"),
     [
         ({"height": 172.0}, "expected metres, 0.4 to 2.5"),
         ({"focal_mm": 1.0}, "expected millimetres"),
@@ -167,8 +167,8 @@ def test_an_interrupted_run_goes_on_where_it_was(scene, tmp_path):
         ({"height": 1.7, "rest_joints": np.zeros((55, 3))}, "expected no avatar with it"),
     ],
 )
-def test_options_out_of_range_are_refused_before_the_work(scene, tmp_path, options, told):
-    with pytest.raises(ValueError, match=told):
+def test_options_out_of_range_are_refused_before_the_work(scene, tmp_path, options, problem):
+    with pytest.raises(ValueError, match=problem):
         fit_video(tmp_path / "me.mp4", **options)
     assert scene.looks == 0
 
@@ -203,8 +203,8 @@ def test_a_motion_knows_what_it_was_made_from(tmp_path):
 def test_the_command_writes_the_motion_and_refuses_the_files_of_others(scene, tmp_path, capsys):
     video, out = str(tmp_path / "me.mp4"), tmp_path / "m.npz"
     assert cli.execute(["motion", video, "--out", str(out), "--height", "1.7"]) == 0
-    said = capsys.readouterr().out
-    assert f"{COUNT} frames at 10 a second" in said and "--motion" in said
+    message = capsys.readouterr().out
+    assert f"{COUNT} frames at 10 a second" in message and "--motion" in message
     assert len(load_motion(out).translations) == COUNT and not list(tmp_path.glob("*.seen.npz"))
     # the same again replaces it; a motion that somebody else made stays
     assert cli.execute(["motion", video, "--out", str(out)]) == 0
@@ -216,6 +216,6 @@ def test_the_command_writes_the_motion_and_refuses_the_files_of_others(scene, tm
     (tmp_path / "text.mp4").write_text("no video")
     for name in ("text.mp4", "missing.mp4"):
         assert cli.execute(["motion", str(tmp_path / name), "--out", str(out)]) == cli.BAD_DATA
-        said = capsys.readouterr().err
-        assert name in said and said.strip().count("\n") == 0
+        message = capsys.readouterr().err
+        assert name in message and message.strip().count("\n") == 0
     assert scene.looks == looks

@@ -57,9 +57,9 @@ def clip(tmp_path, monkeypatch):
 
 def test_a_video_of_someone_who_turns_gives_photos_from_all_sides_and_their_times(clip, tmp_path):
     video, asked = clip
-    told = photos_of_video(video, tmp_path / "photos")
+    message = photos_of_video(video, tmp_path / "photos")
     known = read_json(tmp_path / "photos" / MARK)
-    assert "from all sides of the person" in told and known["by_direction"]
+    assert "from all sides of the person" in message and known["by_direction"]
     assert len(known["chosen"]) == 16 and max(np.diff(known["chosen"])) <= 4
     assert asked[0] == "detector" and set(asked[1:]) == {"landmarks"}  # found once, then followed
     names = sorted(path.stem for path in (tmp_path / "photos" / "images").iterdir())

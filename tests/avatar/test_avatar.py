@@ -100,7 +100,7 @@ def test_no_avatar_is_written_that_could_not_be_read(tmp_path):
     avatar = make_avatar()
     drawn = avatar.gaussians
     path = tmp_path / "nobody.npz"
-    for wrong, said in (
+    for wrong, problem in (
         (avatar.select(np.zeros(0, int)), "means: expected at least one Gaussian"),
         (
             unlike(avatar, rest_vertices=jnp.zeros((0, 3))),
@@ -117,7 +117,7 @@ def test_no_avatar_is_written_that_could_not_be_read(tmp_path):
             "skinning_weights: expected rows with the sum 1",
         ),
     ):
-        with pytest.raises(FileError, match=said) as caught:
+        with pytest.raises(FileError, match=problem) as caught:
             wrong.save(path)
         assert str(caught.value).startswith(f"{path}: ") and not any(tmp_path.iterdir())
 

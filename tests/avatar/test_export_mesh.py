@@ -236,11 +236,14 @@ def test_a_motion_that_was_exported_is_read_again(tmp_path):
     one, motion = avatar(), dance(4)
     write_mesh_glb(tmp_path / "a.glb", one, mesh(), motion)
     back = load_motion(tmp_path / "a.glb", rest_joints=one.rest_joints)
-    matrices = lambda m: (
-        Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3))
-        .as_matrix()
-        .reshape(4, 55, 3, 3)
-    )
+
+    def matrices(m):
+        return (
+            Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3))
+            .as_matrix()
+            .reshape(4, 55, 3, 3)
+        )
+
     np.testing.assert_allclose(matrices(back), matrices(motion), atol=1e-4)
     moved = np.asarray(back.translations - motion.translations)
     np.testing.assert_allclose(moved - moved[0], 0, atol=1e-4)
@@ -387,11 +390,14 @@ def test_blender_shows_our_frames_and_we_read_its_files(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     shown = np.load(tmp_path / "frame.npy") @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # z up to y up
     np.testing.assert_allclose(shown, skinned(tmp_path / "ours.glb", 2), atol=1e-4)
-    matrices = lambda m: (
-        Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3))
-        .as_matrix()
-        .reshape(4, 55, 3, 3)
-    )
+
+    def matrices(m):
+        return (
+            Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3))
+            .as_matrix()
+            .reshape(4, 55, 3, 3)
+        )
+
     for name in ("theirs.glb", "theirs.bvh"):
         back = grounded(load_motion(tmp_path / name, rest_joints=one.rest_joints), rest, PARENTS)
         np.testing.assert_allclose(matrices(back), matrices(motion), atol=1e-3, err_msg=name)

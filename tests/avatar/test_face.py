@@ -108,9 +108,10 @@ def test_an_even_stretch_of_the_skin_stretches_its_gaussians(someone):
 def test_teeth_are_drawn_only_between_open_lips(someone):
     body, plain, avatar = someone
     g = len(plain.gaussians.means)
-    shown = lambda **values: np.asarray(
-        animate(avatar, pose_with(avatar, body, **values)).opacities[g:]
-    )
+
+    def shown(**values):
+        return np.asarray(animate(avatar, pose_with(avatar, body, **values)).opacities[g:])
+
     in_mouth = np.asarray(avatar.face.in_mouth) > 0
     assert not shown(mouthSmileLeft=1.0)[in_mouth].any()
     opened = shown(jawOpen=1.0)

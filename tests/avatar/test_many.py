@@ -94,7 +94,7 @@ def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(netwo
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "problem"),
     [
         ("reconstruct people --out x.npz", "--out x.npz: expected a folder"),
         (
@@ -110,11 +110,13 @@ def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(netwo
         ("reconstruct people/a --batch 0", "--batch 0: expected at least 1"),
     ],
 )
-def test_what_cannot_be_meant_is_said_before_the_work(line, said, tmp_path, monkeypatch, humangs):
+def test_what_cannot_be_meant_is_said_before_the_work(
+    line, problem, tmp_path, monkeypatch, humangs
+):
     monkeypatch.chdir(tmp_path)
     for name in ("a", "b"):
         (tmp_path / "people" / name).mkdir(parents=True)
         (tmp_path / "people" / name / "capture.json").write_text("{}")
     code, out, err = humangs(*line.split())
-    assert (code, out) == (cli.BAD_USAGE, "") and said in err
+    assert (code, out) == (cli.BAD_USAGE, "") and problem in err
     assert [path.name for path in tmp_path.iterdir()] == ["people"]

@@ -575,11 +575,11 @@ def test_a_known_displacement_moves_the_skin_and_no_joint_alone_and_in_a_batch(b
     for avatar, photos in zip(together, captures, strict=True):
         alone = reconstruct(variables, config, photos)
         assert jax.tree.structure(avatar) == jax.tree.structure(alone)
-        of = lambda avatar: (avatar.rest_vertices, avatar.rest_joints, avatar.gaussians.means)
+        parts_of = lambda avatar: (avatar.rest_vertices, avatar.rest_joints, avatar.gaussians.means)
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4),
-            of(avatar),
-            of(alone),
+            parts_of(avatar),
+            parts_of(alone),
         )
 
 

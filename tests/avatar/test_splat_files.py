@@ -607,9 +607,11 @@ def test_other_files_of_gaussians_are_named_with_what_converts_them(name, messag
 
 
 def test_colors_of_other_spaces_are_told(tmp_path, caplog):
-    linear = lambda content: content["meshes"][0]["primitives"][0]["extensions"][EXTENSION].update(
-        colorSpace="lin_rec709_display"
-    )
+    def linear(content):
+        return content["meshes"][0]["primitives"][0]["extensions"][EXTENSION].update(
+            colorSpace="lin_rec709_display"
+        )
+
     (tmp_path / "a.glb").write_bytes(glb(scene(), change=linear))
     assert_close(hg.load_gaussians(tmp_path / "a.glb"), scene(), STEPS[".glb"])
     assert "lin_rec709_display" in caplog.text

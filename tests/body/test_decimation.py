@@ -114,20 +114,21 @@ def sphere(rings=12, radius=1.0, open_below=False):
         for a in angles
     ]
     vertices = np.concatenate([[[0, 1.0, 0]], np.reshape(grid, (-1, 3)), [[0, -1.0, 0]]])
-    at = lambda r, c: 1 + r * columns + c % columns
-    faces = [(0, at(0, c), at(0, c + 1)) for c in range(columns)]
+    vertex_at = lambda r, c: 1 + r * columns + c % columns
+    faces = [(0, vertex_at(0, c), vertex_at(0, c + 1)) for c in range(columns)]
     for r in range(len(angles) - 1):
         for c in range(columns):
             faces += [
-                (at(r, c), at(r + 1, c), at(r, c + 1)),
-                (at(r, c + 1), at(r + 1, c), at(r + 1, c + 1)),
+                (vertex_at(r, c), vertex_at(r + 1, c), vertex_at(r, c + 1)),
+                (vertex_at(r, c + 1), vertex_at(r + 1, c), vertex_at(r + 1, c + 1)),
             ]
     if open_below:
         vertices = vertices[:-1]
     else:
         last = len(vertices) - 1
         faces += [
-            (last, at(len(angles) - 1, c + 1), at(len(angles) - 1, c)) for c in range(columns)
+            (last, vertex_at(len(angles) - 1, c + 1), vertex_at(len(angles) - 1, c))
+            for c in range(columns)
         ]
     return radius * vertices, np.asarray(faces)
 

@@ -165,13 +165,16 @@ def write_opencv_yaml(file, K, poses, names):
 
 def write_opencv_json(file, K, poses, names):
     """Writes JSON as cv2.FileStorage does."""
-    entry = lambda m: {
-        "type_id": "opencv-matrix",
-        "rows": len(m),
-        "cols": m.shape[1],
-        "dt": "d",
-        "data": m.ravel().tolist(),
-    }
+
+    def entry(m):
+        return {
+            "type_id": "opencv-matrix",
+            "rows": len(m),
+            "cols": m.shape[1],
+            "dt": "d",
+            "data": m.ravel().tolist(),
+        }
+
     values = {"names": list(names)}
     for name, k, pose in zip(names, integer_centers(K), poses, strict=True):
         values |= {
@@ -225,11 +228,14 @@ SIZE = [WIDTH, HEIGHT]
 
 def panoptic():
     rows = zip(NAMES, K, POSES, strict=True)
-    entry = lambda n, k, p: {
-        "name": n,
-        "K": k.tolist(),
-        "R": p[:3, :3].tolist(),
-        "t": p[:3, 3:].tolist(),
-        "distCoef": LENS,
-    }
+
+    def entry(n, k, p):
+        return {
+            "name": n,
+            "K": k.tolist(),
+            "R": p[:3, :3].tolist(),
+            "t": p[:3, 3:].tolist(),
+            "distCoef": LENS,
+        }
+
     return {"cameras": [entry(*row) | {"resolution": SIZE, "type": "hd"} for row in rows]}

@@ -118,9 +118,10 @@ def _truth(model, betas, rotations, translations, turn, views):
     )
     azimuths = turn + jnp.arange(views) * (2 * jnp.pi / views)
     K = intrinsics_from_fov(1.0, SIZE, SIZE)
-    place = lambda center: orbit(
-        center, jnp.full(views, 3.4), azimuths, jnp.full(views, 0.15), K, SIZE, SIZE
-    )
+
+    def place(center):
+        return orbit(center, jnp.full(views, 3.4), azimuths, jnp.full(views, 0.15), K, SIZE, SIZE)
+
     return landmarks, joints, jax.vmap(place)(joints.mean(1))
 
 

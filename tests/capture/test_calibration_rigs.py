@@ -135,9 +135,10 @@ def test_dots_land_where_the_pinhole_says():
     )
     assert np.linalg.norm(pinhole - lens, axis=-1).max() > 4  # the lens matters
     columns, rows = np.meshgrid(np.arange(128) + 0.5, np.arange(100) + 0.5)
-    spots = lambda where: np.exp(
-        -((columns - where[0]) ** 2 + (rows - where[1]) ** 2) / (2 * 1.5**2)
-    )
+
+    def spots(where):
+        return np.exp(-((columns - where[0]) ** 2 + (rows - where[1]) ** 2) / (2 * 1.5**2))
+
     photo = sum(spots(where) for where in lens).astype(np.float32)
     straight = undistort(photo, K, coefficients, fill=0.0)
     for where in pinhole:

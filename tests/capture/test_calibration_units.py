@@ -25,12 +25,15 @@ def imported(tmp_path, unit, writer=written.write_calibration_full, name="rig.js
 
 def write_panoptic(file, K, poses, names):
     rows = zip(names, written.integer_centers(K).tolist(), poses, strict=True)
-    keys = lambda k, pose: {
-        "K": k,
-        "R": pose[:3, :3].tolist(),
-        "t": pose[:3, 3:].tolist(),
-        "distCoef": [0.0] * 5,
-    }
+
+    def keys(k, pose):
+        return {
+            "K": k,
+            "R": pose[:3, :3].tolist(),
+            "t": pose[:3, 3:].tolist(),
+            "distCoef": [0.0] * 5,
+        }
+
     file.write_text(
         json.dumps({"cameras": [{"name": name, **keys(k, pose)} for name, k, pose in rows]})
     )
@@ -44,11 +47,12 @@ def test_the_unit_is_the_one_that_puts_the_cameras_near_a_person(unit, word, tmp
 
 
 @pytest.mark.parametrize(
-    ("unit", "said"), [(0.01, "CMU Panoptic is in centimetres: taken"), (1.0, "taken for metres")]
+    ("unit", "message"),
+    [(0.01, "CMU Panoptic is in centimetres: taken"), (1.0, "taken for metres")],
 )
-def test_panoptic_is_in_centimetres_unless_that_cannot_be(unit, said, tmp_path):
+def test_panoptic_is_in_centimetres_unless_that_cannot_be(unit, message, tmp_path):
     report = imported(tmp_path, unit, write_panoptic, "calibration_1.json")
-    assert report.checks.distance == pytest.approx(2.3, rel=1e-3) and said in str(report)
+    assert report.checks.distance == pytest.approx(2.3, rel=1e-3) and message in str(report)
 
 
 def test_a_scale_that_is_given_is_taken_and_metres_need_no_words(tmp_path):
@@ -63,12 +67,15 @@ def multical(relations):
     `relations` names for each camera the one in whose axes it stands, or None for the world.
     """
     index = NAMES.index
-    lens = lambda i: {
-        "model": "standard",
-        "image_size": [written.WIDTH, written.HEIGHT],
-        "dist": [[0.0] * 5],
-        "K": K[i].tolist(),
-    }
+
+    def lens(i):
+        return {
+            "model": "standard",
+            "image_size": [written.WIDTH, written.HEIGHT],
+            "dist": [[0.0] * 5],
+            "K": K[i].tolist(),
+        }
+
     poses = {}
     for name, base in relations.items():
         pose = POSES[index(name)] @ (
@@ -131,7 +138,7 @@ LENS = (
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         ("annots.npy", b"\x93NUMPY\x01\0v\0{}", "an array of NumPy, such as annots.npy"),
         ("camchain.yaml", KALIBR.encode(), "a camchain of Kalibr"),
@@ -140,8 +147,8 @@ LENS = (
         ("none.json", b"", "none.json: not a known format"),
     ],
 )
-def test_what_is_no_calibration_is_described(name, content, said, tmp_path):
+def test_what_is_no_calibration_is_described(name, content, message, tmp_path):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(CaptureError, match=rf"{name}: .*expected COLMAP") as caught:
         read_calibration(tmp_path / name, lambda name: (1, 1))
-    assert said in str(caught.value) and "not a known format" in str(caught.value)
+    assert message in str(caught.value) and "not a known format" in str(caught.value)

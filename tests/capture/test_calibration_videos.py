@@ -36,9 +36,10 @@ def write_rig(folder, masks=False):
     for kind in ("videos", "masks") if masks else ("videos",):
         (folder / kind).mkdir()
         for camera, name in enumerate(NAMES):
-            level = lambda frame, kind=kind, camera=camera: (
-                1.0 if kind == "masks" else grey(camera, frame)
-            )
+
+            def level(frame, kind=kind, camera=camera):
+                return 1.0 if kind == "masks" else grey(camera, frame)
+
             write_video(
                 folder / kind / f"{name}.mp4", [np.full(shape, level(f)) for f in range(FRAMES)], 30
             )

@@ -125,8 +125,8 @@ def test_exchanged_hands_are_told_and_explain_the_sides_of_their_view_and_no_cam
     report = examine(capture, with_points(keypoints, exchange)).report
     (hands,) = [swap for swap in report.swaps if swap.kind == "hands"]
     assert report.swaps == (cameras, other, hands)
-    told = "view m0v1: the keypoints of the hands seem exchanged: each lies at the other wrist"
-    assert told in report.warnings and f"warning: {told}" in str(report)
+    message = "view m0v1: the keypoints of the hands seem exchanged: each lies at the other wrist"
+    assert message in report.warnings and f"warning: {message}" in str(report)
 
 
 def test_joints_that_turn_too_far(good):

@@ -290,13 +290,16 @@ def test_our_own_file_round_trips_exactly(tmp_path, keypoint_set):
 def people_file(path):
     """Writes a file of `humangs detect`; the second person is not in the second image."""
     rng = np.random.default_rng(2)
-    person = lambda: SeenPerson(
-        np.concatenate(
-            [rng.integers(0, 800, (33, 2)) / 4, rng.integers(1, 17, (33, 1)) / 16], axis=1
-        ),
-        rng.integers(-8, 8, (33, 3)) / 8,
-        0.5,
-    )
+
+    def person():
+        return SeenPerson(
+            np.concatenate(
+                [rng.integers(0, 800, (33, 2)) / 4, rng.integers(1, 17, (33, 1)) / 16], axis=1
+            ),
+            rng.integers(-8, 8, (33, 3)) / 8,
+            0.5,
+        )
+
     images = [
         ImagePeople(
             f"{name}.jpg", SIZE, tuple(None if (i, j) == (1, 1) else person() for j in range(2))
@@ -336,7 +339,7 @@ def test_a_person_of_our_detector_is_read_by_number(tmp_path, where):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "problem"),
     [
         (lambda c: c.update(set="faces"), "set: expected one of .*mediapipe33.*, got 'faces'"),
         (lambda c: c["images"][0].pop("people"), r"images\[0\]\.people: missing"),
@@ -346,11 +349,11 @@ def test_a_person_of_our_detector_is_read_by_number(tmp_path, where):
         ),
     ],
 )
-def test_damaged_files_of_our_detector_are_one_line(tmp_path, change, said):
+def test_damaged_files_of_our_detector_are_one_line(tmp_path, change, problem):
     path = tmp_path / "keypoints.json"
     people_file(path)
     edit_json(path, change)
-    with pytest.raises(CaptureError, match=said) as error:
+    with pytest.raises(CaptureError, match=problem) as error:
         read(path, person=0)
     assert "\n" not in str(error.value)
 

@@ -239,9 +239,12 @@ errors went from 20.1 to 17.2 mm, from 16.5 to 10.3 mm, and from 11.2 to 11.7 mm
 
 def test_a_set_without_a_table_has_places_that_change_nothing():
     kind = COCO_17
-    rest = lambda model: pose_landmarks(
-        model, jnp.zeros(1), BodyPose(0.3 * jnp.ones((55, 3)), jnp.zeros(3))
-    )[0]
+
+    def rest(model):
+        return pose_landmarks(model, jnp.zeros(1), BodyPose(0.3 * jnp.ones((55, 3)), jnp.zeros(3)))[
+            0
+        ]
+
     plain, placed = (
         landmark_model(default_body(), kind.names, places) for places in ((), kind.places)
     )
@@ -276,8 +279,11 @@ def test_several_frames_show_where_a_detector_sees_its_landmarks():
     for biased in (False, True):
         model = plain.moved(jnp.asarray(truth)) if biased else plain
         joints, _, seen = observe(frames, noise=1.0, model=model)
-        for finds, of in ((True, plain), (False, landmark_model(default_body(), kind.names))):
-            fit = fit_landmarks(of, seen)
+        for finds, fitted_model in (
+            (True, plain),
+            (False, landmark_model(default_body(), kind.names)),
+        ):
+            fit = fit_landmarks(fitted_model, seen)
             errors[biased, finds] = (
                 1000 * np.linalg.norm(np.asarray(fit.joints) - joints, axis=-1).mean()
             )
@@ -357,9 +363,12 @@ def test_size_and_place_in_space_do_not_count_and_unseen_landmarks_neither():
     world = 1.7 * jnp.einsum("cab,kb->cka", rotation, landmarks) - 2.0
     first = jax.tree.map(lambda leaf: leaf[0], seen)
     hidden = first.confidences.at[:, :5].set(0.0)
-    residuals = lambda world: world_residuals(
-        model, replace(first, confidences=hidden, world=world), landmarks, 5.0
-    )
+
+    def residuals(world):
+        return world_residuals(
+            model, replace(first, confidences=hidden, world=world), landmarks, 5.0
+        )
+
     np.testing.assert_allclose(residuals(world), 0, atol=2e-2)  # the size has a floor of 5 cm
     np.testing.assert_array_equal(residuals(world.at[:, :5].add(9.0))[:, :5], 0)
     assert float(jnp.abs(residuals(world.at[:, 8].add(0.5))).max()) > 0.5

@@ -91,10 +91,10 @@ def test_the_movement_that_is_told_is_that_across_the_line_of_sight():
     towards = np.asarray(one.cameras.center[0]) - np.asarray(one.poses.translation[0])
     towards = 0.2 * towards / np.linalg.norm(towards)
     aside = 0.2 * np.cross(towards, [0.0, 1.0, 0.0]) / np.linalg.norm(towards)
-    for shift, told in ((towards, "up to 1 cm"), (aside, "up to 13 cm")):
+    for shift, distance in ((towards, "up to 1 cm"), (aside, "up to 13 cm")):
         moved = one.poses.translation.at[0].add(jnp.asarray(shift, jnp.float32))
         poses = replace(one.poses, translation=moved)
-        assert told in movement_line(dataclasses.replace(one, poses=poses))
+        assert distance in movement_line(dataclasses.replace(one, poses=poses))
 
 
 def test_the_record_of_a_fit_has_a_row_for_each_photo():

@@ -322,9 +322,9 @@ def test_windows_cover_the_photo_at_every_scale_and_none_is_beside_it(size):
 
 
 def test_detections_of_one_person_are_one_and_the_best_is_kept():
-    person = lambda score, x, size: Detection(
-        score, np.asarray([x, 50.0]), np.asarray([x, 50.0 - size])
-    )
+    def person(score, x, size):
+        return Detection(score, np.asarray([x, 50.0]), np.asarray([x, 50.0 - size]))
+
     found = [
         person(0.9, 50.0, 20.0),
         person(0.8, 53.0, 22.0),

@@ -72,30 +72,30 @@ def scaled(step, factor):
     return Step(factor * step.landmarks, factor * step.views, factor * step.focal)
 
 
-def changes(evidence, of, step):
+def changes(evidence, slopes, step):
     """Returns what the derivatives predict for a step.
 
     The two arrays are changes of the residuals of landmarks in views, and of those that tie
     landmarks.
     """
-    seen = np.einsum("ckra,ka->ckr", of.by_landmark, step.landmarks) + np.einsum(
-        "ckra,ca->ckr", of.by_view, step.views
+    seen = np.einsum("ckra,ka->ckr", slopes.by_landmark, step.landmarks) + np.einsum(
+        "ckra,ca->ckr", slopes.by_view, step.views
     )
-    seen += of.by_focal * step.focal[evidence.kinds][:, None, None]
-    return seen, np.einsum("tka,ka->t", of.tied, step.landmarks)
+    seen += slopes.by_focal * step.focal[evidence.kinds][:, None, None]
+    return seen, np.einsum("tka,ka->t", slopes.tied, step.landmarks)
 
 
 @pytest.mark.parametrize(("views", "known"), [(1, 1), (3, 2), (4, 0)])
 def test_derivatives_are_those_of_central_differences(views, known):
     evidence, rig = problem(views, known=known)
-    of, rng = derivatives(evidence, rig, SCALE), np.random.default_rng(1)
+    slopes, rng = derivatives(evidence, rig, SCALE), np.random.default_rng(1)
     for _ in range(5):
         step = random_step(evidence, rig, rng, 1.0)
         after, before = (
             residuals(evidence, moved(evidence, rig, scaled(step, d)), SCALE)
             for d in (DIFFERENCE, -DIFFERENCE)
         )
-        seen, tied = changes(evidence, of, step)
+        seen, tied = changes(evidence, slopes, step)
         for name, found in (("seen", seen), ("tied", tied), ("focal", step.focal)):
             expected = (getattr(after, name) - getattr(before, name)) / (2 * DIFFERENCE)
             np.testing.assert_allclose(found, expected, atol=RELATIVE * np.abs(expected).max())
@@ -108,16 +108,18 @@ def test_the_depth_of_a_landmark_behind_the_camera_does_not_move_its_pixel():
     assert np.all(
         (behind.landmarks @ np.swapaxes(rig.rotations, -1, -2) + places[:, None])[..., 2] < NEAR
     )
-    of = derivatives(evidence, behind, SCALE)
+    slopes = derivatives(evidence, behind, SCALE)
     step = Step(np.zeros_like(rig.landmarks), np.zeros((3, VIEW)), np.zeros(2))
     deeper = behind.rotations[0].T @ [0.0, 0.0, 1.0]
     seen, _ = changes(
-        evidence, of, dataclasses.replace(step, landmarks=np.tile(deeper, (len(rig.landmarks), 1)))
+        evidence,
+        slopes,
+        dataclasses.replace(step, landmarks=np.tile(deeper, (len(rig.landmarks), 1))),
     )
     np.testing.assert_allclose(seen[0, :, :2], 0, atol=1e-9)
 
 
-def dense(evidence, rows, of):
+def dense(evidence, rows, slopes):
     """Returns all derivatives as one matrix and all residuals as one vector.
 
     Loops go over the blocks of landmarks, views and focal lengths.
@@ -128,12 +130,12 @@ def dense(evidence, rows, of):
     for v in range(c):
         for j in range(k):
             block = np.zeros((5, 3 * k + VIEW * c + g))
-            block[:, 3 * j : 3 * j + 3] = of.by_landmark[v, j]
-            block[:, 3 * k + VIEW * v : 3 * k + VIEW * (v + 1)] = of.by_view[v, j]
-            block[:, 3 * k + VIEW * c + evidence.kinds[v]] = of.by_focal[v, j]
+            block[:, 3 * j : 3 * j + 3] = slopes.by_landmark[v, j]
+            block[:, 3 * k + VIEW * v : 3 * k + VIEW * (v + 1)] = slopes.by_view[v, j]
+            block[:, 3 * k + VIEW * c + evidence.kinds[v]] = slopes.by_focal[v, j]
             J.append(block)
             r.append(rows.seen[v, j])
-    J.append(np.pad(of.tied.reshape(len(rows.tied), 3 * k), ((0, 0), (0, VIEW * c + g))))
+    J.append(np.pad(slopes.tied.reshape(len(rows.tied), 3 * k), ((0, 0), (0, VIEW * c + g))))
     J.append(np.pad(np.eye(g), ((0, 0), (3 * k + VIEW * c, 0))))
     return np.concatenate(J), np.concatenate([*r, rows.tied, rows.focal])
 
@@ -141,8 +143,8 @@ def dense(evidence, rows, of):
 @pytest.mark.parametrize(("views", "known"), [(1, 1), (3, 2), (5, 0)])
 def test_eliminated_landmarks_give_the_step_of_the_dense_normal_equations(views, known):
     evidence, rig = problem(views, known=known)
-    rows, of = residuals(evidence, rig, SCALE), derivatives(evidence, rig, SCALE)
-    normal, (J, r) = normal_equations(evidence, rows, of), dense(evidence, rows, of)
+    rows, slopes = residuals(evidence, rig, SCALE), derivatives(evidence, rig, SCALE)
+    normal, (J, r) = normal_equations(evidence, rows, slopes), dense(evidence, rows, slopes)
     k, m, damping = len(rig.landmarks), len(normal.by_cameras), 0.01
     # what is damped is what the elimination adds to its diagonals: not of the rows that tie
     # landmarks

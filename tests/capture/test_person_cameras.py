@@ -53,10 +53,13 @@ def test_exact_landmarks_give_exact_cameras_of_a_person_who_stands_upright_and_l
     assert angles.max() < EXACT_DEGREES and centers.max() < EXACT_METRES
     assert found.errors.max() < 0.5
     points = found.landmarks[0]
-    at = lambda name: points[NAMES.index(name)]
+    point_of = lambda name: points[NAMES.index(name)]
     assert points[:, 1].min() == pytest.approx(0, abs=1e-6)
-    assert at("nose")[1] > at("left_hip")[1] > at("left_ankle")[1]
-    assert at("left_shoulder")[0] > at("right_shoulder")[0] and at("nose")[2] > at("left_ear")[2]
+    assert point_of("nose")[1] > point_of("left_hip")[1] > point_of("left_ankle")[1]
+    assert (
+        point_of("left_shoulder")[0] > point_of("right_shoulder")[0]
+        and point_of("nose")[2] > point_of("left_ear")[2]
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -399,7 +402,10 @@ def test_a_fit_turns_the_camera_back_and_says_so_and_check_names_it(tmp_path):
     # a body that is wider than the masks: cameras stay only where the keypoints say that they are
     # right
     masks = np.zeros(truth.images.shape[:3], np.float32)
-    said = lambda capture, known: str(
-        check_capture(dataclasses.replace(capture, masks=masks), tmp_path / "x.png", known)
-    )
-    assert "--fixed-cameras" not in said(wrong, keypoints) + said(truth, None)
+
+    def report_of(capture, known):
+        return str(
+            check_capture(dataclasses.replace(capture, masks=masks), tmp_path / "x.png", known)
+        )
+
+    assert "--fixed-cameras" not in report_of(wrong, keypoints) + report_of(truth, None)

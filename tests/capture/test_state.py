@@ -19,10 +19,12 @@ def test_views_by_one_camera_share_it_and_equal_focal_lengths_are_one():
         64,
         48,
     )
-    of = lambda cameras: camera_origin(cameras, np.asarray([0, 0, 1]))
-    assert of(cameras).camera.tolist() == [0, 1, 0] and of(cameras).focal.tolist() == [0, 0, 0]
+    origin_of = lambda cameras: camera_origin(cameras, np.asarray([0, 0, 1]))
+    assert origin_of(cameras).camera.tolist() == [0, 1, 0] and origin_of(
+        cameras
+    ).focal.tolist() == [0, 0, 0]
     zoomed = replace(cameras, K=cameras.K.at[1, 0, 0].multiply(1.01))
-    assert of(zoomed).focal.tolist() == [0, 1, 0]
+    assert origin_of(zoomed).focal.tolist() == [0, 1, 0]
 
 
 def test_right_joints_are_mirror_images_of_left_ones_and_unknown_ones_have_no_limits():

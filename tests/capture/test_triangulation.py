@@ -356,10 +356,14 @@ def test_somebody_whom_one_view_alone_shows_stays_alone():
 
 
 def test_people_are_followed_over_time_by_where_they_are():
-    at = lambda x: Match((0, 0), (False, False), 0.0, np.asarray([x, 0.0, 0.0]))
+    match_at = lambda x: Match((0, 0), (False, False), 0.0, np.asarray([x, 0.0, 0.0]))
     alone = Match((0, None), (False, False), float("inf"), np.full(3, np.nan))
     a, b, later = in_order_of_time(
-        [[at(0.0), at(1.0)], [at(1.2), at(0.1)], [at(0.2), alone, at(5.0)]]
+        [
+            [match_at(0.0), match_at(1.0)],
+            [match_at(1.2), match_at(0.1)],
+            [match_at(0.2), alone, match_at(5.0)],
+        ]
     )
     assert [m.center[0] for m in a if m] == [0.0, 1.0] and a[2:] == [None, None]
     assert [m.center[0] for m in b if m] == [0.1, 1.2]

@@ -81,7 +81,7 @@ class Fit:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "problem"),
     [
         ({"steps": 0}, "steps 0: expected 1 to 1,000"),
         ({"steps": 10**6}, "steps 1000000: expected 1 to 1,000"),
@@ -93,10 +93,10 @@ class Fit:
         ({"most": 7}, "seven"),
     ],
 )
-def test_numbers_out_of_range_are_one_line(changes, said):
+def test_numbers_out_of_range_are_one_line(changes, problem):
     with pytest.raises(ValueError) as caught:
         Fit(**changes)
-    assert str(caught.value) == said or str(caught.value).startswith(f"Fit.{said}")
+    assert str(caught.value) == problem or str(caught.value).startswith(f"Fit.{problem}")
     with pytest.raises(ValueError) as caught:
         dataclasses.replace(Fit(), **changes)
     assert "\n" not in str(caught.value)
@@ -104,7 +104,7 @@ def test_numbers_out_of_range_are_one_line(changes, said):
 
 def test_a_file_names_the_path_of_the_field():
     assert config_from_json(Fit, '{"steps": 9, "most": null}') == Fit(steps=9)
-    for text, said in (
+    for text, problem in (
         ('{"steps": 0}', "config.steps 0: expected 1 to 1,000"),
         ('{"shares": [2]}', "config.shares 2: expected 0 to 1"),
         ('{"shares": ' + json.dumps([0] * 300) + "}", "config.shares: expected at most 256"),
@@ -114,7 +114,7 @@ def test_a_file_names_the_path_of_the_field():
     ):
         with pytest.raises(ValueError) as caught:
             config_from_json(Fit, text)
-        assert str(caught.value).startswith(said)
+        assert str(caught.value).startswith(problem)
     nested = json.loads(config_to_json(settings.PRESETS["best"]))
     nested["runtime"]["body_vertices"] = 0
     with pytest.raises(

@@ -254,9 +254,12 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(
         return read_view(*arguments)
 
     monkeypatch.setattr("humangs_jax.data.photos.read_view", reading)
-    examples = lambda cache: [
-        loader_of(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(s) for s in range(6)
-    ]
+
+    def examples(cache):
+        return [
+            loader_of(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(s) for s in range(6)
+        ]
+
     cache = CaptureCache(find_captures(folder), BODY, limit_bytes=limit)
     first = examples(cache)
     counts = [len(read)]

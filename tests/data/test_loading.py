@@ -29,9 +29,10 @@ SIZE = 4
 
 def toy_views(values, name):
     """Returns views in which each leaf holds the numbers `values` (v,)."""
-    fill = lambda *shape: jnp.broadcast_to(
-        values.reshape(-1, *[1] * len(shape)), (len(values), *shape)
-    )
+
+    def fill(*shape):
+        return jnp.broadcast_to(values.reshape(-1, *[1] * len(shape)), (len(values), *shape))
+
     return SubjectViews(
         images=fill(SIZE, SIZE, 3),
         masks=fill(SIZE, SIZE),
@@ -57,9 +58,10 @@ class CountingSource:
             time.sleep(self.delay(index))
         if index == self.broken_at:
             raise ValueError(f"example {index} of {self.name}")
-        views = lambda n: toy_views(
-            jnp.asarray([self.name, index, seed] + [0.0] * n, jnp.float32), ""
-        )
+
+        def views(n):
+            return toy_views(jnp.asarray([self.name, index, seed] + [0.0] * n, jnp.float32), "")
+
         return jax.tree.map(np.asarray, Example(views(input_count), views(1)))
 
     def describe(self, seed, index, input_count):

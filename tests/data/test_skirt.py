@@ -106,10 +106,13 @@ def in_clothes(body, rotations=None, worn=None, grown=0.0):
     K = intrinsics_from_fov(np.pi / 3, SIZE, SIZE)
     angles = jnp.linspace(0, 2 * np.pi, VIEWS + 1)[:-1]
     cameras = orbit(jnp.asarray([0.0, -0.5, 0.0]), 2.4, angles, 0.1, K, SIZE, SIZE)
+
     # a pixel belongs to the person where any part is seen
-    shown = lambda i: np.any(
-        [np.asarray(rasterizer()(*part, cameras[i]).face_ids) >= 0 for part in parts], axis=0
-    )
+    def shown(i):
+        return np.any(
+            [np.asarray(rasterizer()(*part, cameras[i]).face_ids) >= 0 for part in parts], axis=0
+        )
+
     masks = np.stack([shown(i) for i in range(VIEWS)]).astype(np.float32)
     return capture_from_arrays(
         np.ones((*masks.shape, 3), np.float32),
@@ -196,9 +199,12 @@ def test_a_skirt_bends_between_the_legs(body):
     worn, count = with_tube(body, 0.7), len(body.template)
     rest = shape_body(worn, jnp.zeros(len(worn.shape_names)))
     sides = np.asarray(worn.faces)[(np.asarray(worn.faces) >= count).all(-1)]
-    length = lambda x: np.linalg.norm(
-        np.asarray(x)[sides] - np.asarray(x)[np.roll(sides, -1, 1)], axis=-1
-    ).max()
+
+    def length(x):
+        return np.linalg.norm(
+            np.asarray(x)[sides] - np.asarray(x)[np.roll(sides, -1, 1)], axis=-1
+        ).max()
+
     posed = pose_body(worn, rest, BodyPose(turned_hips(worn, 30), jnp.zeros(3))).vertices
     assert length(posed) < STRETCH * length(rest.vertices)
     between = np.asarray(posed)[count:].reshape(ROWS, -1, 3)[:, GAP // 2]

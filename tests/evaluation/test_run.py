@@ -124,9 +124,11 @@ def test_people_who_are_scored_are_kept(people, tmp_path):
             raise KeyboardInterrupt
         return predicting(people)(case, background)
 
-    run = lambda **options: evaluate(
-        cases(people), method=method, keep=tmp_path / "kept", **{"page_images": 5, **options}
-    )
+    def run(**options):
+        return evaluate(
+            cases(people), method=method, keep=tmp_path / "kept", **{"page_images": 5, **options}
+        )
+
     with pytest.raises(KeyboardInterrupt):
         run()
     stop.clear()
@@ -152,9 +154,10 @@ def test_scores_of_other_photos_views_or_people_are_never_taken_for_kept_ones(pe
     (ann, _), (bob, _) = people["ann"], people["bob"]
     brighter = dataclasses.replace(ann, images=np.clip(ann.images + 0.1, 0, 1))
     renamed = Case("ann", bob)
-    run = lambda *cases, **options: (
-        evaluate(cases, method=white, keep=tmp_path / "kept", page_images=0, **options).rows
-    )
+
+    def run(*cases, **options):
+        return evaluate(cases, method=white, keep=tmp_path / "kept", page_images=0, **options).rows
+
     plain = lambda *cases: evaluate(cases, method=white, page_images=0).rows
     first = Case("ann", ann)
     assert run(first) == plain(first)
@@ -171,29 +174,34 @@ def test_scores_of_other_photos_views_or_people_are_never_taken_for_kept_ones(pe
 def test_a_folder_of_scores_made_with_other_inputs_weights_or_body_is_refused(
     people, folders, tmp_path
 ):
-    run = lambda **options: evaluate(
-        folders, **{"method": white, "keep": tmp_path / "kept", "page_images": 0, **options}
-    )
+    def run(**options):
+        return evaluate(
+            folders, **{"method": white, "keep": tmp_path / "kept", "page_images": 0, **options}
+        )
+
     views = {name: {"context": [0], "target": [1]} for name in people}
     run(inputs=1)
-    said = "written with settings other than asked for now "
-    with pytest.raises(ValueError, match=said + r"\(inputs 1 -> 2\)"):
+    problem = "written with settings other than asked for now "
+    with pytest.raises(ValueError, match=problem + r"\(inputs 1 -> 2\)"):
         run(inputs=2)
-    with pytest.raises(ValueError, match=said + r"\(indices None -> '\w+', inputs 1 -> None\)"):
+    with pytest.raises(ValueError, match=problem + r"\(indices None -> '\w+', inputs 1 -> None\)"):
         run(indices=views)
-    with pytest.raises(ValueError, match=said + r"\(body None -> '\w+'\)"):
+    with pytest.raises(ValueError, match=problem + r"\(body None -> '\w+'\)"):
         run(inputs=1, body=small_body())
-    with pytest.raises(ValueError, match=said + r"\(method .*, name .*\)"):
+    with pytest.raises(ValueError, match=problem + r"\(method .*, name .*\)"):
         run(inputs=1, method=predicting(people))
 
 
 def test_scores_of_images_that_were_drawn_again_are_not_kept(people, folders, tmp_path):
     theirs = tmp_path / "theirs"
     write_predictions(theirs, people)
-    run = lambda: [
-        row.scores["psnr"]
-        for row in evaluate(folders, predictions=theirs, keep=tmp_path / "kept").rows
-    ]
+
+    def run():
+        return [
+            row.scores["psnr"]
+            for row in evaluate(folders, predictions=theirs, keep=tmp_path / "kept").rows
+        ]
+
     before = run()
     write_png(theirs / "bob" / "left.png", np.zeros((40, 32, 3)))
     after = run()
@@ -318,29 +326,29 @@ def test_what_is_wrong_is_one_line(people, folders, tmp_path):
 
 def test_which_views_are_inputs_and_which_are_compared(people, folders, tmp_path):
     capture = people["ann"][0]
-    one = lambda *arguments, **options: find_people(*arguments, **options).load(0)
-    case = one(capture, 2)
+    first_person = lambda *arguments, **options: find_people(*arguments, **options).load(0)
+    case = first_person(capture, 2)
     assert case.inputs.names == ("front", "left") and case.truth.names == ("back", "right")
     assert (
-        one(folders, reconstructs=False).truth.names == NAMES
-        and one(folders, 1).truth.names == NAMES[1:]
+        first_person(folders, reconstructs=False).truth.names == NAMES
+        and first_person(folders, 1).truth.names == NAMES[1:]
     )
     (tmp_path / "views.json").write_text('{"ann": {"context": [3, 0], "target": [1]}}')
     indices = read_evaluation(tmp_path / "views.json")
-    case = one(folders, indices=indices)
+    case = first_person(folders, indices=indices)
     assert case.inputs.names == ("right", "front") and case.truth.names == ("left",)
     save_capture(folders / "ann" / "held_out", capture.select([3]))
-    case = one(folders)
+    case = first_person(folders)
     assert case.inputs.names == ("front", "left") and case.truth.names == ("right",)
-    assert one(folders, 1).inputs.names == ("front",)
+    assert first_person(folders, 1).inputs.names == ("front",)
     with pytest.raises(ValueError, match="indices: 'eve' is no capture in"):
-        one(folders, indices={"eve": {"context": [], "target": [0]}})
+        first_person(folders, indices={"eve": {"context": [], "target": [0]}})
     with pytest.raises(ValueError, match="indices: 'bob' is missing"):
         find_people(folders, indices=indices).load(1)
     with pytest.raises(ValueError, match="ann: expected views from 0 to 3 and at least one target"):
-        one(folders, indices={"ann": {"context": [0], "target": [4]}})
+        first_person(folders, indices={"ann": {"context": [0], "target": [4]}})
     with pytest.raises(ValueError, match="capture: 3 inputs, but 2 views show the first frame"):
-        one(capture, 3)
+        first_person(capture, 3)
 
 
 def test_inputs_stand_around_the_person():
@@ -481,17 +489,20 @@ def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, mo
         return score(predicted, truth, *rest)
 
     monkeypatch.setattr(evaluation, "score_views", score_views)
-    run = lambda *more: cli.execute(
-        [
-            "evaluate",
-            str(folders),
-            "--predictions",
-            str(tmp_path / "theirs"),
-            "--protocol",
-            "lhm",
-            *more,
-        ]
-    )
+
+    def run(*more):
+        return cli.execute(
+            [
+                "evaluate",
+                str(folders),
+                "--predictions",
+                str(tmp_path / "theirs"),
+                "--protocol",
+                "lhm",
+                *more,
+            ]
+        )
+
     kept = lambda: [file.name for file in (tmp_path / "cache").rglob("person_*.json")]
     assert run() == cli.INTERRUPTED and [name[:11] for name in kept()] == ["person_ann_"]
     interrupting.clear()

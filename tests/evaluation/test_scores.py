@@ -34,18 +34,21 @@ def torchmetrics_ssim(x, y):
     at = np.arange(11) - 5.0
     kernel = np.exp(-0.5 * (at / 1.5) ** 2)
     kernel = np.outer(kernel, kernel) / kernel.sum() ** 2
-    moment = lambda a: np.stack(
-        [
-            np.einsum(
-                "yxij,ij->yx",
-                np.lib.stride_tricks.sliding_window_view(
-                    np.pad(a[..., c], 5, mode="reflect"), (11, 11)
-                ),
-                kernel,
-            )
-            for c in range(3)
-        ]
-    )
+
+    def moment(a):
+        return np.stack(
+            [
+                np.einsum(
+                    "yxij,ij->yx",
+                    np.lib.stride_tricks.sliding_window_view(
+                        np.pad(a[..., c], 5, mode="reflect"), (11, 11)
+                    ),
+                    kernel,
+                )
+                for c in range(3)
+            ]
+        )
+
     mean_x, mean_y = moment(x), moment(y)
     variance_x = np.maximum(moment(x * x) - mean_x**2, 0)
     variance_y = np.maximum(moment(y * y) - mean_y**2, 0)

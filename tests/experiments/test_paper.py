@@ -249,11 +249,14 @@ def test_people_are_plain_and_a_system_without_poses_sees_one_of_them(tmp_path):
     config = bench.configuration(bench.variants()["lvsm"], 0, 4)
     make = lambda **how: people.on_disk(folder, **how)(config)
     both, one = make(), make(one_pose=True)
-    targets = lambda source: {
-        x.targets.rotations.tobytes() != x.inputs.rotations[:1].tobytes()
-        for i in range(12)
-        for x in [source.example(0, i, 4)]
-    }
+
+    def targets(source):
+        return {
+            x.targets.rotations.tobytes() != x.inputs.rotations[:1].tobytes()
+            for i in range(12)
+            for x in [source.example(0, i, 4)]
+        }
+
     assert targets(one) == {False} and targets(both) == {False, True}
     # recolored people have their color channels in another order, by example
     colored = make(recolored=True)

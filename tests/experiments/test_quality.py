@@ -53,14 +53,14 @@ def test_scores_by_task_are_means_over_views():
 @pytest.mark.slow
 @pytest.mark.parametrize("function", [quality.evaluation_views, bodies.evaluation_bodies])
 def test_wrong_options_are_one_line(function, capsys):
-    for said, option in {
+    for problem, option in {
         "--views": "--views=5",
         "--subjects": "--subjects=0",
         "reach beyond": "--first=999999",
     }.items():
         with pytest.raises(SystemExit) as exit_:
             run(function, option)
-        assert exit_.value.code == 2 and said in capsys.readouterr().err.splitlines()[-1]
+        assert exit_.value.code == 2 and problem in capsys.readouterr().err.splitlines()[-1]
 
 
 def mean_psnr(drawn, truth, chosen):

@@ -263,8 +263,11 @@ def test_every_system_has_both_sizes_of_the_same_parts():
     for make in SYSTEMS.values():
         published, bench = make("published"), make("bench")
         assert bench.conventions.image_size == 32 < published.conventions.image_size
-        kinds = lambda config: [
-            type(part) for part in (config.architecture.reader, config.architecture.decoder)
-        ]
+
+        def kinds(config):
+            return [
+                type(part) for part in (config.architecture.reader, config.architecture.decoder)
+            ]
+
         assert kinds(published) == kinds(bench)
     assert SYSTEMS["lhm_plus"]("bench").architecture.reader.pooling == 4

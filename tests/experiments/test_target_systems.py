@@ -56,10 +56,13 @@ def drawing(name):
 def draw(config, variables, inputs, queries):
     outputs, _ = apply_humangs(variables, inputs, config)
     own, nobody = part_variables(variables, "driver"), BodyPose(jnp.zeros((2, 3)), jnp.zeros(3))
-    one = lambda query: config.architecture.driver.apply(
-        own, outputs, Target(nobody, jnp.zeros((1, 3)), query), config.forward_context()
-    )
-    return jnp.stack([one(query) for query in queries])
+
+    def driven_by(query):
+        return config.architecture.driver.apply(
+            own, outputs, Target(nobody, jnp.zeros((1, 3)), query), config.forward_context()
+        )
+
+    return jnp.stack([driven_by(query) for query in queries])
 
 
 def frame_outputs(variables, outputs, body, at, config):
@@ -368,9 +371,12 @@ def test_a_sharper_softmax_of_views_takes_the_color_of_the_best_one():
     colors = {}
     for sharpness in (2.0, 4.0):
         reader = dataclasses.replace(config.architecture.reader, sharpness=sharpness)
-        read = lambda inputs, reader=reader: reader.apply(
-            {}, Encoding(inputs.images, None, jnp.int32(0)), inputs, config.forward_context()
-        )
+
+        def read(inputs, reader=reader):
+            return reader.apply(
+                {}, Encoding(inputs.images, None, jnp.int32(0)), inputs, config.forward_context()
+            )
+
         colors[sharpness] = jax.jit(read)(inputs).colors
     red = lambda sharpness: np.asarray(colors[sharpness][..., 0]).ravel()
     both = (
@@ -421,9 +427,14 @@ def test_a_target_is_drawn_from_the_two_photos_nearest_to_it():
     _, _, inputs, scene_of = stereo()
     scene, centers = scene_of(inputs), inputs.cameras.center  # at 0, 1.67, 3.33 and 5 radians
     assert nearest_pair(scene, centers[0]).opacities.shape == (2 * SIZE**2,)
-    used = lambda center, scene: {
-        i for i in range(4) if np.isin(inputs.images[i], nearest_pair(scene, center).colors).all()
-    }
+
+    def used(center, scene):
+        return {
+            i
+            for i in range(4)
+            if np.isin(inputs.images[i], nearest_pair(scene, center).colors).all()
+        }
+
     assert used(centers[0], scene) == {0, 3} and used(
         0.6 * centers[1] + 0.4 * centers[2], scene
     ) == {1, 2}

@@ -221,12 +221,13 @@ def hex_of_hex(times):
 
 def sparse(kind="csc", shape=(3, 3), indptr=(0, 1, 1, 1), indices=(0,)):
     """Returns instructions that make a sparse matrix, as scipy writes them."""
-    of = lambda values, code: array(
-        dtype(code), sizes(len(values)), raw(np.asarray(values, code).tobytes())
-    )
+
+    def array_of(values, code):
+        return array(dtype(code), sizes(len(values)), raw(np.asarray(values, code).tobytes()))
+
     state = EMPTY_DICT + MARK + word("_shape") + number(shape[0]) + number(shape[1]) + TUPLE2
-    state += word("data") + of((1.0,), "f8") + word("indices") + of(indices, "i4")
-    state += word("indptr") + of(indptr, "i8") + b"u"
+    state += word("data") + array_of((1.0,), "f8") + word("indices") + array_of(indices, "i4")
+    state += word("indptr") + array_of(indptr, "i8") + b"u"
     return name_of("scipy.sparse", f"{kind}_matrix") + EMPTY_TUPLE + NEWOBJ + state + BUILD
 
 

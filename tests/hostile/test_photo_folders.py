@@ -51,7 +51,7 @@ def good(folder, count=2):
         save(folder, f"good{i}.png", view(i % CAPTURE.view_count)[0])
 
 
-def one(change, name="odd.png", **options):
+def with_changed(change, name="odd.png", **options):
     """Returns a maker of a folder of two good photos and a changed one."""
 
     def make(folder):
@@ -160,23 +160,23 @@ FOLDERS = {
     "40 photos": (lambda folder: good(folder, 40), 40, ""),
     "a folder for each camera": (nested, 4, ""),
     "the same photo twice": (duplicates, 3, ""),
-    "a statue": (one(grey), 3, ""),
-    "CMYK": (one(lambda photo: photo, "odd.jpg", mode="CMYK"), 3, ""),
+    "a statue": (with_changed(grey), 3, ""),
+    "CMYK": (with_changed(lambda photo: photo, "odd.jpg", mode="CMYK"), 3, ""),
     "animated": (animated, 3, ""),
-    "turned by EXIF": (one(lambda photo: np.rot90(photo), exif=TURNED_BY_EXIF), 3, ""),
-    "mirrored": (one(lambda photo: photo[:, ::-1]), 3, ""),
-    "upside down": (one(lambda photo: photo[::-1, ::-1]), 3, ""),
-    "on its side": (one(np.rot90), 3, ""),
-    "mixed sizes": (one(lambda photo: resized(photo, 600, 600)), 3, ""),
-    "behind a table": (one(behind_a_table), 3, ""),
-    "far away": (one(far(1000, 1000, 120)), 3, ""),
+    "turned by EXIF": (with_changed(lambda photo: np.rot90(photo), exif=TURNED_BY_EXIF), 3, ""),
+    "mirrored": (with_changed(lambda photo: photo[:, ::-1]), 3, ""),
+    "upside down": (with_changed(lambda photo: photo[::-1, ::-1]), 3, ""),
+    "on its side": (with_changed(np.rot90), 3, ""),
+    "mixed sizes": (with_changed(lambda photo: resized(photo, 600, 600)), 3, ""),
+    "behind a table": (with_changed(behind_a_table), 3, ""),
+    "far away": (with_changed(far(1000, 1000, 120)), 3, ""),
     "somebody small beside": (beside((1.0, 0.4)), 2, ""),
     "another format under this name": (files(odd_png=jpeg()), 3, ""),
     # a warning that names the photo
-    "feet cut off": (one(lambda photo: photo[:300]), 3, OUTSIDE),
-    "cut at one side": (one(lambda photo: photo[:, 160:]), 3, OUTSIDE),
-    "an empty room among them": (one(lambda photo: room()), 3, NOBODY),
-    "a speck": (one(far(1000, 1000, 30)), 3, NOBODY),
+    "feet cut off": (with_changed(lambda photo: photo[:300]), 3, OUTSIDE),
+    "cut at one side": (with_changed(lambda photo: photo[:, 160:]), 3, OUTSIDE),
+    "an empty room among them": (with_changed(lambda photo: room()), 3, NOBODY),
+    "a speck": (with_changed(far(1000, 1000, 30)), 3, NOBODY),
     # one clear line
     "black": (only(dark=np.zeros((64, 48, 3))), None, r"no person in dark\.png: expected one"),
     "tiny photos": (
@@ -193,7 +193,7 @@ FOLDERS = {
     "an empty file": (files(odd_jpg=b""), None, r"odd\.jpg"),
     "a HEIC without the extra": (files(odd_heic=HEIC.read_bytes()), None, r"odd\.heic.*heic"),
     "one name with two suffixes": (
-        one(lambda photo: photo, "good0.jpg"),
+        with_changed(lambda photo: photo, "good0.jpg"),
         None,
         r"good0\.jpg and .*good0\.png",
     ),
@@ -251,18 +251,18 @@ def kinds(names, fast):
 def test_the_person_is_found_or_one_line_says_why_not(
     kind, remembered, tmp_path, monkeypatch, capsys
 ):
-    _, count, said = FOLDERS[kind]
+    _, count, expected = FOLDERS[kind]
     monkeypatch.chdir(tmp_path)
     code, errors, warnings = run(
         kind, ["detect", "photos", "--out", "found"], remembered, monkeypatch, capsys
     )
     if count is None:
         assert code == cli.BAD_DATA and len(errors) == 1 and not warnings
-        assert re.search(said, errors[0])
+        assert re.search(expected, errors[0])
         assert {path.name for path in Path("found").glob("*")} <= {"people.png"}
         return
     assert code == 0 and not errors
-    assert len(warnings) == bool(said) and all(re.search(said, line) for line in warnings)
+    assert len(warnings) == bool(expected) and all(re.search(expected, line) for line in warnings)
     images = read_people(Path("found/keypoints.json"))[1]
     assert len(images) == count
     for each in images:

@@ -468,10 +468,13 @@ def test_the_file_that_is_to_be_last_is_moved_last(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "replace", noted)
     names = ("a.json", "body.npz", "c.json")
-    write = lambda folder: (
-        folder.mkdir(exist_ok=True),
-        [(folder / name).touch() for name in names],
-    )
+
+    def write(folder):
+        return (
+            folder.mkdir(exist_ok=True),
+            [(folder / name).touch() for name in names],
+        )
+
     atomic.add_files(tmp_path / "me", write, last="body.npz")
     assert moved == ["a.json", "c.json", "body.npz"]
 

@@ -132,13 +132,15 @@ def test_a_damaged_photo_of_the_web_is_one_line(kind, tmp_path):
 
 
 def test_further_brands_tell_what_a_photo_is_whose_first_does_not():
-    box = lambda *brands: (
-        (16 + 4 * len(brands[1:])).to_bytes(4, "big")
-        + b"ftyp"
-        + brands[0]
-        + bytes(4)
-        + b"".join(brands[1:])
-    )
+    def box(*brands):
+        return (
+            (16 + 4 * len(brands[1:])).to_bytes(4, "big")
+            + b"ftyp"
+            + brands[0]
+            + bytes(4)
+            + b"".join(brands[1:])
+        )
+
     assert iso_kind(box(b"mif1", b"mif1", b"avif")) == iso_kind(box(b"avis")) == "AVIF"
     assert iso_kind(box(b"mif1", b"heic")) == iso_kind(box(b"heic", b"avif")) == "HEIF"
     assert iso_kind(box(b"mp42", b"heic")) is iso_kind(PLAIN) is None

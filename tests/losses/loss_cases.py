@@ -4,14 +4,19 @@ import functools
 
 import numpy as np
 
-fire = lambda i, inputs, squeezed, expanded: [
-    (f"{i}.squeeze", inputs, squeezed, 1),
-    (f"{i}.expand1x1", squeezed, expanded, 1),
-    (f"{i}.expand3x3", squeezed, expanded, 3),
-]
-three = lambda numbers, widths: [
-    (str(i), a, b, 3) for i, a, b in zip(numbers, (3, *widths), widths, strict=False)
-]
+
+def fire(i, inputs, squeezed, expanded):
+    return [
+        (f"{i}.squeeze", inputs, squeezed, 1),
+        (f"{i}.expand1x1", squeezed, expanded, 1),
+        (f"{i}.expand3x3", squeezed, expanded, 3),
+    ]
+
+
+def three(numbers, widths):
+    return [(str(i), a, b, 3) for i, a, b in zip(numbers, (3, *widths), widths, strict=False)]
+
+
 BACKBONES = {  # name, in, out, size of the convolutions that are looked at, as torchvision has them
     "vgg19": three(
         (0, 2, 5, 7, 10, 12, 14, 16, 19, 21, 23, 25, 28, 30),

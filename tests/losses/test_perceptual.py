@@ -72,9 +72,12 @@ def test_the_smallest_image(name):
     least = SMALLEST[name]
     assert perceptual.smallest_side(TABLES[name]) == least
     weights = jax.eval_shape(lambda key: random_weights(key, TABLES[name]), jax.random.key(0))
-    maps = lambda *size: jax.eval_shape(
-        lambda x, w: feature_maps(w, TABLES[name], x), jnp.zeros((*size, 3)), weights
-    )
+
+    def maps(*size):
+        return jax.eval_shape(
+            lambda x, w: feature_maps(w, TABLES[name], x), jnp.zeros((*size, 3)), weights
+        )
+
     assert all(min(x.shape) >= 1 for x, _ in maps(least, least))
     for size in ((least - 1, 64), (64, least - 1)):
         with pytest.raises(
@@ -99,9 +102,10 @@ POOLS = [Pool(2, 2, True), Pool(2, 2), Pool(), Pool(ceil=True)]
 def test_pools_against_their_definition(layer, size):
     x = np.random.default_rng(0).random((*size, 3)).astype(np.float32)
     reduce = np.mean if layer.average else np.max
-    starts = lambda side: range(
-        0, side - (1 if layer.ceil else layer.size - 1), 2
-    )  # a window may stick out by one
+
+    def starts(side):
+        return range(0, side - (1 if layer.ceil else layer.size - 1), 2)
+
     window = lambda i, j: reduce(x[i : i + layer.size, j : j + layer.size], axis=(0, 1))
     expected = [[window(i, j) for j in starts(size[1])] for i in starts(size[0])]
     np.testing.assert_allclose(pooled(layer, jnp.asarray(x)), expected, rtol=1e-6)
@@ -185,9 +189,10 @@ def test_the_golden_numbers():
     """The numbers are the project's golden perceptual_a."""
     golden, vgg = np.load(DATA / "perceptual_a.npz"), made_up("vgg19")
     images = [jnp.asarray(golden[name].transpose(0, 2, 3, 1)) for name in ("predicted", "target")]
-    batched = lambda *images: jax.vmap(
-        lambda *x: (perceptual_errors(vgg, *x), perceptual_loss(vgg, *x))
-    )(*images)
+
+    def batched(*images):
+        return jax.vmap(lambda *x: (perceptual_errors(vgg, *x), perceptual_loss(vgg, *x)))(*images)
+
     errors, losses = jax.jit(batched)(*images)
     np.testing.assert_allclose(errors.mean(axis=0), golden["errors"], rtol=FLOAT32)
     np.testing.assert_allclose(losses.mean(), golden["total"], rtol=FLOAT32)

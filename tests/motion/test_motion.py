@@ -84,9 +84,10 @@ def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
     """The command's help and `load_motion` know a new row; of two formats of a file, its content
     tells which one it is.
     """
-    standing = lambda path, reading: Poses(
-        np.zeros((2, 55, 3)), np.zeros((2, 3)), float(path.read_text())
-    )
+
+    def standing(path, reading):
+        return Poses(np.zeros((2, 55, 3)), np.zeros((2, 3)), float(path.read_text()))
+
     monkeypatch.setitem(
         MOTIONS,
         "toy",
@@ -180,8 +181,8 @@ def test_where_the_floor_agrees_another_axis_is_up_and_it_is_said(
         write(tmp_path / "a.npz", **arrays(*in_world(expected, translations, UP[up])))
     )
     np.testing.assert_allclose(motion.translations, translations, atol=2 * FLOAT32)
-    said = f"{tmp_path / 'a.npz'}: {up} is up, not {usual}"
-    assert [line.startswith(said) for line in caplog.messages] == ([] if up == usual else [True])
+    warning = f"{tmp_path / 'a.npz'}: {up} is up, not {usual}"
+    assert [line.startswith(warning) for line in caplog.messages] == ([] if up == usual else [True])
 
 
 def test_who_stands_still_may_lie_and_that_is_said(tmp_path, caplog):

@@ -153,9 +153,10 @@ def test_joints_between_those_we_know_turn_bones_too(tmp_path):
     shoulder = clips[0].names.index("LeftArm")
     turns[:, shoulder] = clips[0].turns[:, shoulder]  # as if another joint below it had turned
     rotations, translations, _ = retargeted(dataclasses.replace(clips[1], turns=turns), rest)
-    direction = lambda poses: np.diff(
-        places_of(rest, poses, translations + rest[0])[:, [arm, elbow]], axis=1
-    )
+
+    def direction(poses):
+        return np.diff(places_of(rest, poses, translations + rest[0])[:, [arm, elbow]], axis=1)
+
     np.testing.assert_allclose(direction(rotations), direction(bent), atol=EXACT)
 
 
@@ -189,10 +190,13 @@ def test_feet_stay_on_the_ground_on_another_body(tmp_path, names):
         tmp_path, write_bvh(source, poses, names, frame, moves), rest_joints=target
     )
     ours = places_of(target, rotations, translations + target[0])
-    legs = lambda rest: sum(
-        np.linalg.norm(rest[INDEX[f"left_{b}"]] - rest[INDEX[f"left_{a}"]])
-        for a, b in (("hip", "knee"), ("knee", "ankle"))
-    )
+
+    def legs(rest):
+        return sum(
+            np.linalg.norm(rest[INDEX[f"left_{b}"]] - rest[INDEX[f"left_{a}"]])
+            for a, b in (("hip", "knee"), ("knee", "ankle"))
+        )
+
     expected = np.where(np.arange(frames) == 4, 0.25 * legs(target) / legs(source), 0)
     feet = ours[:, [ankle, INDEX["right_ankle"]], 1]
     np.testing.assert_allclose(feet - feet[0], np.stack([expected] * 2, 1), atol=1e-4)

@@ -435,9 +435,12 @@ def triple(options, seed=0):
             network.subject({name: take(name, x).astype(np.float64) for name, x in arrays.items()})
         )
     per_view = ("mid_tokens", "mid_feature_map_stride4")
-    join = lambda name: (np.concatenate if name in per_view else np.stack)(
-        [stages[name] for stages in subjects]
-    )
+
+    def join(name):
+        return (np.concatenate if name in per_view else np.stack)(
+            [stages[name] for stages in subjects]
+        )
+
     return (
         state,
         arrays | {name: join(name).astype(np.float32) for name in subjects[0]},

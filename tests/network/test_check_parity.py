@@ -154,9 +154,12 @@ def test_ties_of_posed_rotations_are_free_and_nothing_else_is():
         check_parity.TIES: readings,
         check_parity.TIE_LEVELS: np.asarray([[[1.001, 1, 0.2, 0]]]),
     }
-    error = lambda reference, bound: check_parity.relative_errors(
-        found, {"posed_rotations": np.asarray(reference).reshape(1, 1, 4)}, bound
-    )["posed_rotations"]
+
+    def error(reference, bound):
+        return check_parity.relative_errors(
+            found, {"posed_rotations": np.asarray(reference).reshape(1, 1, 4)}, bound
+        )["posed_rotations"]
+
     assert error([0.6, 0.5, 0, 0], 0) == 0 and error([-0.4, -0.7, 0, 0], 2e-3) == 0
     assert error([0.4, 0.7, 0, 0], 5e-4) > 0.2 and error([0, 0, 0, 0.7], 2e-3) > 0.2
 

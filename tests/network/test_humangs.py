@@ -246,9 +246,12 @@ def test_unseen_vertices_are_grey_and_pool_nothing():
 def padded(inputs, views):
     """Returns the inputs with garbage behind their views."""
     missing = views - len(inputs.images)
-    extend = lambda x, junk: jnp.concatenate(
-        [x, jnp.broadcast_to(jnp.asarray(junk, x.dtype), (missing, *x.shape[1:]))]
-    )
+
+    def extend(x, junk):
+        return jnp.concatenate(
+            [x, jnp.broadcast_to(jnp.asarray(junk, x.dtype), (missing, *x.shape[1:]))]
+        )
+
     return replace(
         inputs,
         images=extend(inputs.images, 0.9),
@@ -287,10 +290,10 @@ def loss(variables, inputs, config):
 
 @functools.partial(jax.jit, static_argnames="config")
 def gradients(variables, continuous, inputs, config):
-    of = lambda params, continuous: loss(
-        {**variables, "params": params}, replace(inputs, **continuous), config
-    )
-    return jax.grad(of, (0, 1))(variables["params"], continuous)
+    def outputs_of(params, continuous):
+        return loss({**variables, "params": params}, replace(inputs, **continuous), config)
+
+    return jax.grad(outputs_of, (0, 1))(variables["params"], continuous)
 
 
 @pytest.mark.slow
@@ -354,9 +357,9 @@ def test_configurations_that_do_not_fit_are_refused(make, message):
 
 
 def test_images_must_be_those_of_the_cameras():
-    apply = lambda inputs: jax.eval_shape(
-        lambda x: apply_humangs(variables_of(TINY), x, TINY), inputs
-    )
+    def apply(inputs):
+        return jax.eval_shape(lambda x: apply_humangs(variables_of(TINY), x, TINY), inputs)
+
     inputs = random_inputs()
     with pytest.raises(ValueError, match="32 x 32 but their cameras say 64 x 32"):
         apply(replace(inputs, cameras=replace(inputs.cameras, width=64)))

@@ -100,9 +100,9 @@ def test_conventions():
 
 
 def test_half_pixel_sampling_reproduces_a_ramp_at_any_resolution():
-    ramp = lambda n, size: (
-        (jnp.arange(n) + 0.5) * size / n
-    )  # each texel holds its centre's pixel position
+    def ramp(n, size):
+        return (jnp.arange(n) + 0.5) * size / n
+
     pixels = jnp.asarray([[3.0, 5.0], [7.25, 2.0]])
     for n in (4, 16):
         grid = jnp.broadcast_to(ramp(n, 16.0)[None, :, None], (n, n, 1))
@@ -226,10 +226,12 @@ def test_in_a_loop_all_of_its_convolutions_are_those_that_the_library_knows(batc
     """XLA makes nested loops over single numbers of other ones."""
 
     def total_gradient(xs, kernel):
-        add = lambda total, x: (
-            total + jax.grad(lambda k: jnp.sum(jnp.sin(convolve(x, k))))(kernel),
-            None,
-        )
+        def add(total, x):
+            return (
+                total + jax.grad(lambda k: jnp.sum(jnp.sin(convolve(x, k))))(kernel),
+                None,
+            )
+
         return jax.lax.scan(add, jnp.zeros_like(kernel), xs)[0]
 
     shapes = [
@@ -278,9 +280,10 @@ def test_gradients_are_finite_wherever_one_reads():
         [[2.0, 2.0], [-1.0, 0.0], [-0.5, 4.5], [1e30, 0], [np.nan, 1], [WIDTH - 1, HEIGHT - 1]]
     )
     grid = jnp.asarray(np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, CHANNELS)), jnp.float32)
-    total = lambda grid, positions: sum(
-        jnp.sum(jnp.sin(x)) for x in sample_neighborhoods(grid, positions)
-    )
+
+    def total(grid, positions):
+        return sum(jnp.sum(jnp.sin(x)) for x in sample_neighborhoods(grid, positions))
+
     of_grid, of_positions = jax.grad(total, (0, 1))(grid, positions)
     assert np.isfinite(of_grid).all() and np.isfinite(of_positions).all()
     assert np.array_equal(of_positions[3:5], np.zeros((2, 2))) and np.abs(of_grid).max() > 0

@@ -298,9 +298,10 @@ def test_batches_by_vmap_and_gradients_are_finite():
     # near the rim of a silhouette, where few views weigh little, rounding in float32 moves a mean
     # by 1e-5
     assert np.allclose(batched.colors[1], read(arguments).colors, atol=1e-4)
-    total = lambda images, vertices: jnp.sum(
-        read((images, *arguments[1:4], vertices, *arguments[5:])).colors
-    )
+
+    def total(images, vertices):
+        return jnp.sum(read((images, *arguments[1:4], vertices, *arguments[5:])).colors)
+
     for gradient in jax.grad(total, (0, 1))(arguments[0], arguments[4]):
         assert np.isfinite(gradient).all() and np.any(gradient)
 

@@ -158,9 +158,12 @@ def test_outputs_are_those_of_the_quarters():
     """A network that is cut off after a quarter gives that quarter's raw output."""
     outputs = network(CONFIG).apply(VARIABLES, TOKENS)
     assert len(outputs) == 4
-    blocks = lambda n: {
-        k: v for k, v in VARIABLES["params"].items() if k in {f"block_{i}" for i in range(n)}
-    }
+
+    def blocks(n):
+        return {
+            k: v for k, v in VARIABLES["params"].items() if k in {f"block_{i}" for i in range(n)}
+        }
+
     rest = {k: VARIABLES["params"][k] for k in ("input_norm", "norm")}
     short = network(dataclasses.replace(CONFIG, layers=4))
     quarters = short.apply(

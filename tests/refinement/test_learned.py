@@ -115,9 +115,10 @@ def test_clusters_carry_what_one_end_knows_to_the_other(scene):
     values, graph = stacked(parameters), graph_of(np.asarray(avatar.gaussians.means))
     signals = jax.tree.map(lambda x: x[None], signals_of(scene))
     hidden = jnp.zeros((len(values), Refiner.width))
-    moves = lambda hidden: (
-        iterate(load_refiner(), values, values, hidden, signals, graph, avatar)[0] - values
-    )
+
+    def moves(hidden):
+        return iterate(load_refiner(), values, values, hidden, signals, graph, avatar)[0] - values
+
     lowest, highest = np.argsort(np.asarray(values[:, 1]))[[0, -1]]
     changed = moves(hidden.at[lowest].set(10.0)) - moves(hidden)
     assert np.abs(changed[highest]).max() > 0
@@ -203,9 +204,12 @@ def test_the_order_of_photos_does_not_matter(scene):
             for shape in ((3, g, COLUMNS), (3, g), (3, g))
         )
     )
-    run = lambda s: iterate(
-        load_refiner(), values, values, jnp.zeros((g, Refiner.width)), s, graph, avatar
-    )[0]
+
+    def run(s):
+        return iterate(
+            load_refiner(), values, values, jnp.zeros((g, Refiner.width)), s, graph, avatar
+        )[0]
+
     np.testing.assert_allclose(
         run(signals), run(jax.tree.map(lambda x: x[::-1], signals)), atol=ROUNDING
     )

@@ -381,9 +381,10 @@ def test_a_trial_that_loses_leaves_the_avatar_alone(four, monkeypatch):
 def shifted(capture, pixels):
     """Returns the capture with each photo moved in another direction."""
     steps = [(pixels, 0), (0, pixels), (-pixels, 0), (0, -pixels)]
-    moved = lambda stack: np.stack(
-        [np.roll(x, step, (0, 1)) for x, step in zip(stack, steps, strict=True)]
-    )
+
+    def moved(stack):
+        return np.stack([np.roll(x, step, (0, 1)) for x, step in zip(stack, steps, strict=True)])
+
     return dataclasses.replace(capture, images=moved(capture.images), masks=moved(capture.masks))
 
 
@@ -482,9 +483,12 @@ def test_held_out_pixels_decide_on_the_iterations_of_few_photos(
 
 def test_what_makes_the_photos_worse_is_not_returned(person, monkeypatch):
     """This also holds if nothing is held out, so that the search keeps its last state."""
-    worse = lambda own, state, *_: replace(
-        state, parameters=replace(state.parameters, means=state.parameters.means + 0.2)
-    )
+
+    def worse(own, state, *_):
+        return replace(
+            state, parameters=replace(state.parameters, means=state.parameters.means + 0.2)
+        )
+
     stepping(monkeypatch, worse)
     report = refinement.refine_with_report(*person, dataclasses.replace(STEPS, steps=2))
     assert not report.kept and report.loss[0] == report.loss[1]

@@ -123,9 +123,11 @@ def analyse(splats, lists, grid, config, g, g_transmittance) -> Analysed:
         b_slope = np.where(slope != 0, b_slope + slope_size * (e_raw + 3), 0)
 
         # moments about the tile's centre, moved to the splat's: terms as large as |pixel| + |splat|
-        powers = lambda a, b: np.stack(
-            [np.ones_like(a * b), a + 0 * b, b + 0 * a, a * a + 0 * b, a * b, b * b + 0 * a]
-        )
+        def powers(a, b):
+            return np.stack(
+                [np.ones_like(a * b), a + 0 * b, b + 0 * a, a * a + 0 * b, a * b, b * b + 0 * a]
+            )
+
         moments = powers(px - x, py - y), powers(abs(px) + abs(x), abs(py) + abs(y))
         roundings = p + t + 10
         np.add.at(sums[:, :6], chosen, np.einsum("cnp,np->nc", moments[0], slope))

@@ -112,9 +112,10 @@ def test_the_median_depth_is_where_half_of_the_light_is_left():
 def test_the_median_depth_passes_no_gradient_and_a_small_step_does_not_change_its_kind():
     with jax.enable_x64(True):
         gaussians = wall([3.0, 2.0, 4.0], [0.3, 0.3, 0.1])
-        total = lambda o: jnp.sum(
-            render(replace(gaussians, opacities=o), camera(), ALL).depth_median
-        )
+
+        def total(o):
+            return jnp.sum(render(replace(gaussians, opacities=o), camera(), ALL).depth_median)
+
         gradient = jax.jit(jax.grad(total))(gaussians.opacities)
         assert (gradient == 0).all()
         assert total(gaussians.opacities + 1e-7) == pytest.approx(total(gaussians.opacities))

@@ -75,12 +75,15 @@ def test_moving_world_and_camera_together_changes_nothing(float64):
 def test_determinant_of_a_needle_is_accurate_in_float32():
     scales = [[1000.0, 1e-4, 1e-4]] * 3
     quats = [[np.cos(a), 0, 0, np.sin(a)] for a in (0.1, np.pi / 8, 1.0)]  # turned within the image
-    gaussians = lambda dtype: Gaussians(
-        *(
-            jnp.asarray(a, dtype)
-            for a in ([[0.1, 0.2, 2.0]] * 3, quats, scales, [1.0] * 3, [[1.0] * 3] * 3)
+
+    def gaussians(dtype):
+        return Gaussians(
+            *(
+                jnp.asarray(a, dtype)
+                for a in ([[0.1, 0.2, 2.0]] * 3, quats, scales, [1.0] * 3, [[1.0] * 3] * 3)
+            )
         )
-    )
+
     with jax.enable_x64(True):
         exact = project(gaussians(np.float64), camera(np.float64))
     rounded = project(gaussians(np.float32), camera(np.float32))

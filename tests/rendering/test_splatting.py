@@ -324,12 +324,13 @@ def test_traced_calls_warn_of_what_did_not_fit_where_asked(draw, caplog):
     )
     small = dataclasses.replace(CHUNKS, max_pairs=64)
     asking = dataclasses.replace(small, warn_overflow=True)
-    loss = lambda opacities, config: draw(
-        replace(gaussians, opacities=opacities), cameras, config
-    ).rgb.sum()
-    program = lambda config: str(
-        jax.make_jaxpr(jax.grad(loss), static_argnums=1)(gaussians.opacities, config)
-    )
+
+    def loss(opacities, config):
+        return draw(replace(gaussians, opacities=opacities), cameras, config).rgb.sum()
+
+    def program(config):
+        return str(jax.make_jaxpr(jax.grad(loss), static_argnums=1)(gaussians.opacities, config))
+
     assert "callback" not in program(small) and "debug_callback" in program(asking)
     drawn = jax.jit(loss, static_argnums=1)
     with caplog.at_level(logging.WARNING):

@@ -97,9 +97,12 @@ def test_the_texture_says_what_the_materials_say(person, baked):
     weights = rng.dirichlet(np.ones(3), size=4000).astype(np.float32)
     albedo, slopes = subject.paint(person, faces, subject.spots_at(person, faces, weights))
     uv = sum(weights[:, i : i + 1] * baked.atlas.uvs[baked.atlas.faces[faces, i]] for i in range(3))
-    look = lambda texture: np.asarray(
-        sample_texture(jnp.asarray(texture, jnp.float32), jnp.asarray(uv[None]))
-    )[0]
+
+    def look(texture):
+        return np.asarray(sample_texture(jnp.asarray(texture, jnp.float32), jnp.asarray(uv[None])))[
+            0
+        ]
+
     error = np.abs(look(baked.albedo) / 255 - np.clip(albedo, 0, 1))
     assert np.median(error) < 0.01 and error.mean() < 0.04  # edges of patterns are a texel wide
     bent = (look(baked.slopes) - bank.SLOPE_ZERO) * bank.SLOPE_STEP

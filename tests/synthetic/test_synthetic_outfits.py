@@ -48,9 +48,10 @@ def test_people_differ(people):
 
 def test_clothes_go_together(people):
     for person in people:
-        count = lambda kinds, person=person: sum(
-            garment.kind in kinds for garment in person.garments
-        )
+
+        def count(kinds, person=person):
+            return sum(garment.kind in kinds for garment in person.garments)
+
         assert count(outfits.DRESSES + outfits.TOPS) >= 1
         assert (
             count(outfits.DRESSES + outfits.BOTTOMS + outfits.SKIRTS) == count(outfits.SHOES) == 1

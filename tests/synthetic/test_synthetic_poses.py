@@ -61,9 +61,12 @@ def posed(body):
 def test_halfway_rotations_are_on_the_way(numbers, t):
     a, b = np.asarray(numbers[:3]), np.asarray(numbers[3:])
     middle = kin.between(a, b, t)
-    angle = lambda x, y: np.linalg.norm(
-        kin.rotation_vector(kin.rotation_matrix(x).T @ kin.rotation_matrix(y))
-    )
+
+    def angle(x, y):
+        return np.linalg.norm(
+            kin.rotation_vector(kin.rotation_matrix(x).T @ kin.rotation_matrix(y))
+        )
+
     np.testing.assert_allclose(
         [angle(a, middle), angle(middle, b)], [t * angle(a, b), (1 - t) * angle(a, b)], atol=1e-6
     )
@@ -169,13 +172,13 @@ def winding_numbers(points, vertices, faces):
     """
     dot = lambda x, y: jnp.sum(x * y, axis=-1)
 
-    def one(point):
+    def winding_number(point):
         a, b, c = (vertices[faces[:, i]] - point for i in range(3))
         la, lb, lc = (jnp.linalg.norm(x, axis=-1) for x in (a, b, c))
         below = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
         return jnp.sum(2 * jnp.arctan2(dot(a, jnp.cross(b, c)), below)) / (4 * jnp.pi)
 
-    return jax.lax.map(one, points, batch_size=64)
+    return jax.lax.map(winding_number, points, batch_size=64)
 
 
 @jax.jit
@@ -200,9 +203,10 @@ def test_hardly_any_of_the_body_is_inside_itself(body, drawn):
     body = decimate(body, 1000)
     at_rest = inside_itself(body, np.zeros((kin.JOINTS, 3), np.float32))
     assert at_rest.mean() < 0.02  # mouth and eyes
-    inside_of = lambda rotations: np.asarray(
-        inside_itself(body, np.float32(rotations)) & ~at_rest
-    ).mean()
+
+    def inside_of(rotations):
+        return np.asarray(inside_itself(body, np.float32(rotations)) & ~at_rest).mean()
+
     inside = [inside_of(rotations) for rotations in drawn[:10]]
     assert np.mean(inside) < INSIDE and np.max(inside) < 0.04
     folded = np.zeros((kin.JOINTS, 3))

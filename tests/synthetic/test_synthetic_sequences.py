@@ -103,9 +103,12 @@ def test_legs_and_arms_keep_to_their_limits(build, drawn, case):
 
 def test_walks_get_on_and_turns_turn(drawn):
     way = lambda s: np.linalg.norm(s.translations[-1] - s.translations[0])
-    heading = lambda s: np.unwrap(
-        np.arctan2(*np.moveaxis(kin.rotation_matrix(s.rotations[:, 0])[:, [0, 2], 2], -1, 0))
-    )
+
+    def heading(s):
+        return np.unwrap(
+            np.arctan2(*np.moveaxis(kin.rotation_matrix(s.rotations[:, 0])[:, [0, 2], 2], -1, 0))
+        )
+
     for case, sequence in drawn.items():
         if case[0] == "walk":
             assert way(sequence) > 0.6

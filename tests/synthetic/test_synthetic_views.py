@@ -108,9 +108,11 @@ def test_close_cameras_are_close_and_outside(seed):
 
 
 def test_the_loader_shrinks_a_set_to_smaller_sizes(folder, body):
-    source = lambda size: CaptureSource(
-        CaptureCache(find_people(folder, "demo"), body), ViewSampling(), size, size
-    )
+    def source(size):
+        return CaptureSource(
+            CaptureCache(find_people(folder, "demo"), body), ViewSampling(), size, size
+        )
+
     small, large = (Loader(source(size), 1).batch_at(0).inputs for size in (SIZE // 2, SIZE))
     blocks = np.asarray(large.images).reshape(1, 4, SIZE // 2, 2, SIZE // 2, 2, 3)
     np.testing.assert_allclose(small.images, blocks.mean((3, 5)), atol=1e-6)
@@ -141,11 +143,14 @@ def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):
     made = []
     fast(monkeypatch, made)
     layout = writer.Layout(SIZE, views=2)
-    write = lambda count, **changes: writer.write_set(
-        tmp_path,
-        count,
-        **{"layout": layout, "split": "demo", "body": BODY, "progress": False} | changes,
-    )
+
+    def write(count, **changes):
+        return writer.write_set(
+            tmp_path,
+            count,
+            **{"layout": layout, "split": "demo", "body": BODY, "progress": False} | changes,
+        )
+
     write(2)
     write(4)
     assert made == list(DEMO[:4])  # nobody twice
@@ -179,11 +184,14 @@ def test_processes_write_the_same_files(tmp_path):
     alone, together = tmp_path / "alone", tmp_path / "together"
     writer.write_set(alone, 3, layout, "demo", progress=False)
     writer.write_set(together, 3, layout, "demo", workers=2, progress=False)
-    read = lambda file: (
-        file.read_bytes()
-        if file.suffix != ".npz"
-        else {k: x.tolist() for k, x in np.load(file).items()}
-    )
+
+    def read(file):
+        return (
+            file.read_bytes()
+            if file.suffix != ".npz"
+            else {k: x.tolist() for k, x in np.load(file).items()}
+        )
+
     # an npz tells when it was written
     contents = [
         {file.relative_to(root): read(file) for file in root.rglob("*.*")}
@@ -254,7 +262,8 @@ def test_the_splits_share_no_seed():
 
 
 def test_nobody_is_written_beyond_the_end_of_a_split(tmp_path, monkeypatch):
-    fast(monkeypatch, [])
+    made = []
+    fast(monkeypatch, made)
     with pytest.raises(ValueError, match="reach beyond the split"):
         writer.write_set(
             tmp_path, 3, LAYOUT, "test", len(SPLITS["test"]) - 2, body=BODY, progress=False

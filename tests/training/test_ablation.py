@@ -159,7 +159,7 @@ def test_one_seed_has_no_interval():
 
 
 @pytest.mark.parametrize(
-    ("how", "said"),
+    ("how", "problem"),
     [
         ({"variants": {"base": {}}}, "'base': is the name"),
         ({"variants": {"a": {"model.depth": 1}}}, "model.depth: TrainConfig has no such field"),
@@ -178,14 +178,14 @@ def test_one_seed_has_no_interval():
         ({"variants": {"a": {"model.architecture.reader.sample_rgb": False}}}, "'a': "),
     ],
 )
-def test_what_cannot_be_meant_is_refused_before_the_first_run(how, said, trained, tmp_path):
-    with pytest.raises(ValueError, match=said):
+def test_what_cannot_be_meant_is_refused_before_the_first_run(how, problem, trained, tmp_path):
+    with pytest.raises(ValueError, match=problem):
         run(tmp_path, validation=[], **how)
     assert trained == [] and not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "problem"),
     [
         ({"target_size": 1024}, "512 x 512 cannot be averaged to 1024 x 1024"),
         ({"model.conventions.image_size": 1024}, "512 x 512 cannot be averaged to 1024 x 1024"),
@@ -198,17 +198,17 @@ def test_what_cannot_be_meant_is_refused_before_the_first_run(how, said, trained
 )
 @pytest.mark.parametrize("kind", ["folders", "a source"])
 def test_photos_and_views_that_the_captures_lack_are_found_before_the_first_step(
-    changes, said, kind, trained, tmp_path, capture_folder
+    changes, problem, kind, trained, tmp_path, capture_folder
 ):
     people = [capture_folder]
     if kind == "a source":
         people = captured_people(people, load_body())
     variants = {"usual": {}, "too large": changes}
-    with pytest.raises(ValueError, match=f"'too large': 1 of the people cannot be used.*{said}"):
+    with pytest.raises(ValueError, match=f"'too large': 1 of the people cannot be used.*{problem}"):
         run(tmp_path, people=people, validation=[], seeds=1, variants=variants)
     if changes.keys() & {"target_size", "stages", "views.target_count"}:
         return  # targets to compare on are those of the base
-    with pytest.raises(ValueError, match=f"'too large': 1 of the people cannot be used.*{said}"):
+    with pytest.raises(ValueError, match=f"'too large': 1 of the people cannot be used.*{problem}"):
         run(tmp_path, validation=people, seeds=1, variants=variants)
     assert trained == [] and not any(tmp_path.iterdir())
 

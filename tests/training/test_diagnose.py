@@ -273,14 +273,19 @@ def test_going_back_the_innermost_last_stage_with_good_gradients_behind_it_is_bl
         "encoder": good | {"taken": number("in", 3)},
         "loss": good,
     }
-    of = lambda stages: Diagnosis(
-        7, 0, 1.0, 100.0, (), tuple(StageReport(name, **x) for name, x in stages.items())
+
+    def diagnosis_of(stages):
+        return Diagnosis(
+            7, 0, 1.0, 100.0, (), tuple(StageReport(name, **x) for name, x in stages.items())
+        )
+
+    assert diagnosis_of(stages).fault == Fault(
+        "backward", "encoder.block_1", number("kernel", 2)["kernel"]
     )
-    assert of(stages).fault == Fault("backward", "encoder.block_1", number("kernel", 2)["kernel"])
     between = stages | {"encoder.block_1": good | {"returned": number("out", 1)}}
-    assert of(between).fault == Fault("backward", "encoder", number("in", 3)["in"])
+    assert diagnosis_of(between).fault == Fault("backward", "encoder", number("in", 3)["in"])
     worse = stages | {name: good | {"values": number("", 1)} for name in ("encoder.norm", "loss")}
-    assert of(worse).fault == Fault("forward", "encoder.norm", number("", 1)[""])
+    assert diagnosis_of(worse).fault == Fault("forward", "encoder.norm", number("", 1)[""])
 
 
 def test_numbers_of_arrays():

@@ -176,9 +176,11 @@ def test_runs_of_other_seeds_share_a_program(body, captures, variables, monkeypa
         train_step(init_state(config, variables), batch, body, config)
     assert asked[0][1:] == asked[1][1:] and hash(asked[0][1]) == hash(asked[1][1])
     assert (asked[0][0] != asked[1][0]).any()
-    of = lambda seed: step.subject_keys(jnp.asarray(step.seed_numbers(seed)), jnp.asarray(3), 2)
+    keys_of = lambda seed: step.subject_keys(
+        jnp.asarray(step.seed_numbers(seed)), jnp.asarray(3), 2
+    )
     expected = jax.random.split(jax.random.fold_in(jax.random.key(7), 3), 2)
-    assert (jax.random.key_data(of(7)) == jax.random.key_data(expected)).all()
+    assert (jax.random.key_data(keys_of(7)) == jax.random.key_data(expected)).all()
 
 
 def test_a_broken_folder_is_named_and_another_configuration_refused(

@@ -65,9 +65,12 @@ def agreement(values, point, names, directions=3, steps=STEP_SIZES):
         jax.tree.map(lambda x: rng.normal(size=x.shape) * size(np.asarray(x)), point)
         for _ in range(directions)
     ]
-    inner = lambda a, b: sum(
-        np.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
-    )
+
+    def inner(a, b):
+        return sum(
+            np.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+        )
+
     gradients = [jax.device_get(gradient(point, weights)) for weights in np.eye(len(names))]
     derivatives = np.asarray([[inner(g, way) for way in ways] for g in gradients])
     best = np.full((len(names), directions), np.inf)
@@ -101,12 +104,13 @@ def own_case(names, side=SIDE):
     def values(point):
         point = {name: jnp.asarray(x) for name, x in point.items()}
         alpha = point["alpha"]
-        one = lambda rgb, alpha, depth, spread: Rendering(
-            rgb, alpha, depth, jnp.zeros((), jnp.int32), distortion=spread
-        )
+
+        def rendering_of(rgb, alpha, depth, spread):
+            return Rendering(rgb, alpha, depth, jnp.zeros((), jnp.int32), distortion=spread)
+
         # distortion is at most the square of alpha times the range of depths
         spread = 2 * alpha**2 * point["spread"]
-        rendering = jax.vmap(one)(point["rgb"], alpha, point["depth"], spread)
+        rendering = jax.vmap(rendering_of)(point["rgb"], alpha, point["depth"], spread)
         drawn = Drawn(rendering, point["opacities"], point["tight_offsets"])
         return loss_terms(drawn, images, masks, depths, config, networks)
 

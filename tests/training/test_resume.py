@@ -40,20 +40,28 @@ def test_resume_of_eight_devices_on_four_and_of_two_processes(captures, tmp_path
     eight, four, stopped = (tmp_path / name for name in ("eight", "four", "stopped"))
     two, two_stopped = tmp_path / "two", tmp_path / "two_stopped"
     cache = ("--cache", tmp_path / "compiled")
-    on = lambda devices, at_once: ("--batch", 8, "--devices", devices, "--at-once", at_once, *cache)
-    run(four, folder, "--stop-at", 4, *on(4, 2))
-    run(stopped, folder, "--stop-at", 2, *on(4, 2))
-    run(stopped, folder, "--stop-at", 4, *on(4, 2))
+    arguments_on = lambda devices, at_once: (
+        "--batch",
+        8,
+        "--devices",
+        devices,
+        "--at-once",
+        at_once,
+        *cache,
+    )
+    run(four, folder, "--stop-at", 4, *arguments_on(4, 2))
+    run(stopped, folder, "--stop-at", 2, *arguments_on(4, 2))
+    run(stopped, folder, "--stop-at", 4, *arguments_on(4, 2))
     assert same(state_of(stopped, 4), state_of(four, 4))
     assert losses(stopped) == losses(four) and list(losses(four)) == [1, 2, 3, 4]
 
-    run(eight, folder, "--stop-at", 2, *on(8, 1))
-    run(eight, folder, "--stop-at", 4, *on(4, 2))
+    run(eight, folder, "--stop-at", 2, *arguments_on(8, 1))
+    run(eight, folder, "--stop-at", 4, *arguments_on(4, 2))
     assert largest_difference(state_of(eight, 4).params, state_of(four, 4).params) < bound(ACROSS)
 
-    run_several(2, two, folder, "--stop-at", 4, *on(1, 4))
-    run_several(2, two_stopped, folder, "--stop-at", 2, *on(1, 4))
-    run_several(2, two_stopped, folder, "--stop-at", 4, *on(1, 4))
+    run_several(2, two, folder, "--stop-at", 4, *arguments_on(1, 4))
+    run_several(2, two_stopped, folder, "--stop-at", 2, *arguments_on(1, 4))
+    run_several(2, two_stopped, folder, "--stop-at", 4, *arguments_on(1, 4))
     assert same(state_of(two_stopped, 4), state_of(two, 4)) and losses(two_stopped) == losses(two)
     assert largest_difference(state_of(two, 4).params, state_of(four, 4).params) < bound(ACROSS)
     assert list(losses(two).values()) == pytest.approx(

@@ -52,12 +52,16 @@ def test_gradients_are_means_over_all_devices_whichever_hold_the_parts():
         np.random.default_rng(0).normal(size=(2, 2, 3, 4)), jnp.float32
     )  # data, fsdp, rows, columns
     mesh = SimpleNamespace(size=4)
-    parts = lambda spec: jax.vmap(
-        jax.vmap(
-            lambda g: inspect.unwrap(mean_parts)({"x": g}, {"x": spec}, mesh)["x"], axis_name="fsdp"
-        ),
-        axis_name="data",
-    )(gradients)
+
+    def parts(spec):
+        return jax.vmap(
+            jax.vmap(
+                lambda g: inspect.unwrap(mean_parts)({"x": g}, {"x": spec}, mesh)["x"],
+                axis_name="fsdp",
+            ),
+            axis_name="data",
+        )(gradients)
+
     mean = np.asarray(gradients).mean(axis=(0, 1))
     np.testing.assert_allclose(
         parts(PartitionSpec()), np.broadcast_to(mean, (2, 2, 3, 4)), rtol=1e-5

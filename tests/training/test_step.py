@@ -99,9 +99,9 @@ AGAINST_FOG = {"absolute": 0.2, "boundary": 0.1, "depth": 0.3, "distortion": 1.0
 
 @pytest.mark.slow
 def test_terms_against_fog_are_added_and_keep_gradients_finite(body, source, variables):
-    weighted = lambda **terms: dataclasses.replace(
-        CONFIG, loss=dataclasses.replace(CONFIG.loss, **terms)
-    )
+    def weighted(**terms):
+        return dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, **terms))
+
     config, batch = weighted(**AGAINST_FOG), source.batch_at(0)
     lacking = {
         "depth": "depth of the targets",
@@ -225,9 +225,10 @@ def test_backgrounds_are_exchanged_like_those_of_photos():
 
 def test_the_share_of_random_backgrounds_is_kept():
     keys = jax.random.split(jax.random.key(0), 200)
-    draw = lambda share: np.asarray(
-        jax.jit(jax.vmap(lambda key: random_backgrounds(key, 3, share)))(keys)
-    )
+
+    def draw(share):
+        return np.asarray(jax.jit(jax.vmap(lambda key: random_backgrounds(key, 3, share)))(keys))
+
     white = (draw(0.25) == 1).all(axis=-1)
     assert 0.68 < white.mean() < 0.82  # 600 draws of probability 0.75: four standard deviations
     assert (draw(0.0) == 1).all()
@@ -332,13 +333,14 @@ def test_a_gradient_is_the_mean_over_subjects_whatever_the_microbatch(monkeypatc
 def test_augmentation_and_backgrounds_do_not_share_random_numbers(monkeypatch, source, body):
     """Else the color of the background would tell how the photos were disturbed."""
     keys = {}
-    take = lambda name, value: (
-        lambda key, *_: keys.update({name: jax.random.key_data(key)}) or value
-    )
+
+    def take(name, value):
+        return lambda key, *_: keys.update({name: jax.random.key_data(key)}) or value
+
     example = jax.tree.map(lambda x: x[0], source.batch_at(0))
     views = example.targets
-    one = lambda rgb, alpha: Rendering(rgb, alpha, alpha, jnp.zeros((), jnp.int32))
-    rendering = jax.vmap(one)(views.images, views.masks)
+    rendering_of = lambda rgb, alpha: Rendering(rgb, alpha, alpha, jnp.zeros((), jnp.int32))
+    rendering = jax.vmap(rendering_of)(views.images, views.masks)
     outputs = SimpleNamespace(dropped_tokens=jnp.zeros((), jnp.int32))
     monkeypatch.setattr(step, "augment", take("augment", example))
     monkeypatch.setattr(

@@ -99,9 +99,9 @@ def test_a_camera_inside_of_the_body(body, batch, variables):
 
 
 def test_black_photos_and_masks_that_cover_all(body, batch, variables):
-    full = lambda views: replace(
-        views, images=jnp.zeros_like(views.images), masks=jnp.ones_like(views.masks)
-    )
+    def full(views):
+        return replace(views, images=jnp.zeros_like(views.images), masks=jnp.ones_like(views.masks))
+
     step_without_harm(
         init_state(CONFIG, variables), replace(batch, inputs=full(batch.inputs)), body
     )

@@ -111,7 +111,7 @@ def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
         slider.dispatchEvent(new Event("input"));
         await humangs.settle();""")
     taller, view = content_height(browser), browser.run("return humangs.view()")
-    said = browser.run(
+    sliders = browser.run(
         "return [...document.querySelectorAll('#shape .slider')].map((row) =>"
         " row.innerText.split(/\\s*\\n\\s*/))"
     )
@@ -124,8 +124,8 @@ def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
     at = body.shape_names.index("height")
     own = browser.run("return humangs.view()")["betas"]
     assert view["betas"][at] == pytest.approx(own[at] + 1) and view["betas"][:at] == own[:at]
-    assert [name for name, _ in said[:3]] == ["female to male", "young to old", "weight"]
-    assert [float(value) for _, value in said] == pytest.approx(view["betas"], abs=0.051)
+    assert [name for name, _ in sliders[:3]] == ["female to male", "young to old", "weight"]
+    assert [float(value) for _, value in sliders] == pytest.approx(view["betas"], abs=0.051)
 
 
 def content_height(browser):
@@ -302,8 +302,8 @@ def test_a_dropped_glb_moves_and_its_other_animations_are_offered(browser, avata
     write_glb(
         tmp_path / "two.glb", rest, clips[0], still, MIXAMO, more=clips[1:], titles=("walk", "run")
     )
-    said = drop(browser, "two.glb", (tmp_path / "two.glb").read_bytes())
-    assert "3 frames" in said and "2 animations (walk, run): the first is taken" in said
+    message = drop(browser, "two.glb", (tmp_path / "two.glb").read_bytes())
+    assert "3 frames" in message and "2 animations (walk, run): the first is taken" in message
     np.testing.assert_allclose(
         matrices(shown_pose(browser, 2)[0]), matrices(clips[0][2]), atol=ANGLE
     )
@@ -335,10 +335,10 @@ def test_a_dropped_glb_moves_and_its_other_animations_are_offered(browser, avata
 
 def test_a_file_that_is_no_motion_gets_one_line_and_changes_nothing(browser):
     before = browser.run("return document.getElementById('motion-name').textContent")
-    said = drop(browser, "notes.txt", b"hello")
+    message = drop(browser, "notes.txt", b"hello")
     assert (
-        said.startswith("notes.txt")
-        and "expected a motion as .npz (ours, AMASS), .bvh or .glb" in said
-        and "\n" not in said
+        message.startswith("notes.txt")
+        and "expected a motion as .npz (ours, AMASS), .bvh or .glb" in message
+        and "\n" not in message
     )
     assert browser.run("return document.getElementById('motion-name').textContent") == before

@@ -26,19 +26,24 @@ HALF = 0.5 * (1 + 1e-6)
 def unpack(packed):
     """Returns the arrays by name, as the page reads them."""
     entries = packed.header["arrays"].items()
-    read = lambda e: np.frombuffer(
-        packed.data, e["type"], int(np.prod(e["shape"])), e["offset"]
-    ).reshape(e["shape"])
+
+    def read(e):
+        return np.frombuffer(packed.data, e["type"], int(np.prod(e["shape"])), e["offset"]).reshape(
+            e["shape"]
+        )
+
     return {name: read(entry) for name, entry in entries}
 
 
 def decoded(packed):
     """Returns the arrays dequantized, as scene.js and project.frag do it."""
     arrays, header = unpack(packed), packed.header
-    spread = lambda name: (
-        np.asarray(header[name]["low"])
-        + arrays[name] * STEP * (np.asarray(header[name]["high"]) - np.asarray(header[name]["low"]))
-    )
+
+    def spread(name):
+        return np.asarray(header[name]["low"]) + arrays[name] * STEP * (
+            np.asarray(header[name]["high"]) - np.asarray(header[name]["low"])
+        )
+
     weights = np.zeros((header["count"], max(256, len(header["parents"]))))
     np.add.at(
         weights,

@@ -253,8 +253,8 @@ def test_a_browser_that_cannot_show_it_says_which_can_and_has_no_controls(file, 
         with pytest.raises(RuntimeError, match=reason):
             browser.open(file)
         assert visible(browser, ("view", "message", *CONTROLS)) == []
-        said = browser.run("return document.getElementById('unable').innerText")
-        assert all(word in said for word in ("WebGL 2", "Chrome", "Firefox", "Safari", reason))
+        message = browser.run("return document.getElementById('unable').innerText")
+        assert all(word in message for word in ("WebGL 2", "Chrome", "Firefox", "Safari", reason))
 
 
 def test_so_does_one_that_runs_no_scripts(file):
@@ -402,9 +402,9 @@ def test_an_address_may_ask_for_a_colour_a_pose_and_a_time(embedded):
 
 def test_an_option_that_is_wrong_is_named_and_others_are_ignored(embedded):
     browser = embedded("background=sky&time=-1&v=3&constructor=1")
-    said = browser.run("return document.getElementById('message').textContent")
+    message = browser.run("return document.getElementById('message').textContent")
     assert (
-        said
+        message
         == "background=sky: expected transparent, or six digits such as ffcc00; time=-1: expected"
         " seconds of the motion, such as 1.5"
     )

@@ -423,8 +423,12 @@ def compare(tmp_path, caplog, files):
             page["translations"], motion.translations, atol=EXACT, err_msg=case
         )
         assert page["fps"] == pytest.approx(motion.fps, rel=1e-6), case
-        said = " ".join(caplog.messages).replace(HOW_TO_CHANGE, "")
-        assert bool(page["note"]) == bool(said) and page["note"] in said, (case, page["note"], said)
+        warnings = " ".join(caplog.messages).replace(HOW_TO_CHANGE, "")
+        assert bool(page["note"]) == bool(warnings) and page["note"] in warnings, (
+            case,
+            page["note"],
+            warnings,
+        )
 
 
 @pytest.mark.slow

@@ -265,10 +265,11 @@ def test_scans_become_scenes_by_the_command(tmp_path, body, capsys):
     np.testing.assert_allclose(
         np.asarray(capture.cameras.cam_from_world), wanted.cam_from_world, atol=MILLIMETRE
     )
+
     # as matrices: a turn by more than half a circle is also one the other way round
-    matrices = lambda rotations: Rotation.from_rotvec(
-        np.asarray(rotations, float).reshape(-1, 3)
-    ).as_matrix()
+    def matrices(rotations):
+        return Rotation.from_rotvec(np.asarray(rotations, float).reshape(-1, 3)).as_matrix()
+
     found = matrices(capture.poses.rotations)
     np.testing.assert_allclose(found, matrices(wanted.parameters([0]).rotations), atol=1e-4)
     np.testing.assert_allclose(
@@ -297,10 +298,10 @@ def test_a_data_set_is_one_line_of_the_table(tmp_path, body, monkeypatch, capsys
     (tmp_path / "raw" / "a.toy").touch()
     monkeypatch.setattr(training, "Preprocess", training.Preprocess)  # reloading replaces it
     importlib.reload(training)
-    said = " ".join(
+    help_text = " ".join(
         in_process(monkeypatch, capsys, "preprocess", "--help")[1].replace("│", " ").split()
     )
-    assert ",toy}" in said and "; toy: made up" in said
+    assert ",toy}" in help_text and "; toy: made up" in help_text
     words = (
         "preprocess",
         "toy",
