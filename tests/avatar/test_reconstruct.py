@@ -237,9 +237,8 @@ def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
     for got, expected in zip(jax.tree.leaves(views), jax.tree.leaves(own), strict=True):
         np.testing.assert_allclose(got, expected, atol=TURNED)
     avatars = [reconstruct(*network, x).gaussians for x in (photos, turned)]
-    lit, unlit = reconstruct_batch(
-        network[0], network[1].with_conventions(light=True), [photos, turned]
-    )
+    config = network[1].with_conventions(light=True)
+    lit, unlit = avatars_of(reconstruct_batch(network[0], config, [photos, turned]))
     assert lit.light is not None and unlit.light is None
     for second, first in (avatars, (lit.gaussians, unlit.gaussians)):
         for got, expected in zip(jax.tree.leaves(second), jax.tree.leaves(first), strict=True):
