@@ -1,9 +1,9 @@
-"""Timing on a machine that others use too: competitors take turns in one process, so that all see
-the same load.
+"""Times programs on a machine that others use too. Programs that are compared take turns in one
+process, so that all see the same load.
 
-Process CPU time counts what all threads worked; wall time is what a user waits. Other programs
-stretch wall time by several times, and CPU time (caches, clock) by a third: compare ratios of CPU
-times first.
+CPU time of the process counts the work of all threads. Wall time is what a user waits. Other
+programs on the machine multiply wall time by several times, and CPU time (caches, clock) by up to a
+third, so ratios of CPU times are compared first.
 """
 
 import os
@@ -14,12 +14,11 @@ import numpy as np
 
 
 def prepare_process() -> None:
-    """What has to be set before JAX starts: sleeping OpenMP threads, and an allocator that keeps
-    what it has.
+    """Sets what has to be set before JAX starts: OpenMP threads that sleep, and an allocator that
+    keeps freed memory.
     """
-    os.environ.setdefault(
-        "OMP_WAIT_POLICY", "passive"
-    )  # spinning ones would be counted as CPU time
+    # the CPU time of threads that spin would be counted
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
     from humangs_jax.core.processes import keep_freed_memory
 
@@ -27,7 +26,7 @@ def prepare_process() -> None:
 
 
 def timed(function: Callable[[], object]) -> tuple[float, float]:
-    """Wall ms and process CPU ms (all threads) of one call."""
+    """Returns the wall ms of one call, and the CPU ms of all threads of the process."""
     cpu, wall = time.process_time(), time.perf_counter()
     function()
     return 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
@@ -36,8 +35,8 @@ def timed(function: Callable[[], object]) -> tuple[float, float]:
 def medians(
     runs: Mapping[str, Callable[[], object]], repeats: int, warm_up: int = 1
 ) -> dict[str, np.ndarray]:
-    """(wall ms, CPU ms) of every run: medians over `repeats` iterations in which each has one
-    turn.
+    """Returns {run: (wall ms, CPU ms)}, medians over `repeats` iterations in which each run has one
+    turn. Before that each run is called `warm_up` times.
     """
     for _ in range(warm_up):
         for run in runs.values():

@@ -1,10 +1,10 @@
-"""Corrections of canonical Gaussians for one driving frame, and the LCA-style driver: an MLP that
-gives them.
+"""Corrects canonical Gaussians for one driving frame, and has the driver of LCA-style systems, an
+MLP that predicts the corrections.
 
-LCA (Large-scale Codec Avatars, 2026, https://arxiv.org/abs/2604.02320) has no public code; what is
-known of it: a transformer over image and anchor tokens, an MLP that gives canonical Gaussians, an
-MLP that corrects them for the driving signal, skinning. Our reading of the second MLP: it takes the
-features of a vertex, which the canonical MLP takes too, and the rotations of all joints but the
+LCA (Large-scale Codec Avatars, 2026, https://arxiv.org/abs/2604.02320) has no public code. Its
+paper describes a transformer over image and anchor tokens, an MLP that predicts canonical
+Gaussians, an MLP that corrects them for the driving signal, and skinning. In our reading the second
+MLP takes the features of a vertex, as the first one does, and the rotations of all joints but the
 root.
 """
 
@@ -26,30 +26,30 @@ from humangs_jax.network.vertex_decoder import COLOR_MARGIN, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
 CHANNELS = 14
-"""Of a correction: offset 3, quaternion 4, logarithm of the scale 3, logits of opacity 1 and color
-3.
+"""Numbers of a correction: 3 of the offset, 4 of the quaternion, 3 of the logarithm of the scale, 1
+of the logit of the opacity, and 3 of the logits of the color.
 """
 SCALING = 2.0
-"""Corrections of the logarithm of a scale are bounded to this."""
+"""Bound of the corrections of the logarithm of a scale."""
 
 
 class Corrected(NamedTuple):
-    """gaussians: canonical, of one frame.
-
-    offsets: (g, 3) of the means, in the unit of `offset_scale`.
-    """
+    """Corrected Gaussians of one frame."""
 
     gaussians: Gaussians
+    """The Gaussians in the canonical pose."""
     offsets: Float[Array, "g 3"]
+    """Offsets of the means, in the unit of `offset_scale`."""
 
 
 def apply_corrections(
     gaussians: Gaussians, raw: Float[Array, "g 14"], offset_scale: float
 ) -> Corrected:
-    """Gaussians with corrections, `CHANNELS` numbers each: zeros change nothing (but colors closer
-    to 0 or 1 than `COLOR_MARGIN`), and Gaussians of opacity 0 keep it.
+    """Corrects Gaussians by `CHANNELS` numbers each.
 
-    offset_scale: metres to which offsets, in canonical axes, are bounded by tanh.
+    Numbers of 0 change nothing, except that colors are kept `COLOR_MARGIN` away from 0 and 1.
+    Gaussians of opacity 0 keep it. Offsets are in canonical axes, and tanh bounds them to
+    `offset_scale` metres.
     """
     offsets, rotations, scales, opacities, colors = jnp.split(raw, (3, 7, 10, 11), axis=-1)
     offsets = offset_scale * jnp.tanh(offsets)
@@ -68,7 +68,8 @@ def apply_corrections(
 
 
 def pose_vector(pose: BodyPose, joints: int) -> Float[Array, " q"]:
-    """Axis-angles of all joints but the root: how the person stands in the world is no part of it.
+    """Returns the rotation vectors of all joints but the root, whose rotation only says how the
+    person stands in the world.
 
     Raises: ValueError if the body has another number of joints than the driver was made for.
     """
@@ -79,21 +80,22 @@ def pose_vector(pose: BodyPose, joints: int) -> Float[Array, " q"]:
 
 @part
 class CorrectionMLP(GaussianDriver):
-    """The LCA-style driver, for readers that give `VertexFeatures`, and a decoder with K Gaussians
-    per vertex.
+    """The driver of LCA-style systems, for readers that return `VertexFeatures`.
 
-    Inputs of vertices -> raw corrections, 14 for each Gaussian; they start near 0.
+    An MLP predicts 14 raw corrections for each Gaussian from the features of its vertex and the
+    pose. They are near 0 at first.
     """
 
     hidden: Width = 512
+    """Width of the hidden layers."""
     layers: Layers = 3
-    """Hidden ones."""
+    """Number of hidden layers."""
     joints: Count = 55
-    """Of the body."""
+    """Number of joints of the body."""
     offset_scale: Spread = 0.05
-    """Metres, bound of the offsets."""
+    """Bound of the offsets in metres."""
     gaussians_per_vertex: Count = 1
-    """K."""
+    """Gaussians of a vertex, as the decoder makes them."""
 
     @nn.compact
     def __call__(
@@ -101,7 +103,8 @@ class CorrectionMLP(GaussianDriver):
     ) -> HumanGSOutputs:
         """See `parts.TargetDecoder`.
 
-        Raises: ValueError for other features or another K; see `pose_vector`.
+        Raises: ValueError for other features, another number of Gaussians of a vertex, or another
+            number of joints.
         """
         if not isinstance(outputs.scene, VertexFeatures):
             raise ValueError(
@@ -124,9 +127,9 @@ class CorrectionMLP(GaussianDriver):
         gaussians, offsets = apply_corrections(
             outputs.gaussians, raw.reshape(-1, CHANNELS), self.offset_scale
         )
-        # of a body of 1.8 m, metres are normalised units
+        # for a body of 1.8 m, metres are normalised units
         driven = offsets.reshape(len(local), per_vertex, 3)
-        # the canonical ones stay small, too
+        # the loss keeps canonical offsets small, too
         if outputs.tight_offsets is not None:
             driven = jnp.concatenate([outputs.tight_offsets, driven], axis=1)
         return replace(outputs, gaussians=gaussians, tight_offsets=driven)

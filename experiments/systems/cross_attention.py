@@ -1,7 +1,7 @@
-"""A reader that is not pixel-aligned: vertices look at all tokens of all photos by attention.
+"""A reader whose vertices look at all tokens of all photos by attention, without pixel alignment.
 
-The paper replaces it by back-projection. Its arithmetic grows with vertices times tokens;
-back-projection's grows with vertices times views. One layer is
+The paper replaces it by back-projection. The arithmetic of attention grows with vertices times
+tokens, that of back-projection with vertices times views. One layer is
 
     x += attention(q = norm(x), k, v = tokens);  x += mlp(norm(x))
 
@@ -31,14 +31,16 @@ INIT = nn.initializers.normal(INIT_STD)
 
 @part
 class CrossAttentionReader(Reader):
-    """Vertices as queries, image tokens as keys and values."""
+    """A reader with vertices as queries, and image tokens as keys and values."""
 
     width: Width = 768
-    """Features of a vertex."""
+    """Number of features of a vertex."""
     layers: Layers = 1
+    """Number of layers."""
     mlp_ratio: Ratio = 4
+    """Width of the MLPs as a multiple of `width`."""
     head_width: Width = 64
-    """As `layers` and `mlp_ratio`: see `TransformerConfig`."""
+    """Width of a head of the attention."""
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
@@ -49,7 +51,10 @@ class CrossAttentionReader(Reader):
     def __call__(
         self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> VertexFeatures:
-        """Features of the n vertices. Raises ValueError for an encoder with an upsampler."""
+        """Returns the features of the n vertices.
+
+        Raises: ValueError for an encoder with an upsampler.
+        """
         tokens, count = image_tokens(encoding, inputs)
         canonical = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
         x = nn.Dense(self.width, kernel_init=INIT, name="position")(positional_encoding(canonical))
@@ -64,7 +69,8 @@ class CrossAttentionReader(Reader):
 def image_tokens(
     encoding: Encoding, inputs: HumanGSInputs
 ) -> tuple[Float[Array, "l d"], Int[Array, ""] | None]:
-    """The tokens of all views, those of padding last, and the number of real ones (None: all).
+    """Returns the tokens of all views, those of padding last, and the number of real tokens, None
+    if all are real.
 
     Raises: ValueError unless the maps have one element a patch.
     """
@@ -79,21 +85,28 @@ def image_tokens(
         )
     if packing is not None:
         return tokens.at[packing.indices].get(mode="fill", fill_value=0), packing.count
-    return tokens, None if inputs.view_count is None else inputs.view_count * (height * width)
+    if inputs.view_count is None:
+        return tokens, None
+    return tokens, inputs.view_count * (height * width)
 
 
 def check_heads(part: str, width: int, head_width: int) -> None:
-    """Raises ValueError unless heads of that width fill the features."""
+    """Raises a ValueError unless `width` features are a whole number of heads."""
     if width % head_width:
         raise ValueError(f"{part}: width {width} is not a multiple of head_width {head_width}")
 
 
 class CrossBlock(nn.Module):
-    """One layer: queries (n, d) that look at tokens (l, e) -> (n, d); see the module."""
+    """One layer, in which queries (n, d) look at tokens (l, e). The module's docstring has the
+    formula.
+    """
 
     head_width: int
+    """Width of a head of the attention."""
     mlp_ratio: int
+    """Width of the MLP as a multiple of d."""
     runtime: Runtime
+    """Number types and the kind of attention."""
 
     @nn.compact
     def __call__(

@@ -1,17 +1,17 @@
-"""GST-style: tokens of groups of vertices look at one photo, and each makes one attribute of the
-Gaussians of its group.
+"""Parts of GST-style systems: tokens of groups of vertices look at one photo, and each token makes
+one attribute of the Gaussians of its group.
 
-Theirs (Prospero et al. 2024, https://arxiv.org/abs/2409.04196): one photo, a frozen HMR2 ViT, 130
-learned tokens (5 attributes of 26 groups of 265 vertices of SMPL) that cross-attend to its tokens;
-a Gaussian a vertex, its mean the posed vertex plus an offset; the body's pose and shape and the
-camera come from the same network.
+GST (Prospero et al. 2024, https://arxiv.org/abs/2409.04196) takes one photo and a frozen ViT of
+HMR2. 130 learned tokens (5 attributes of 26 groups of 265 vertices of SMPL) cross-attend to the
+ViT's tokens. Each vertex has a Gaussian, whose mean is the posed vertex plus an offset. The body's
+pose and shape and the camera come from the same network.
 
-Our reading: the tokens attend to each other before they look at the photo, as in any decoder of a
-transformer; the body, its pose and the camera are given, as they are to every system here: theirs
-come from HMR2's pretrained weights, and a network that knows a few hundred people would be judged
-by its wrong poses alone; our patch transformer stands for HMR2's; vertices are grouped in their
-order; offsets are in the canonical frame, so that the person can be posed, which theirs cannot.
-Behind the reader a token changes nothing outside of its group.
+In our reading the tokens attend to each other before they look at the photo, as in any decoder of a
+transformer. The body, its pose and the camera are given, as they are to all systems here. GST's
+come from pretrained weights of HMR2, and a network that knows a few hundred people would be judged
+only by its wrong poses. Our patch transformer replaces HMR2's. Vertices are grouped in their order.
+Offsets are in the canonical frame, so that the person can be posed, unlike GST's. After the reader
+a token changes nothing outside of its group.
 """
 
 import flax.linen as nn
@@ -37,22 +37,25 @@ from humangs_jax.network.vertex_decoder import INITIAL_OPACITY, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
 ATTRIBUTES = {"offsets": 3, "quats": 4, "scales": 3, "opacities": 1, "colors": 3}
-"""Numbers of each attribute of a Gaussian; the order of a group's tokens."""
+"""{attribute of a Gaussian: its numbers}, in the order of a group's tokens."""
 
 
 @part
 class GroupReader(Reader):
-    """Learned tokens, one an attribute and group, that look at the tokens of one photo.
-
-    `width`: of a token; `layers`, `mlp_ratio` and `head_width` as in `CrossAttentionReader`.
+    """A reader with a learned token for each attribute and group, which look at the tokens of one
+    photo.
     """
 
     groups: Vertices = 26
-    """Of vertices."""
+    """Number of groups of vertices."""
     width: Width = 1024
+    """Number of features of a token."""
     layers: Layers = 6
+    """Number of layers."""
     mlp_ratio: Ratio = 2
+    """Width of the MLPs as a multiple of `width`."""
     head_width: Width = 64
+    """Width of a head of the attention."""
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
@@ -63,15 +66,14 @@ class GroupReader(Reader):
     def __call__(
         self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> Float[Array, "a r d"]:
-        """Tokens of the 5 attributes of r groups.
+        """Returns the tokens of the 5 attributes of r groups.
 
-        Raises ValueError for a second photo, or an encoder with an upsampler.
+        Raises: ValueError for a second photo, or an encoder with an upsampler.
         """
         check_views(inputs, 1)
         tokens, count = image_tokens(encoding, inputs)
-        x = self.param(
-            "queries", nn.initializers.normal(1.0), (len(ATTRIBUTES) * self.groups, self.width)
-        )
+        shape = len(ATTRIBUTES) * self.groups, self.width
+        x = self.param("queries", nn.initializers.normal(1.0), shape)
         init = nn.initializers.normal(INIT_STD)
         for index in range(self.layers):
             own = Attention(self.head_width, True, ctx.runtime, init, name=f"self_{index}")
@@ -86,12 +88,14 @@ class GroupReader(Reader):
 
 @part
 class GroupDecoder(Decoder):
-    """A linear head an attribute, from a group's token to the Gaussians of its vertices."""
+    """A decoder with a linear head for each attribute, from a group's token to the Gaussians of its
+    vertices.
+    """
 
     group_size: Vertices = 265
-    """Vertices of a group; the body has at most groups * group_size."""
+    """Vertices of a group. The body has at most `groups` times `group_size`."""
     offset_scale: Spread = 0.5
-    """Bound of the offsets, normalised units."""
+    """Bound of the offsets in normalised units."""
     initial_log_scale: Bias = -4.8
     """Bias of the scales before the softplus."""
 
@@ -99,8 +103,9 @@ class GroupDecoder(Decoder):
     def __call__(
         self, features: Float[Array, "a r d"], inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
-        """A Gaussian a vertex. Raises ValueError for a body of more vertices than the groups
-        have.
+        """Returns a Gaussian for each vertex.
+
+        Raises: ValueError for a body with more vertices than the groups have.
         """
         vertices, groups = len(inputs.canonical_vertices), features.shape[1]
         room = groups * self.group_size
@@ -109,19 +114,27 @@ class GroupDecoder(Decoder):
                 f"a body of {vertices} vertices: {groups} groups of decoder.group_size"
                 f" {self.group_size} have {room}"
             )
-        # a token an attribute: each gives that attribute of all vertices of its group
-        first = {"scales": self.initial_log_scale, "opacities": INITIAL_OPACITY}
+        # each token makes one attribute of all vertices of its group
+        first = {
+            "offsets": (0.0, 0.0, 0.0),
+            "quats": quaternion.IDENTITY,
+            "scales": (self.initial_log_scale,) * 3,
+            "opacities": (INITIAL_OPACITY,),
+            "colors": (0.0, 0.0, 0.0),
+        }
         raw = {}
         for token, (name, numbers) in zip(features, ATTRIBUTES.items(), strict=True):
-            bias = quaternion.IDENTITY if name == "quats" else (first.get(name, 0.0),) * numbers
-            raw[name] = nn.Dense(
+
+            def initial(_, __, dtype=jnp.float32, bias=first[name]):
+                return jnp.tile(jnp.asarray(bias, dtype), self.group_size)
+
+            head = nn.Dense(
                 self.group_size * numbers,
                 kernel_init=nn.initializers.normal(LAST_STD),
-                bias_init=lambda _, __, dtype=jnp.float32, b=bias: jnp.tile(
-                    jnp.asarray(b, dtype), self.group_size
-                ),
+                bias_init=initial,
                 name=name,
-            )(token).reshape(room, numbers)[:vertices]
+            )
+            raw[name] = head(token).reshape(room, numbers)[:vertices]
         # offsets are limited, in units of the body
         unit = subject_unit(inputs.canonical_vertices)
         offsets = self.offset_scale * jnp.tanh(raw["offsets"] / self.offset_scale)

@@ -1,24 +1,25 @@
-"""LVSM-style and HumanRAM-style: one transformer makes the pixels of a target from photos. No
-Gaussians, no 3D.
+"""Parts of LVSM-style and HumanRAM-style systems, in which one transformer makes the pixels of a
+target from photos, without Gaussians or other 3D.
 
-LVSM, decoder-only (Jin et al. 2024, https://arxiv.org/abs/2410.17242): patches of the photos (rgb
-and rays, 9 channels) and of the target (rays, 6) are tokens with a linear map each; all attend to
-all; a linear map turns the target's tokens into pixels. Trained with squared error and 0.5 VGG-19.
-Their encoder-decoder: photos and learned latent tokens attend to each other, then target and
-latents (12 + 12 layers, 3,072 latents). LVSM knows no body: it shows other views of the pose in the
-photos, CANNOT be animated, and the pose of a target changes nothing. HumanRAM (Yu et al. 2025,
-https://arxiv.org/abs/2506.03118) adds a neural texture of the body, read at the position maps of
-photos and of the target (57 and 54 channels): the target's pose enters through its position map
-alone. A residual convolutional decoder fuses its target tokens of four depths. Trained with squared
-error and 1.0 VGG.
+In the decoder-only LVSM (Jin et al. 2024, https://arxiv.org/abs/2410.17242) patches of the photos
+(rgb and rays, 9 channels) and of the target (rays, 6 channels) become tokens by a linear map each.
+All tokens attend to all. A linear map turns the target's tokens into pixels. It is trained with
+squared error and 0.5 VGG-19. In LVSM's encoder-decoder photos and learned latent tokens attend to
+each other, then target and latents (12 + 12 layers, 3,072 latents). LVSM knows no body. It shows
+other views of the pose in the photos and CANNOT be animated: the pose of a target changes nothing.
 
-Every target needs a pass through the whole transformer: photos attend to the target, so
-nothing of a person can be kept from one target to the next, and a frame costs as much as the first
-one. (The encoder-decoder's latents could be kept; here they are made again.)
+HumanRAM (Yu et al. 2025, https://arxiv.org/abs/2506.03118) adds a neural texture of the body, which
+is read at the position maps of photos and of the target (57 and 54 channels). The target's pose
+enters only through its position map. A residual convolutional decoder fuses the target tokens of
+four depths. It is trained with squared error and 1.0 VGG.
 
-Our reading: the neural texture and blocks are those of this package. HumanRAM's code is not public:
-its decoder here adds the four depths, from the last to the first, each followed by a residual
-block, and doubles the sides until a token has its pixels.
+Every target needs a pass through the whole transformer. Photos attend to the target, so nothing of
+a person can be kept from one target to the next, and a frame costs as much as the first one. (The
+encoder-decoder's latents could be kept; here they are made again.)
+
+In our reading the neural texture and the blocks are those of this package. HumanRAM's code is not
+public. Its decoder here adds the four depths from the last to the first, each followed by a
+residual block, and doubles the sides until a token has its pixels.
 """
 
 from typing import Annotated, Any, NamedTuple, cast
@@ -52,70 +53,72 @@ from humangs_jax.network.upsampler import KAIMING, SLOPE, UpConvolution
 from humangs_jax.rendering.gaussians import Gaussians
 
 LEAST_WIDTH = 8
-"""Of the maps of the convolutional decoder, whose width halves as their sides double."""
+"""Least number of features of the convolutional decoder's maps, which halves as their sides
+double.
+"""
 
 
 @part
 class NoReader(Reader):
-    """The reader of systems whose decoders read the inputs themselves: its features are the
-    encoding.
-    """
+    """The reader of systems whose decoders read the inputs. Its features are the encoding."""
 
     def __call__(self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
+        """Returns the encoding."""
         return encoding
 
 
 class Photos(NamedTuple):
-    """pixels: (v, h, w, 12) rgb, ray, canonical position. view_count: as in `HumanGSInputs`."""
+    """The photos as a `QueryDriver` reads them."""
 
     pixels: Float[Array, "v h w 12"]
+    """rgb (3), ray (6) and canonical position (3) of each pixel."""
     view_count: Int[Array, ""] | None
+    """Number of views that are no padding, as in `HumanGSInputs`."""
 
 
 @part
 class PhotoDecoder(Decoder):
-    """No Gaussians: the photos, for a `QueryDriver`."""
+    """A decoder that makes no Gaussians and passes the photos to a `QueryDriver`."""
 
     def __call__(
         self, features: PyTree, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
-        return HumanGSOutputs(
-            no_gaussians(), scene=Photos(encoder_pixels(inputs, ctx), inputs.view_count)
-        )
+        """Returns the photos as the scene."""
+        photos = Photos(encoder_pixels(inputs, ctx), inputs.view_count)
+        return HumanGSOutputs(no_gaussians(), scene=photos)
 
 
 def no_gaussians() -> Gaussians:
+    """Returns 0 Gaussians."""
     return Gaussians(*(jnp.zeros((0, *shape)) for shape in ((3,), (4,), (3,), (), (3,))))
 
 
 @part
 class QueryDriver(PixelDriver):
-    """The pixels of a target from the photos."""
+    """A driver that makes the pixels of a target from the photos."""
 
     transformer: TransformerConfig = TransformerConfig(layers=24, class_token=False)
-    """Without a class token."""
+    """The transformer, which has no class token."""
     texture: TriplaneConfig | None = None
-    """The neural texture (HumanRAM), None: the body is unknown (LVSM)."""
+    """The neural texture (HumanRAM). None: the body is unknown (LVSM)."""
     fusion: Annotated[int, Range(2, 16_384)] | None = None
-    """Width of the convolutional decoder, which needs a patch size that is a power of 2; None: the
-    linear map.
+    """Width of the convolutional decoder, which needs a patch size that is a power of 2. None:
+    pixels come from a linear map.
     """
     patch_size: Patch = 8
-    """Of photos and targets."""
+    """Side of a patch of photos and targets in pixels."""
     latents: Vertices | None = None
-    """Learned tokens of LVSM's encoder-decoder, which has two transformers, None: photos and target
-    attend to each other.
+    """Number of learned tokens of LVSM's encoder-decoder, which has two transformers. None: photos
+    and target attend to each other.
     """
 
     @property
     def moves(self) -> bool:
-        """Whether it can show a pose that no photo shows: without the texture the body is
-        unknown.
-        """
+        """Whether it can show a pose that no photo shows. Without the texture it knows no body."""
         return self.texture is not None
 
     def __post_init__(self):
-        """Raises ValueError for a class token, or too few layers to fuse four depths."""
+        """Raises a ValueError for a class token, or for too few layers to fuse four depths."""
         super().__post_init__()
         if self.transformer.class_token:
             raise ValueError(
@@ -130,7 +133,10 @@ class QueryDriver(PixelDriver):
     def __call__(
         self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext
     ) -> Float[Array, "i j 3"]:
-        """The image of a target in [0, 1], on white; its sides are multiples of the patch size."""
+        """Returns the image of a target in [0, 1] on white. Its sides are multiples of the patch
+        size.
+        """
+        # what tokens are made of: rays, and positions or what the texture has there
         photos: Photos = outputs.scene
         patch, dtype, width = self.patch_size, ctx.runtime.compute_dtype, self.transformer.width
         query = cast(Array, target.pixels)
@@ -152,22 +158,23 @@ class QueryDriver(PixelDriver):
             patches = patchify(maps, patch)
             return linear(width, name)(patches.reshape(len(patches), -1))
 
-        seen = tokens_of(
-            jnp.concatenate([2 * photos.pixels[..., :3] - 1, seen], axis=-1), "photo_tokens"
-        )
+        colored = jnp.concatenate([2 * photos.pixels[..., :3] - 1, seen], axis=-1)
+        seen = tokens_of(colored, "photo_tokens")
         asked = tokens_of(asked[None], "target_tokens")
         targets = len(asked)
-        # the target comes first: photos that are padding are the last tokens
+
+        # number of photo tokens that are no padding, which come first; None: all of them
         real = photos.view_count
-        count = None if real is None else targets + real * (len(seen) // len(photos.pixels))
+        if real is not None:
+            real = real * (len(seen) // len(photos.pixels))
         if self.latents is not None:
             learned = self.param("latents", nn.initializers.normal(INIT_STD), (self.latents, width))
             encoder = Transformer(self.transformer, ctx.runtime, name="encoder")
-            encoded = encoder(
-                jnp.concatenate([learned, seen]),
-                None if count is None else count - targets + self.latents,
-            )[-1]
-            seen, count = encoded[: self.latents], None
+            encoder_count = None if real is None else self.latents + real
+            encoded = encoder(jnp.concatenate([learned, seen]), encoder_count)[-1]
+            seen, real = encoded[: self.latents], None
+        # the target comes before the photos, so that padding is last
+        count = None if real is None else targets + real
         transformer = Transformer(self.transformer, ctx.runtime, name="transformer")
         depths = transformer(jnp.concatenate([asked, seen]), count)
         rows, columns = query.shape[0] // patch, query.shape[1] // patch
@@ -179,16 +186,23 @@ class QueryDriver(PixelDriver):
 
 
 class FusionHead(nn.Module):
-    """Token maps of four depths, each (1, h, w, d) -> (1, patch h, patch w, 3), before the
-    sigmoid.
+    """Turns token maps of four depths, each (v, h, w, d), into colors (v, patch h, patch w, 3)
+    before the sigmoid.
     """
 
     hidden: int
+    """Number of features of the coarsest maps."""
     patch: int
+    """Side of a patch in pixels."""
     dtype: Any = None
+    """Number type of the products."""
 
     @nn.compact
     def __call__(self, maps: list[Float[Array, "v h w d"]]) -> Float[Array, "v i j 3"]:
+        """Returns colors before the sigmoid.
+
+        Raises: ValueError if the side of a patch is no power of 2.
+        """
         if self.patch & (self.patch - 1):
             raise ValueError(f"driver.fusion: patch_size {self.patch}: expected a power of 2")
 

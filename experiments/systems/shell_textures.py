@@ -1,18 +1,18 @@
-"""GHG-style: textures of shells of the body, copied from the photos, and a U-Net that makes a
-Gaussian of every texel.
+"""Parts of GHG-style systems: textures of shells of the body, copied from the photos, and a U-Net
+that makes a Gaussian of every texel.
 
-Theirs (Kwon et al. 2024, https://arxiv.org/abs/2407.12777): UV maps of 1024 x 1024 texels of the
+GHG (Kwon et al. 2024, https://arxiv.org/abs/2407.12777) has UV maps of 1024 x 1024 texels of the
 surface of the body and of four shells around it, up to 4 cm off along the normals. A texel has the
-color of the photo that sees it best; a network of gated convolutions fills the rest of the
-innermost one, the outer ones keep what was seen. A convolutional U-Net takes the colors and the
-offsets of the shells and gives rotation, scale (at most 1 cm) and opacity. Means and colors are not
-predicted.
+color of the photo that sees it best. A network of gated convolutions fills the rest of the
+innermost map, and the outer maps keep what was seen. A convolutional U-Net takes the colors and the
+offsets of the shells and predicts rotation, scale (at most 1 cm) and opacity. Means and colors are
+not predicted.
 
-Our reading: the best view is the one whose ray meets the posed normal most directly; unseen texels
-of the innermost shell are filled from their neighbours through coarser and coarser maps (pull-push,
-Gortler et al. 1996), without a network; texels of outer shells that no photo shows on the person
-are transparent. Theirs is of one pose; here texels have the skinning weights of their points, so
-that the person can be animated. The encoder is `PlainPhotos`: none.
+In our reading the best view is the one whose ray meets the posed normal most directly. Unseen
+texels of the innermost shell are filled from their neighbours through coarser and coarser maps
+(pull-push, Gortler et al. 1996), without a network. Texels of outer shells that no photo shows on
+the person are transparent. GHG makes one pose. Here texels have the skinning weights of their
+points, so that the person can be animated. The encoder `PlainPhotos` passes the photos on.
 """
 
 import flax.linen as nn
@@ -42,44 +42,48 @@ from humangs_jax.network.vertex_decoder import INITIAL_OPACITY
 from humangs_jax.rendering.gaussians import Gaussians
 
 DISTANCES = (0.0, 0.01, 0.02, 0.03, 0.04)
+"""Distances of the shells from the surface in normalised units."""
 CHANNELS = (4, 3, 1)
-"""Of a quaternion, a scale and an opacity."""
+"""Numbers of a quaternion, a scale and an opacity."""
 
 
 @pytree_dataclass
 class ShellTextures:
-    """What the photos show of every texel of s shells.
-
-    distances: (s,) from the surface, normalised units. colors: (s, h, w, 3), the innermost filled,
-    others `UNSEEN_COLOR` where nothing was seen. seen: (s, h, w) whether a photo shows the person
-    there.
-    """
+    """What the photos show of every texel of s shells."""
 
     distances: Float[Array, " s"]
+    """Distances of the shells from the surface in normalised units."""
     colors: Float[Array, "s h w 3"]
+    """Colors of the texels. Where nothing was seen the innermost shell is filled, and others have
+    `UNSEEN_COLOR`.
+    """
     seen: Bool[Array, "s h w"]
+    """Whether a photo shows the person at the texel."""
 
 
 @part
 class PlainPhotos(Encoder):
-    """The encoder of systems that read the photos themselves: its maps are their colors."""
+    """The encoder of systems whose other parts read the photos. Its maps are their colors."""
 
     patch_size: Patch = 1
+    """Side of a patch in pixels."""
 
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
+        """Returns the colors of the photos as maps."""
         return Encoding(inputs.images, None, jnp.zeros((), jnp.int32))
 
 
 @part
 class ShellTextureReader(Reader):
-    """The textures."""
+    """A reader that makes the textures of the shells."""
 
     surface_map: SurfaceMap = SurfaceMap("atlas", 1024)
+    """The texels of a shell."""
     shells: tuple[Spread, ...] = DISTANCES
-    """Ascending distances from the surface, normalised units, the first 0."""
+    """Distances from the surface in normalised units, ascending from 0."""
 
     def __post_init__(self):
-        """Raises ValueError unless the shells begin at the surface and ascend."""
+        """Raises a ValueError unless the distances of the shells ascend from 0."""
         super().__post_init__()
         if not self.shells or self.shells[0] != 0 or list(self.shells) != sorted(set(self.shells)):
             raise ValueError(
@@ -89,7 +93,7 @@ class ShellTextureReader(Reader):
     def __call__(
         self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> ShellTextures:
-        """Textures of the shells.
+        """Returns the textures of the shells.
 
         Raises: ValueError if the inputs lack the map of the surface or posed normals.
         """
@@ -103,7 +107,7 @@ class ShellTextureReader(Reader):
         covered = texels.covered
 
         def look(best, view):
-            """Take colors from a view where it faces the surface more than those before."""
+            """Takes colors from a view where it faces the surface more than the views before."""
             image, foreground, depth_map, camera, vertices, normals, present = view
             surface_normals = safe_normalize(texels.interpolate(normals), jnp.zeros(3))
             points = texels.interpolate(vertices) + steps[:, None, None, None] * surface_normals
@@ -111,27 +115,22 @@ class ShellTextureReader(Reader):
             # a point is seen inside of the photo, on the person, not behind the surface
             pixels, depths = project_vertices(camera, points)
             indices = texel_indices(pixels, size, size, grid)
-            surface, person = (
-                sample_nearest(depth_map, indices),
-                sample_nearest(foreground, indices) > 0,
-            )
-            framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (
-                depths > 0
-            )
-            visible = (
-                framed & person & ((surface < 0) | (depths < surface + DEPTH_TOLERANCE)) & present
-            )
+            surface = sample_nearest(depth_map, indices)
+            person = sample_nearest(foreground, indices) > 0
+            inside = (pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype))
+            framed = jnp.all(inside, axis=-1) & (depths > 0)
+            in_front = (surface < 0) | (depths < surface + DEPTH_TOLERANCE)
+            visible = framed & person & in_front & present
             towards = safe_normalize(camera.center - points, jnp.zeros(3)).reshape(*shape, 3)
             facing = jnp.sum(towards * surface_normals, axis=-1)
             facing = jnp.where(visible.reshape(shape) & covered, facing, 0.0)
             colors = sample_bilinear(image, indices).reshape(*shape, 3)
-            better = facing > best[0]
-            return (
-                jnp.where(better, facing, best[0]),
-                jnp.where(better[..., None], colors, best[1]),
-            ), None
+            best_facing, best_colors = best
+            better = facing > best_facing
+            best_facing = jnp.where(better, facing, best_facing)
+            return (best_facing, jnp.where(better[..., None], colors, best_colors)), None
 
-        # one view after the other; what none has seen on the skin takes colors of its neighbours
+        # one view after the other; unseen texels of the skin take the colors of their neighbours
         shape = (len(self.shells), *covered.shape)
         nothing = jnp.zeros(shape), jnp.full((*shape, 3), UNSEEN_COLOR)
         views = (
@@ -149,24 +148,22 @@ class ShellTextureReader(Reader):
 
 
 def fill_unseen(colors: Float[Array, "h w 3"], seen: Bool[Array, "h w"]) -> Float[Array, "h w 3"]:
-    """Seen texels as they are, others from the finest coarser map that has seen something; grey if
-    nothing was seen at all.
+    """Returns the colors with unseen texels filled from the finest coarser map in which something
+    was seen there. All texels are grey if nothing was seen.
     """
     weights = seen[None, ..., None].astype(colors.dtype)
     return _filled(colors[None] * weights, weights)[0]
 
 
 def _filled(sums, weights):
-    """Means where there are weights, and what coarser maps have elsewhere."""
+    """Returns weighted means where there are weights, and the colors of coarser maps elsewhere."""
     mean = sums / jnp.where(weights > 0, weights, 1)
     _, height, width, _ = sums.shape
     if height % 2 or width % 2:
+        # a map that cannot be halved has one color
         total = jnp.sum(weights, axis=(1, 2), keepdims=True)
-        coarse = jnp.where(
-            total > 0,
-            jnp.sum(sums, axis=(1, 2), keepdims=True) / jnp.where(total > 0, total, 1),
-            UNSEEN_COLOR,
-        )
+        whole_mean = jnp.sum(sums, axis=(1, 2), keepdims=True) / jnp.where(total > 0, total, 1)
+        coarse = jnp.where(total > 0, whole_mean, UNSEEN_COLOR)
     else:
         coarse = doubled(_filled(halved(sums), halved(weights)))
     return jnp.where(weights > 0, mean, coarse)
@@ -174,15 +171,15 @@ def _filled(sums, weights):
 
 @part
 class ShellDecoder(Decoder):
-    """The U-Net."""
+    """A decoder that makes Gaussians of the textures by a U-Net."""
 
     widths: tuple[Width, ...] = (32, 48, 96)
-    """Its features, the finest scale first."""
+    """Numbers of features of the U-Net, the finest scale first."""
     largest_scale: Spread = 0.01
-    """Of a Gaussian, normalised units."""
+    """Largest scale of a Gaussian in normalised units."""
 
     def __post_init__(self):
-        """Raises ValueError for widths that no U-Net has."""
+        """Raises a ValueError for widths that no U-Net has."""
         super().__post_init__()
         check_scales("decoder.widths", self.widths)
 
@@ -190,8 +187,10 @@ class ShellDecoder(Decoder):
     def __call__(
         self, features: ShellTextures, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
-        """A Gaussian a texel of every shell; those that show no point of the body, or were not
-        seen, are transparent.
+        """Returns a Gaussian for each texel of every shell.
+
+        Gaussians are transparent where the texel shows no point of the body, and on outer shells
+        where it was not seen.
 
         Raises: ValueError if the inputs lack the map of the surface, normals or skinning weights.
         """
@@ -214,22 +213,21 @@ class ShellDecoder(Decoder):
         raw = network(entering)[0]
         raw = jnp.moveaxis(raw.reshape(*covered.shape, shells, -1), 2, 0)
         quats, scales, opacities = jnp.split(raw, (CHANNELS[0], CHANNELS[0] + CHANNELS[1]), axis=-1)
-        # the skin is there where it was not seen, too; other shells are not
+        # the skin is shown also where it was not seen, and outer shells only where they were seen
         shown = covered & features.seen.at[0].set(True)
 
         def flat(x):
             return x.reshape(-1, x.shape[-1])
 
+        alpha = jax.nn.sigmoid(opacities[..., 0] + INITIAL_OPACITY)
         gaussians = Gaussians(
             means=flat(surface + offsets) * unit,
             quats=quaternion.normalize(flat(quats) + jnp.asarray(quaternion.IDENTITY, raw.dtype)),
             scales=flat(self.largest_scale * jax.nn.sigmoid(scales)) * unit,
-            opacities=jnp.where(
-                shown, jax.nn.sigmoid(opacities[..., 0] + INITIAL_OPACITY), 0.0
-            ).reshape(-1),
+            opacities=jnp.where(shown, alpha, 0.0).reshape(-1),
             colors=flat(features.colors),
         )
-        # what shows nothing stays at the root
+        # texels that show nothing move with the root
         rows = texels.interpolate(weights).at[..., 0].add(1.0 - covered)
         rows = jnp.tile(rows.reshape(-1, rows.shape[-1]), (shells, 1))
         return HumanGSOutputs(gaussians, skinning_weights=rows)

@@ -1,26 +1,29 @@
-"""GIGA-style and Animatable-Gaussians-style: a Gaussian for every texel of a map of the body, by
-U-Nets that run for every pose.
+"""Parts of GIGA-style and Animatable-Gaussians-style systems: U-Nets that run for every pose make a
+Gaussian for every texel of a map of the body.
 
-GIGA (Zubekhin et al. 2025, https://arxiv.org/abs/2504.07144): photos of the CURRENT frame are
-projected onto a texture of 512 x 512 texels, the visible views weighted by the softmax of 5 times
-the cosine at which they see a texel. Encoders for textures and for canonical positions (64 x 1, 2,
-4, 8 channels), whose coarsest maps attend to an MLP of the pose (162 numbers, width 1024), and
-decoders of 3, 3 and 8 channels give color, offset and the rest of a Gaussian a texel, which
-skinning poses. SSIM 0.5, L1 0.5, alpha 0.2, perceptual 0.5 and penalties of offsets, opacities and
-scales. Our reading: encoders of 3 + 1 channels (color, whether seen) and 3 (position), whose scales
-are joined, and three decoders; no second, static texture of other frames, which half of their steps
-drop: the photos here show one pose, and for a target in another pose theirs is the static texture;
-the pose is that of the target.
+GIGA (Zubekhin et al. 2025, https://arxiv.org/abs/2504.07144) projects photos of the CURRENT frame
+onto a texture of 512 x 512 texels. Visible views are weighted by the softmax of 5 times the cosine
+at which they see a texel. There are encoders for textures and for canonical positions (64 x 1, 2,
+4, 8 channels), whose coarsest maps attend to an MLP of the pose (162 numbers, width 1024). Decoders
+of 3, 3 and 8 channels predict color, offset and the rest of a Gaussian for each texel, which
+skinning poses. The loss has SSIM 0.5, L1 0.5, alpha 0.2, perceptual 0.5 and penalties of offsets,
+opacities and scales.
 
-Animatable Gaussians (Li et al. 2023, https://arxiv.org/abs/2311.16096) is fitted to ONE person:
-maps of the front and the back of the T-pose, 1024 x 1024 texels each, a Gaussian for every texel
-that shows the body; three StyleUNets turn a map of posed positions into colors, offsets (times
-0.05) and the rest. L1 + 0.1 LPIPS + 0.005 of squared offsets, Adam 5e-4, 800,000 steps of one
-person. It reads no photo: the weights contain the person, and fit nobody else. Our reading: plain
-U-Nets on maps of one size, colors that do not depend on the view, no PCA of novel poses, positions
-relative to the middle and the root's rotation.
+In our reading GIGA has encoders of 3 + 1 channels (color, whether seen) and 3 channels (position),
+whose scales are joined, and three decoders. GIGA also has a static texture of other frames, which
+half of its training steps drop. It is left out, because the photos here show one pose; GIGA would
+use it for a target in another pose. The pose is that of the target.
 
-Both start from the same Gaussians, flat ones on the surface: with zero corrections the body itself.
+Animatable Gaussians (Li et al. 2023, https://arxiv.org/abs/2311.16096) is fitted to ONE person. It
+has maps of the front and the back of the T-pose, of 1024 x 1024 texels each, and a Gaussian for
+every texel that shows the body. Three StyleUNets turn a map of posed positions into colors, offsets
+(times 0.05) and the rest. It is trained with L1 + 0.1 LPIPS + 0.005 of squared offsets, by Adam
+with 5e-4, for 800,000 steps of one person. It reads no photo: the weights contain the person, and
+fit nobody else. In our reading there are plain U-Nets on maps of one size, colors that do not
+depend on the view, no PCA of novel poses, and positions relative to the middle and the root's
+rotation.
+
+Both start from the same flat Gaussians on the surface. Without corrections they show the body.
 Texels that show nothing are transparent.
 """
 
@@ -55,53 +58,54 @@ from humangs_jax.network.vertex_decoder import normal_frames
 from humangs_jax.rendering.gaussians import Gaussians
 
 AREA = 1.9
-"""Surface of a body of height 1.8, square metres."""
+"""Surface of a body that is 1.8 m tall, square metres."""
 COVERAGE, THICKNESS = 0.7, 0.2
-"""Standard deviations of a Gaussian along the surface over the distance between texels, and across
-over along it.
+"""Standard deviation of a Gaussian along the surface as a share of the distance between texels, and
+across the surface as a share of that along it.
 """
 OPACITY = 0.9
-"""Of Gaussians before corrections."""
+"""Opacity of Gaussians before corrections."""
 NETS = {"offsets": 3, "shapes": 8, "colors": 3}
-"""Outputs of each network or decoder, in the order of `correction.CHANNELS`."""
+"""{network or decoder: number of its outputs}, in the order of `correction.CHANNELS`."""
 
 
 @pytree_dataclass
 class SurfaceTexture:
-    """colors: (h, w, 3), grey where unseen.
-
-    seen: (h, w) 1 where a photo shows the texel, else 0.
-    """
+    """A texture of the body, copied from photos."""
 
     colors: Float[Array, "h w 3"]
+    """Colors of the texels, grey where no photo shows them."""
     seen: Float[Array, "h w"]
+    """1 where a photo shows the texel, 0 elsewhere."""
 
 
 @pytree_dataclass
 class Surface:
-    """What drivers work from. texture: or None. positions: (h, w, 3) canonical, normalised units.
-
-    texels: the map.
-    """
+    """What drivers work from."""
 
     texture: SurfaceTexture | None
+    """The texture, None for systems that read no photo."""
     positions: Float[Array, "h w 3"]
+    """Canonical positions of the texels in normalised units."""
     texels: Texels
+    """The map of the surface."""
 
 
 @part
 class TextureReader(Reader):
-    """Photos -> the texture of the body."""
+    """A reader that copies the photos to the texture of the body."""
 
     surface_map: SurfaceMap = SurfaceMap()
+    """The texels."""
     sharpness: Weight = 5.0
-    """Of the softmax over the cosines of visible views; larger: the best view."""
+    """Factor of the cosines in the softmax over visible views. A large one takes the best view."""
 
     def __call__(
         self, encoding: Encoding, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> SurfaceTexture:
-        """The texture. Raises: ValueError if the inputs lack the map of the surface or posed
-        normals.
+        """Returns the texture.
+
+        Raises: ValueError if the inputs lack the map of the surface or posed normals.
         """
         texels = _texels(inputs)
         if inputs.posed_normals is None:
@@ -112,21 +116,18 @@ class TextureReader(Reader):
         size, grid = (inputs.cameras.width, inputs.cameras.height), ctx.conventions.pixel_grid
 
         def view(image, depth_map, camera, vertices, normals, present):
-            """Colors of the texels in a view, and their weights: by how much they face it."""
+            """Returns the colors of the texels in a view, and weights by how much they face it."""
             points = texels.interpolate(vertices).reshape(-1, 3)
             pixels, depths = project_vertices(camera, points)
             visible = visible_vertices(pixels, depths, depth_map, size, grid) & covered & present
 
-            def away(x):
+            def unit_vectors(x):
                 return safe_normalize(x, jnp.zeros(3))
 
-            cosines = jnp.sum(
-                away(texels.interpolate(normals).reshape(-1, 3)) * away(camera.center - points),
-                axis=-1,
-            )
-            weights = jnp.where(
-                visible & (cosines > 0), jnp.exp(self.sharpness * (cosines - 1)), 0.0
-            )
+            away = unit_vectors(texels.interpolate(normals).reshape(-1, 3))
+            cosines = jnp.sum(away * unit_vectors(camera.center - points), axis=-1)
+            weights = jnp.exp(self.sharpness * (cosines - 1))
+            weights = jnp.where(visible & (cosines > 0), weights, 0.0)
             return sample_bilinear(image, texel_indices(pixels, size, size, grid)), weights
 
         arguments = (
@@ -146,13 +147,14 @@ class TextureReader(Reader):
 
 @part
 class SurfaceDecoder(Decoder):
-    """A flat Gaussian on the surface for every texel, row-major, with the texture's color: what
-    drivers correct.
+    """A decoder that makes a flat Gaussian on the surface for every texel, which drivers correct.
 
-    Nothing is learned. Without a texture, features of any other kind, colors are grey.
+    Gaussians are in row-major order and have the texture's colors. They are grey if the features
+    are no texture. Nothing is learned.
     """
 
     surface_map: SurfaceMap = SurfaceMap()
+    """The texels."""
 
     def __call__(
         self, features: PyTree, inputs: HumanGSInputs, ctx: ForwardContext
@@ -195,6 +197,7 @@ class SurfaceDecoder(Decoder):
 
 
 def _texels(inputs: HumanGSInputs) -> Texels:
+    """Returns the map of the surface. Raises a ValueError if the inputs lack it."""
     if inputs.texels is None:
         raise ValueError(
             "this network works on a map of the surface: use `gaussian_body` and `prepare_inputs`"
@@ -204,22 +207,23 @@ def _texels(inputs: HumanGSInputs) -> Texels:
 
 @part
 class TextureDriver(GaussianDriver):
-    """GIGA-style: encoders of the texture, seen or not, and of positions; their coarsest maps
-    attend to the pose.
+    """The driver of GIGA-style systems: a U-Net with encoders of the texture and of positions,
+    whose coarsest maps attend to the pose.
     """
 
     widths: tuple[Width, ...] = (64, 128, 256, 512)
-    """Of the U-Net."""
+    """Numbers of features of the U-Net, the finest scale first."""
     pose_width: Width = 1024
-    """Of the MLP of the pose, as `pose_tokens`."""
+    """Width of the MLP of the pose."""
     pose_tokens: Count = 16
+    """Number of tokens that the MLP makes of the pose."""
     joints: Count = 55
-    """Of the body."""
+    """Number of joints of the body."""
     offset_scale: Spread = 0.1
-    """Metres, bound of the offsets."""
+    """Bound of the offsets in metres."""
 
     def __post_init__(self):
-        """Raises ValueError for a number of scales that no map has."""
+        """Raises a ValueError for widths that no U-Net has."""
         super().__post_init__()
         check_scales("driver.widths", self.widths)
 
@@ -234,32 +238,29 @@ class TextureDriver(GaussianDriver):
         surface: Surface = outputs.scene
         if surface.texture is None:
             raise ValueError("a TextureDriver needs a TextureReader")
-        texture, attention = (
-            surface.texture,
-            PoseAttention(self.pose_width, self.pose_tokens, parent=None),
-        )
+        texture = surface.texture
+        attention = PoseAttention(self.pose_width, self.pose_tokens, parent=None)
         seen = jnp.concatenate([2 * texture.colors - 1, texture.seen[..., None]], axis=-1)
         network = UNet(self.widths, tuple(NETS.values()), attention)
         nn.share_scope(self, network)
-        raw = network(
-            seen[None], surface.positions[None], context=pose_vector(target.pose, self.joints)
-        )
+        context = pose_vector(target.pose, self.joints)
+        raw = network(seen[None], surface.positions[None], context=context)
         return _driven(outputs, raw[0], self.offset_scale)
 
 
 @part
 class PoseMapDriver(GaussianDriver):
-    """Animatable-Gaussians-style: three U-Nets on the map of posed positions, for offsets, shapes
-    and colors.
+    """The driver of Animatable-Gaussians-style systems: three U-Nets on the map of posed positions,
+    for offsets, shapes and colors.
     """
 
     widths: tuple[Width, ...] = (64, 128, 256, 512)
-    """Of each U-Net."""
+    """Numbers of features of each U-Net, the finest scale first."""
     offset_scale: Spread = 0.05
-    """Metres, bound of the offsets."""
+    """Bound of the offsets in metres."""
 
     def __post_init__(self):
-        """Raises ValueError for a number of scales that no map has."""
+        """Raises a ValueError for widths that no U-Net has."""
         super().__post_init__()
         check_scales("driver.widths", self.widths)
 
@@ -267,22 +268,21 @@ class PoseMapDriver(GaussianDriver):
     def __call__(
         self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext
     ) -> HumanGSOutputs:
+        """See `parts.TargetDecoder`."""
         surface: Surface = outputs.scene
         upright = quaternion.matrix_from_axis_angle(target.pose.rotations[0])
         middle = jnp.mean(target.vertices, axis=0)
-        relative = jnp.matmul(
-            target.vertices - middle, upright, precision=EXACT
-        )  # rows times R: R^T p
+        # rows times R are R^T p: the root's rotation is taken back
+        relative = jnp.matmul(target.vertices - middle, upright, precision=EXACT)
         maps = surface.texels.interpolate(relative)[None]
-        raw = jnp.concatenate(
-            [UNet(self.widths, (n,), name=name)(maps) for name, n in NETS.items()], axis=-1
-        )
-        return _driven(outputs, raw[0], self.offset_scale)
+        raw = [UNet(self.widths, (n,), name=name)(maps) for name, n in NETS.items()]
+        return _driven(outputs, jnp.concatenate(raw, axis=-1)[0], self.offset_scale)
 
 
 def _driven(
     outputs: HumanGSOutputs, raw: Float[Array, "h w 14"], offset_scale: float
 ) -> HumanGSOutputs:
+    """Returns the outputs with Gaussians corrected by a map of raw corrections."""
     gaussians, offsets = apply_corrections(
         outputs.gaussians, raw.reshape(-1, CHANNELS), offset_scale
     )
@@ -290,22 +290,24 @@ def _driven(
 
 
 class PoseAttention(nn.Module):
-    """The bottleneck of a U-Net: every texel of its maps (1, h, w, d) attends to tokens that an MLP
-    makes of the pose (q,).
+    """The bottleneck of a U-Net, in which every texel of the coarsest maps attends to tokens that
+    an MLP makes of the pose.
     """
 
     width: int
+    """Width of the MLP."""
     tokens: int
+    """Number of tokens."""
 
     @nn.compact
     def __call__(
         self, x: Float[Array, "v h w d"], pose: Float[Array, " q"]
     ) -> Float[Array, "v h w d"]:
+        """Returns the maps after the attention."""
         features = x.shape[-1]
         hidden = jax.nn.silu(nn.Dense(self.width, name="pose_0")(pose))
-        context = nn.Dense(self.tokens * features, name="pose_1")(hidden).reshape(
-            self.tokens, features
-        )
+        context = nn.Dense(self.tokens * features, name="pose_1")(hidden)
+        context = context.reshape(self.tokens, features)
 
         def dense(name):
             return nn.Dense(features, use_bias=False, name=name)

@@ -1,9 +1,9 @@
-"""Maps of the body's surface, for networks that work on texels: which point of the body each texel
-shows.
+"""Maps of the body's surface for networks that work on texels. A map has the point of the body that
+each texel shows.
 
-A part asks for a map by its field `surface_map`. `data.views.gaussian_body` makes it, once per
-body, and the inputs of the network carry it: `HumanGSInputs.texels`. Texels name vertices, so that
-one map serves every shape and pose of a body.
+A part asks for a map by its field `surface_map`. `data.views.gaussian_body` makes the map once for
+each body, and the inputs of the network have it in `HumanGSInputs.texels`. Texels name vertices, so
+that one map serves every shape and pose of a body.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from humangs_jax.rendering.mesh.atlas import CELLS, Atlas, texels, unwrap
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 MARGIN = 0.95
-"""Share of the side of a view from the front or back that the body takes."""
+"""Share of the side of a front or back view that the body fills."""
 
 
 @configuration
@@ -28,20 +28,23 @@ class SurfaceMap:
     """A map of the surface."""
 
     kind: Literal["atlas", "front_back"] = "atlas"
-    """The texture coordinates of the body, or charts cut for it, with every point of the surface
-    once ("atlas"); or the T-pose seen from the front, and beside it, mirrored, from the back, by
-    parallel rays ("front_back")."""
+    """Kind of the map. "atlas" shows every point of the surface once, by the texture coordinates of
+    the body, or by charts that are cut for it. "front_back" shows the T-pose by parallel rays, from
+    the front, and beside it from the back, mirrored.
+    """
     size: Side = 512
-    """Texels a side; "front_back" is twice as wide."""
+    """Texels a side. "front_back" is twice as wide."""
 
     @property
     def shape(self) -> tuple[int, int]:
-        return self.size, self.size * (2 if self.kind == "front_back" else 1)
+        """Height and width in texels."""
+        width = 2 * self.size if self.kind == "front_back" else self.size
+        return self.size, width
 
     def texels(self, body: BodyModel) -> Texels:
-        """Of a body, on the host; texels that show nothing have no weights.
+        """Returns the map of a body, made on the host. Texels that show nothing have no weights.
 
-        Equal bodies share them: they take seconds.
+        A map takes seconds, so equal bodies share it.
         """
 
         def plain(x, dtype):
@@ -53,7 +56,7 @@ class SurfaceMap:
 
 @functools.lru_cache(maxsize=8)
 def _texels(template, faces, uvs, uv_faces, wanted):
-    """Arrays as bytes, which can be compared."""
+    """Returns the map of a body whose arrays are given as bytes, which can be compared."""
     vertices = np.frombuffer(template, np.float32).reshape(-1, 3)
     faces = np.frombuffer(faces, np.int32).reshape(-1, 3)
     if wanted.kind == "atlas":
@@ -65,14 +68,12 @@ def _texels(template, faces, uvs, uv_faces, wanted):
 
 
 def _atlas(vertices, faces, uvs, uv_faces, size):
+    """Returns the face and the barycentric weights of each texel of an atlas."""
     if uvs is not None and uv_faces is not None:
-        nothing = np.zeros(
-            0, np.int64
-        )  # charts and vertices of an atlas are not needed for its texels
-        uvs, uv_faces = (
-            np.frombuffer(uvs, np.float32).reshape(-1, 2),
-            np.frombuffer(uv_faces, np.int32).reshape(-1, 3),
-        )
+        # the texels of an atlas do not need its charts and vertices
+        nothing = np.zeros(0, np.int64)
+        uvs = np.frombuffer(uvs, np.float32).reshape(-1, 2)
+        uv_faces = np.frombuffer(uv_faces, np.int32).reshape(-1, 3)
         return texels(Atlas(uvs, uv_faces, nothing, nothing, size, 1.0))
     one = np.zeros(len(faces), np.int64)
     atlas = unwrap(vertices, faces, one, -(-size // CELLS) * CELLS, one + 1.0)
@@ -80,15 +81,17 @@ def _atlas(vertices, faces, uvs, uv_faces, size):
 
 
 def _front_and_back(vertices, faces, size):
-    """Parallel rays: points are placed at their pixel, at a depth of 2 to 3."""
+    """Returns the face and the barycentric weights of each texel of the front and the back view.
+
+    For parallel rays the points are placed at their pixel, at a depth of 2 to 3.
+    """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     right, up, front = ((vertices - (low + high) / 2) / (high - low)[:2].max()).T * MARGIN
     seen = []
     for side in (1, -1):
         depth = 2.5 - 0.5 * side * front / max(np.abs(front).max(), 1e-6)
-        points = np.stack(
-            [size * (0.5 + side * right) * depth, size * (0.5 - up) * depth, depth], axis=-1
-        )
+        x, y = size * (0.5 + side * right), size * (0.5 - up)
+        points = np.stack([x * depth, y * depth, depth], axis=-1)
         camera = Camera(jnp.eye(3), jnp.eye(4), size, size)
         seen.append(rasterize_mesh(jnp.asarray(points, jnp.float32), jnp.asarray(faces), camera))
 

@@ -1,7 +1,7 @@
-"""Drivers, by what they give for a target: corrected Gaussians, or the image itself.
+"""Base classes of drivers that correct Gaussians for a target, and of drivers that make its image.
 
-Avatar files, exports and the viewer know nothing of them: there a person moves by skinning alone,
-and the avatar of a network with a driver is the one before any correction.
+Avatar files, exports and the viewer do not use drivers. There a person moves by skinning alone, and
+the avatar of a network with a driver is the one before any correction.
 """
 
 import functools
@@ -39,7 +39,7 @@ from humangs_jax.training.forward import draw_posed
 
 
 class GaussianDriver(TargetDecoder):
-    """Corrects the canonical Gaussians for every pose."""
+    """A driver that corrects the canonical Gaussians for every pose."""
 
     @nn.nowrap
     def posed(
@@ -51,15 +51,19 @@ class GaussianDriver(TargetDecoder):
         pose: BodyPose,
         config: HumanGSConfig,
     ) -> tuple[Gaussians, HumanGSOutputs]:
-        """The Gaussians of one frame, posed, and before that. variables: the driver's own."""
+        """Returns the posed Gaussians of one frame, and the outputs before they are posed.
+
+        `variables` are those of the driver.
+        """
         target = Target(pose, person_vertices(body, betas, pose))
-        driven = cast(
-            HumanGSOutputs, self.apply(variables, outputs, target, config.forward_context())
-        )
+        applied = self.apply(variables, outputs, target, config.forward_context())
+        driven = cast(HumanGSOutputs, applied)
         return skin(make_avatar(driven, body, shape_body(body, betas), config), pose), driven
 
     @nn.nowrap
     def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
+        """See `parts.TargetDecoder`."""
+
         def one(pose):
             posed, driven = self.posed(
                 variables, outputs, body, targets.betas, BodyPose(*pose), config.model
@@ -78,20 +82,21 @@ class GaussianDriver(TargetDecoder):
     def show(
         self, variables, config, inputs, targets, background
     ) -> tuple[np.ndarray, Float[np.ndarray, "v h w"]]:
-        """See `parts.TargetDecoder`. Their world has to be y-up, unlike that of `reconstruct`."""
+        """See `parts.TargetDecoder`. The world of the captures has to be y-up, unlike in
+        `reconstruct`.
+        """
         outputs, body, views, config = reconstructed(variables, config, inputs)
         own = part_variables(variables, "driver")
-        posed = (
-            _posed(self, own, outputs, body, views.betas, pose, config) for pose in _poses(targets)
-        )
+        arguments = self, own, outputs, body, views.betas
+        posed = (_posed(*arguments, pose, config) for pose in _poses(targets))
         return drawn(posed, targets.cameras, background, config)
 
 
 class PixelDriver(TargetDecoder):
-    """Makes the images of targets without Gaussians: on white, the background is not known to it,
-    and there is no alpha.
+    """A driver that makes the images of targets without Gaussians.
 
-    `__call__` gives the image of a target whose sides are multiples of the encoder's patch size.
+    Images are on white, because the driver does not know the background, and have no alpha.
+    `__call__` returns the image of a target whose sides are multiples of the encoder's patch size.
     """
 
     has_alpha = False
@@ -105,9 +110,10 @@ class PixelDriver(TargetDecoder):
         targets: SubjectViews,
         config: HumanGSConfig,
     ) -> Float[Array, "v h w 3"]:
-        """Of targets, a pass each; their photos and masks are not used.
+        """Returns the images of targets, made by one pass each.
 
-        What is too much of a whole patch is cut off.
+        The photos and masks of the targets are not used. Pixels of whole patches beyond the image
+        are cut off.
         """
         vertices, pixels = target_queries(body, targets, config)
 
@@ -125,12 +131,12 @@ class PixelDriver(TargetDecoder):
 
     @nn.nowrap
     def draw(self, variables, outputs, body, photos, targets, backgrounds, config) -> Drawn:
+        """See `parts.TargetDecoder`."""
         images = self.images(variables, outputs, body, targets, config.model)
 
         def full(rgb):
-            return Rendering(
-                rgb, jnp.ones(rgb.shape[:2]), jnp.zeros(rgb.shape[:2]), jnp.zeros((), jnp.int32)
-            )
+            alpha, depth = jnp.ones(rgb.shape[:2]), jnp.zeros(rgb.shape[:2])
+            return Rendering(rgb, alpha, depth, jnp.zeros((), jnp.int32))
 
         return Drawn(jax.vmap(full)(images))
 
@@ -145,18 +151,17 @@ class PixelDriver(TargetDecoder):
         outputs, body, views, config = reconstructed(variables, config, inputs)
         own, images = part_variables(variables, "driver"), []
         for pose, camera in zip(_poses(targets), targets.cameras, strict=True):
-            images.append(
-                np.asarray(_image(self, own, outputs, body, _one_view(views, pose, camera), config))
-            )
+            target = _one_view(views, pose, camera)
+            images.append(np.asarray(_image(self, own, outputs, body, target, config)))
         return np.clip(np.stack(images), 0, 1), None
 
 
 def target_queries(
     body: BodyModel, targets: SubjectViews, config: HumanGSConfig
 ) -> tuple[Float[Array, "v n 3"], Float[Array, "v h w 9"]]:
-    """`Target.vertices` and `Target.pixels` of targets, whose photos and masks are not used.
+    """Returns `Target.vertices` and `Target.pixels` of targets.
 
-    Sides are whole patches.
+    Photos and masks of the targets are not used. Sides are rounded up to whole patches.
     """
     patch, cameras = config.architecture.encoder.patch_size, targets.cameras
     height, width = -(-cameras.height // patch) * patch, -(-cameras.width // patch) * patch
@@ -170,34 +175,36 @@ def target_queries(
 def drawn(
     posed: Iterable[Gaussians], cameras: Camera, background: float, config: HumanGSConfig
 ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"]]:
-    """Images and alpha of Gaussians for each camera, as the weights were trained with."""
+    """Draws Gaussians for each camera, in the way that the weights were trained with, and returns
+    images and alpha.
+    """
     how = SPLAT_PRESETS[config.conventions.rendering]
     found = list(draw_gaussians(posed, cameras, jnp.full(3, background), how))
-    return np.stack([np.clip(np.asarray(x.rgb), 0, 1) for x in found]), np.stack(
-        [np.asarray(x.alpha) for x in found]
-    )
+    images = np.stack([np.clip(np.asarray(x.rgb), 0, 1) for x in found])
+    return images, np.stack([np.asarray(x.alpha) for x in found])
 
 
 def reconstructed(
     variables: Variables, config: HumanGSConfig, inputs: Capture
 ) -> tuple[HumanGSOutputs, BodyModel, SubjectViews, HumanGSConfig]:
-    """What the network makes of a capture; the body and photos that it sees, the configuration with
-    buffers that fit.
+    """Returns the network's outputs for a capture, the body and the views that it sees, and the
+    configuration with buffers that fit.
     """
     body = gaussian_body(inputs.body, config)
-    views = to_network_views(
-        prepare_capture(inputs).capture, config.image_size, config.runtime.crop
-    )
+    capture = prepare_capture(inputs).capture
+    views = to_network_views(capture, config.image_size, config.runtime.crop)
     prepared = _prepare(body, views, config)
     config = fit_buffers(prepared.foreground, prepared.view_count, config)
     return _outputs(variables, prepared, config), body, views, config
 
 
 def _poses(targets: Capture) -> Any:
+    """Returns the pose of each view of a capture."""
     return jax.tree.map(lambda x: jnp.asarray(x)[np.asarray(targets.frames)], targets.poses)
 
 
 def _one_view(views: SubjectViews, pose: BodyPose, camera: Camera) -> SubjectViews:
+    """Returns one target without photo and mask, of the person of some views."""
     blank = jnp.zeros((1, camera.height, camera.width, 3))
     camera, rotations, translations = jax.tree.map(
         lambda x: x[None], (camera, pose.rotations, pose.translation)
@@ -210,6 +217,7 @@ _prepare = jax.jit(prepare_inputs, static_argnames="config")
 
 @functools.partial(jax.jit, static_argnames="config")
 def _outputs(variables: Variables, inputs: Any, config: HumanGSConfig) -> HumanGSOutputs:
+    """Compiled: runs the network."""
     return apply_humangs(variables, inputs, config)[0]
 
 
@@ -217,6 +225,7 @@ def _outputs(variables: Variables, inputs: Any, config: HumanGSConfig) -> HumanG
 def _image(
     driver: PixelDriver, variables: Variables, outputs: Any, body: Any, target: Any, config: Any
 ) -> Array:
+    """Compiled: makes the image of one target."""
     return driver.images(variables, outputs, body, target, config)[0]
 
 
@@ -230,4 +239,5 @@ def _posed(
     pose: Any,
     config: Any,
 ) -> Gaussians:
+    """Compiled: returns the posed Gaussians of one frame."""
     return driver.posed(variables, outputs, body, betas, pose, config)[0]

@@ -1,8 +1,9 @@
 """A small U-Net over maps, for systems that predict Gaussians texel by texel.
 
-At each scale two 3x3 convolutions with a ReLU; 2x2 means going down, nearest texels going up,
-joined with the maps of the same scale. A last 3x3 convolution gives the output, which starts near 0
-(Ronneberger et al. 2015, https://arxiv.org/abs/1505.04597).
+Each scale has two 3x3 convolutions with a ReLU. Going down, maps are halved by means of 2x2. Going
+up, they are doubled by nearest texels and joined with the maps of the same scale. A last 3x3
+convolution makes the output, which is near 0 at first (Ronneberger et al. 2015,
+https://arxiv.org/abs/1505.04597).
 """
 
 from typing import Any
@@ -17,11 +18,12 @@ from humangs_jax.network.upsampler import KAIMING
 from humangs_jax.network.vertex_decoder import LAST_STD
 
 MOST_SCALES = 12
-"""The coarsest map of the largest U-Net has two texels."""
+"""Largest number of scales, with which the coarsest map of the largest U-Net has two texels a side.
+"""
 
 
 def check_scales(name: str, widths: tuple[int, ...]) -> None:
-    """Raises ValueError, naming the setting, unless there are 1 to `MOST_SCALES` positive
+    """Raises a ValueError that names the setting unless there are 1 to `MOST_SCALES` positive
     widths.
     """
     if not 1 <= len(widths) <= MOST_SCALES or min(widths) < 1:
@@ -32,24 +34,33 @@ def check_scales(name: str, widths: tuple[int, ...]) -> None:
 
 
 class UNet(nn.Module):
-    """Maps (v, h, w, c) -> (v, h, w, features).
+    """A U-Net from maps (v, h, w, c) to maps (v, h, w, sum of `features`).
 
-    widths: features at every scale, the finest first; both sides are multiples of 2^(len(widths) -
-    1), or ValueError. bottleneck: a module that changes the coarsest maps, (v, h', w', c') and what
-    the call gives as `context` -> the same shape. Several maps have an encoder each, whose results
-    are joined at every scale; several numbers of features a decoder each, joined at the end.
+    Each of several input maps has an encoder, and their results are joined at every scale. Each
+    number of `features` has a decoder, and their results are joined at the end.
     """
 
     widths: tuple[int, ...]
+    """Numbers of features at every scale, the finest first. Both sides of the maps are multiples of
+    2^(len(widths) - 1).
+    """
     features: tuple[int, ...]
+    """Number of features that each decoder makes."""
     bottleneck: nn.Module | None = None
+    """A module that changes the coarsest maps (v, h', w', c'), and also gets the `context` of the
+    call. None: they are not changed.
+    """
     dtype: Any = None
+    """Number type of the products."""
 
     @nn.compact
     def __call__(
         self, *given: Float[Array, "v h w _"], context: Any = None
     ) -> Float[Array, "v h w features"]:
-        """The features of maps. Raises: ValueError for maps that cannot be halved often enough."""
+        """Returns the features of maps.
+
+        Raises: ValueError for maps that cannot be halved often enough.
+        """
         coarsest, (_, height, width, _) = 2 ** (len(self.widths) - 1), given[0].shape
         if height % coarsest or width % coarsest:
             raise ValueError(
@@ -58,37 +69,36 @@ class UNet(nn.Module):
             )
 
         def convolved(x, width, name):
-            """Two convolutions."""
+            """Applies two convolutions."""
             for i in range(2):
                 x = jax.nn.relu(Convolution(width, KAIMING, self.dtype, name=f"{name}_{i}")(x))
             return x
 
         def encoded(x, mark):
-            """A map at every scale, finest first."""
+            """Returns the features of a map at every scale, the finest first."""
             kept = []
             for i, width in enumerate(self.widths):
-                x = convolved(x if i == 0 else halved(x), width, f"{mark}down_{i}")
+                if i > 0:
+                    x = halved(x)
+                x = convolved(x, width, f"{mark}down_{i}")
                 kept.append(x)
             return kept
 
         def decoded(x, features, mark):
-            """Features at the finest scale, with what the encoders kept of each."""
+            """Returns features at the finest scale, with what the encoders kept of each scale."""
             for i, skip in reversed(list(enumerate(kept))):
-                x = convolved(
-                    jnp.concatenate([doubled(x), skip], axis=-1), self.widths[i], f"{mark}up_{i}"
-                )
-            return Convolution(
-                features, nn.initializers.normal(LAST_STD), self.dtype, name=f"{mark}out"
-            )(x)
+                joined = jnp.concatenate([doubled(x), skip], axis=-1)
+                x = convolved(joined, self.widths[i], f"{mark}up_{i}")
+            small = nn.initializers.normal(LAST_STD)
+            return Convolution(features, small, self.dtype, name=f"{mark}out")(x)
 
         def marks(many):
-            """Beginnings of names, none where there is one of a kind."""
+            """Returns the beginnings of names, which are empty if there is only one."""
             return [""] if len(many) == 1 else [f"{i}_" for i in range(len(many))]
 
-        scales = zip(
-            *(encoded(x, mark) for x, mark in zip(given, marks(given), strict=True)), strict=True
-        )
-        kept = [jnp.concatenate(maps, axis=-1) for maps in scales]
+        # encoders are joined at every scale, and decoders at the end
+        by_map = [encoded(x, mark) for x, mark in zip(given, marks(given), strict=True)]
+        kept = [jnp.concatenate(maps, axis=-1) for maps in zip(*by_map, strict=True)]
         x = kept.pop()
         if self.bottleneck is not None:
             x = self.bottleneck(x, context)
@@ -97,10 +107,11 @@ class UNet(nn.Module):
 
 
 def halved(x: Float[Array, "v h w c"]) -> Float[Array, "v i j c"]:
+    """Returns the means of squares of 2 x 2 elements."""
     views, height, width, channels = x.shape
     return jnp.mean(x.reshape(views, height // 2, 2, width // 2, 2, channels), axis=(2, 4))
 
 
 def doubled(x: Float[Array, "v h w c"]) -> Float[Array, "v i j c"]:
-    """Every element as a square of 2 x 2."""
+    """Returns every element as a square of 2 x 2 elements."""
     return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)
