@@ -1,4 +1,4 @@
-"""The points of the trade of speed against accuracy; its tables, images and front."""
+"""Lists the points of the trade of speed against accuracy, and shows their tables and images."""
 
 import dataclasses
 from pathlib import Path
@@ -10,38 +10,43 @@ from humangs_jax.apps.settings import PRESETS, Settings
 from humangs_jax.network.runtime import Runtime
 
 SIZE = 512
-"""Side of the frames that points are compared at."""
+"""Side in pixels of the frames of points that are compared."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """A way to make an avatar and draw it. size: side of the frames, pixels. start: "network", or
-    of `NAIVE`, to compare with.
-    """
+    """A way to make an avatar and draw it."""
 
     name: str
+    """Name in the table."""
     knob: str
+    """The knob that differs from the default point."""
     settings: Settings
+    """How the avatar is made and drawn."""
     size: int = SIZE
+    """Side of the frames in pixels."""
     start: str = "network"
+    """What the avatar is made of: "network", or one of `NAIVE` to compare with."""
 
 
 def point(name: str, knob: str, size: int = SIZE, start: str = "network", **changes: Any) -> Point:
+    """Returns a point of 4 photos with changes, which are fields of `Settings` or `Runtime`."""
     fields = {field.name for field in dataclasses.fields(Runtime)}
     runtime = Runtime(**{key: value for key, value in changes.items() if key in fields})
-    rest: dict[str, Any] = {"views": 4} | {
-        key: value for key, value in changes.items() if key not in fields
-    }
+    rest: dict[str, Any] = {"views": 4}
+    rest |= {key: value for key, value in changes.items() if key not in fields}
     return Point(name, knob, Settings(runtime=runtime, **rest), size, start)
 
 
 DEFAULT = point("default", "default")
-"""4 photos of 256 pixels, as the weights were trained, float32, no refinement; frames of 512
-pixels, exact.
+"""The point of 4 photos of 256 pixels, as the weights were trained, in float32, without refinement,
+with exact frames of 512 pixels.
 """
 
 
 def points() -> list[Point]:
+    """Returns all points that are measured."""
+    # presets and drawing
     found = [DEFAULT]
     found += [Point(f"preset {name}", "preset", settings) for name, settings in PRESETS.items()]
     found += [point(name, "splat preset", splat=name) for name in ("near_exact", "fast", "inria")]
@@ -78,16 +83,20 @@ ITERATIONS = (
     (4, 100, 256),
     *((4, steps, 512) for steps in (0, 100)),
 )
-"""Of the learned update, steps of Adam after them, and the size of the photos."""
+"""Points with refinement: iterations of the learned update, steps of Adam after them, and side of
+the photos in pixels.
+"""
 
 
 def refined(iterations: int, steps: int, size: int) -> Point:
-    """A point with iterations, named by what it does."""
-    parts = [
-        f"{iterations} iteration{'s' * (iterations > 1)}",
-        *([f"{steps} steps"] if steps else []),
-    ]
-    name = ", ".join(parts) + (f" at {size}" if size != 256 else "")
+    """Returns a point with iterations, steps of Adam and a size of the photos, as in
+    `ITERATIONS`.
+    """
+    name = f"{iterations} iterations" if iterations > 1 else "1 iteration"
+    if steps:
+        name += f", {steps} steps"
+    if size != 256:
+        name += f" at {size}"
     return point(
         name, "refinement", refine_iterations=iterations, refine_steps=steps, refine_size=size
     )
@@ -119,7 +128,7 @@ COMBINED: tuple[dict[str, Any], ...] = (
     {"crop": True, "image_size": 384, "refine_iterations": 4, "refine_size": 512},
     {"crop": True, "max_edge_length": 0.02, "refine_iterations": 4, "refine_size": 256},
 )
-"""Several knobs at once."""
+"""Points that change several knobs at once."""
 
 SHORT = {
     "views": "{} photos",
@@ -135,13 +144,14 @@ SHORT = {
 
 
 def combined(**fields: Any) -> Point:
-    return point(
-        ", ".join(SHORT[key].format(value) for key, value in fields.items()), "combined", **fields
-    )
+    """Returns a point with several changes, which is named by them."""
+    name = ", ".join(SHORT[key].format(value) for key, value in fields.items())
+    return point(name, "combined", **fields)
 
 
 EQUAL = 1.05
-"""Times of points that differ by less are taken for equal: they are measured beside other programs.
+"""Ratio of times up to which points are taken for equally fast, because other programs ran during
+the measurements.
 """
 TASKS = {"novel": "same pose", "animation": "novel poses"}
 SCORES = {
@@ -156,12 +166,10 @@ Row = dict[str, Any]
 
 
 def show(run: Run, result: dict[str, Any], image: Path | None) -> None:
-    """All tables, and what is asked for."""
-    result = result | {
-        "points": {
-            name: found for name, found in result["points"].items() if "reconstruct" in found
-        }
-    }
+    """Shows the tables of all measured points, and draws the images if they are asked for."""
+    points = result["points"]
+    measured = {name: found for name, found in points.items() if "reconstruct" in found}
+    result = result | {"points": measured}
     rows = rows_of(result)
     run.show(point_table(rows, result), kept(result), "tradeoff")
     run.show(preset_table(rows, result), table="tradeoff_presets")
@@ -171,21 +179,25 @@ def show(run: Run, result: dict[str, Any], image: Path | None) -> None:
 
 
 def kept(result: dict[str, Any]) -> dict[str, Any]:
-    """With means in place of the rows of people."""
+    """Returns a result with means and the number of people in place of the rows of people."""
     points = {}
     for name, found in result["points"].items():
         people = found.get("people") or []
         points[name] = {key: value for key, value in found.items() if key != "people"}
-        points[name] |= {"people": len(people)} | (means(people) if people else {})
+        points[name]["people"] = len(people)
+        if people:
+            points[name] |= means(people)
     return result | {"points": points}
 
 
 def rows_of(result: dict[str, Any]) -> list[Row]:
-    """A row for each measured point: what it is, times, memory, and means over people by task."""
+    """Returns a row for each measured point: its settings, times, memory, and means over people by
+    task.
+    """
     rows = []
     for name, found in result["points"].items():
         row = {"name": name.removeprefix("preset "), **found["what"], **found}
-        # docs/results have the number of people, and means
+        # docs/results have means and the number of people instead of rows of people
         people, of_people = found["people"], {}
         if isinstance(people, int):
             of_people = {task: found.get(task) for task in TASKS}
@@ -197,28 +209,28 @@ def rows_of(result: dict[str, Any]) -> list[Row]:
 
 
 def quality(row: Row) -> float:
-    """What points are ranked by, dB: the mean of both tasks."""
+    """Returns the PSNR in dB by which points are ranked, the mean of both tasks."""
     return 0.5 * (row["novel"]["psnr"] + row["animation"]["psnr"])
 
 
 def kind(row: Row) -> str:
+    """Returns the kind of a point, a key of `KINDS`."""
     if row["start"] in NAIVE:
         return "no network"
-    return (
-        "refined"
-        if row["settings"]["refine_steps"] or row["settings"]["refine_iterations"]
-        else "feed-forward"
-    )
+    if row["settings"]["refine_steps"] or row["settings"]["refine_iterations"]:
+        return "refined"
+    return "feed-forward"
 
 
 def compared(rows: list[Row]) -> list[Row]:
-    """Those with scores, of frames of one size."""
+    """Returns the rows that have scores of frames of `SIZE` pixels."""
     return [row for row in rows if row["novel"] is not None and row["size"] == SIZE]
 
 
 def front_of(rows: list[Row]) -> list[Row]:
-    """The points of ours than which no other one is better and takes no longer, cheapest
-    reconstruction first.
+    """Returns the points on the front, the cheapest reconstruction first.
+
+    A point with the network is on the front if no other such point is better and takes no longer.
     """
     ours = [row for row in compared(rows) if row["start"] == "network"]
 
@@ -236,10 +248,12 @@ def front_of(rows: list[Row]) -> list[Row]:
 
 
 def _count(people):
+    """Returns the number of people, of a list of rows or as docs/results have it."""
     return people if isinstance(people, int) else len(people)
 
 
 def about(result: dict[str, Any]) -> str:
+    """Describes the weights, the people and the unit of the times."""
     default = result["points"]["default"]
     people, took = _count(default["people"]), f"{default['reconstruct_ms']:.0f} ms a reconstruction"
     return (
@@ -253,13 +267,16 @@ def about(result: dict[str, Any]) -> str:
 
 
 def numbers(row: Row) -> list[str]:
+    """Returns the cells of times, memory and sizes of a row."""
+
     def share(key):
-        return significant(row[key]) if row.get(key) is not None else ""
+        return "" if row.get(key) is None else significant(row[key])
 
     return [share("reconstruct"), share("frame"), *cells(row, SIZES, "")]
 
 
 def scores(row: Row) -> list[str]:
+    """Returns the cells of the scores of a row."""
     return [cell for task in TASKS for cell in cells(row[task] or {}, SCORES, "")]
 
 
@@ -273,7 +290,7 @@ HEADINGS = [
 
 
 def point_table(rows: list[Row], result: dict[str, Any]) -> str:
-    """All points; those of the front are bold."""
+    """Formats the table of all points. Those on the front are bold."""
     front = {row["name"] for row in front_of(rows)}
 
     def named(row):
@@ -288,7 +305,9 @@ def point_table(rows: list[Row], result: dict[str, Any]) -> str:
 
 
 def preset_table(rows: list[Row], result: dict[str, Any]) -> str:
-    """The presets, whether they are on the front, and what they give up."""
+    """Formats the table of presets, with the PSNR that they lose against the best one, and whether
+    they are on the front.
+    """
     presets = [row for row in rows if row["knob"] == "preset"]
     if not presets:
         return "no preset has been measured"
@@ -297,24 +316,12 @@ def preset_table(rows: list[Row], result: dict[str, Any]) -> str:
     def lost(row):
         return [f"{best[task]['psnr'] - row[task]['psnr']:.2f}" for task in TASKS]
 
-    table = [
-        [
-            row["name"],
-            *numbers(row),
-            *scores(row),
-            *lost(row),
-            "yes" if row["name"] in front else "no",
-        ]
-        for row in presets
-    ]
-    header = [
-        "preset",
-        *MEASURES,
-        *HEADINGS,
-        "below best: same pose",
-        "novel poses",
-        "on the front",
-    ]
+    table = []
+    for row in presets:
+        on_front = "yes" if row["name"] in front else "no"
+        table.append([row["name"], *numbers(row), *scores(row), *lost(row), on_front])
+    header = ["preset", *MEASURES, *HEADINGS]
+    header += ["below best: same pose", "novel poses", "on the front"]
     return f"{about(result)}\n\n{markdown_table(header, table)}"
 
 
@@ -323,7 +330,7 @@ def preset_table(rows: list[Row], result: dict[str, Any]) -> str:
 
 
 def draw(rows: list[Row], key: str, path: Path) -> None:
-    """PSNR of both tasks against a time, with the front."""
+    """Draws the PSNR of both tasks against a time, with the front."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
     points = compared(rows)
@@ -332,20 +339,18 @@ def draw(rows: list[Row], key: str, path: Path) -> None:
             for name, color in KINDS.items():
                 chosen = [row for row in points if kind(row) == name]
                 x, y = [row[key] for row in chosen], [row[task]["psnr"] for row in chosen]
-                axis.scatter(
-                    x, y, s=18, color=color, marker="x" if name == "no network" else "o", label=name
-                )
+                marker = "x" if name == "no network" else "o"
+                axis.scatter(x, y, s=18, color=color, marker=marker, label=name)
             steps = staircase(
                 [(row[key], row[task]["psnr"]) for row in points if row["start"] == "network"]
             )
             axis.step(*zip(*steps, strict=True), where="post", color="k", lw=0.8, label="front")
+
+            # names of the presets below the front, where there is room
             named = [row for row in points if row["knob"] == "preset" or row["name"] == "default"]
             for i, row in enumerate(sorted(named, key=lambda row: row[key])):
-                at, line = (
-                    (row[key], row[task]["psnr"]),
-                    {"arrowstyle": "-", "lw": 0.6, "color": "0.4"},
-                )
-                place = (14, -26 - 26 * (i % 3))  # below the front, where there is room
+                at, place = (row[key], row[task]["psnr"]), (14, -26 - 26 * (i % 3))
+                line = {"arrowstyle": "-", "lw": 0.6, "color": "0.4"}
                 axis.annotate(
                     row["name"], at, place, fontsize=8, textcoords="offset points", arrowprops=line
                 )

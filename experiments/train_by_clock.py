@@ -1,4 +1,4 @@
-"""Train the shipped network further on an accelerator that is at hand for minutes: the learning
+"""Trains the shipped network further on an accelerator that is available for minutes. The learning
 rate falls with the clock.
 """
 
@@ -34,50 +34,60 @@ from humangs_jax.training.state import init_state
 from humangs_jax.training.step import seed_numbers, update
 
 FOR_EVER = 100_000_000
-"""Steps of a run whose learning rate does not fall by itself."""
+"""Number of steps of a configuration whose learning rate stays the same."""
 WARM_UP, EMA, LOGGED, SAVED, RESERVE = 40, 0.998, 20, 90.0, 6.0
-"""Steps until the full learning rate; decay of the average; steps between lines of the log; seconds
-between weights on disk; seconds that the last ones may take."""
+"""Steps until the full learning rate, decay of the averaged weights, steps between lines of the
+log, seconds between weights on disk, and seconds that the last weights may take.
+"""
 PAIRS = 7 << 14
-"""(splat, tile) pairs of a target that fit: twice the 45,000 to 50,000 that targets of the shipped
-network need at 256 pixels. What does not fit is counted in the log."""
+"""Number of (splat, tile) pairs of a target that fit, twice the 45,000 to 50,000 that targets of
+the shipped network need at 256 pixels. Pairs that do not fit are counted in the log.
+"""
 FIRST, SEED = 1000, 0
-"""Of the training seeds; of order and views."""
+"""Index of the first person within the training seeds, and seed of order and views."""
 LPIPS, DISPLACED, START_SHARE = 0.1, 0.5, 0.5
-"""Weight of LPIPS (AlexNet) in the loss; share of the examples whose body is displaced to the
-silhouettes of the clothes; share of the first weights in OUT/mean.safetensors, the rest are the
-trained ones (`train_shipped.py`)."""
+"""Weight of LPIPS (AlexNet) in the loss, share of the examples whose body is displaced to the
+silhouettes of the clothes, and share of the first weights in OUT/mean.safetensors, whose other
+share are the trained weights (`train_shipped.py`).
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Clock:
-    """Of a run.
+    """Settings of a run.
 
     Options:
-    init_weights: where to start; default: the shipped ones
-    minutes: in all, with the people and the compilation
-    people: of the training seeds, rendered anew for every step
-    batch: people a step
-    learning_rate: the peak
+    init_weights: weights to start from; default: the shipped ones
+    minutes: time of the run, with the people and the compilation
+    people: people of the training seeds, rendered anew for every step
+    batch: people of a step
+    learning_rate: peak of the learning rate
     """
 
     init_weights: Path | None = None
+    """Weights to start from, None: the shipped ones."""
     minutes: float = 8.0
+    """Minutes of the run, with the people and the compilation."""
     people: int = 450
+    """Number of people of the training seeds."""
     batch: int = 8
+    """People of a step."""
     learning_rate: float = 3e-4
+    """Peak of the learning rate."""
 
 
 @entry
 def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
-    """Train the shipped network further, for minutes, on people rendered on the fly; writes
-    OUT/weights.safetensors, averaged.
+    """Trains the shipped network further for minutes on people rendered on the fly, and writes the
+    averaged weights to OUT/weights.safetensors.
 
     The step compiles while other processes make the people. One program serves all numbers of
     photos.
+
     Raises: ValueError if no time is left to train.
     """
-    began, body, (variables, model) = monotonic(), load_body(), load_weights(how.init_weights)
+    began = monotonic()
+    body, (variables, model) = load_body(), load_weights(how.init_weights)
 
     def clock():
         return monotonic() - began
@@ -113,21 +123,19 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
             left = 0.5 * (1 + math.cos(math.pi * (now - start) / (end - start)))
             rate = min(1.0, (done + 1) / WARM_UP) * left
             batch = examples(bank, done)
-            jax.block_until_ready(metrics)  # of the step before: the clock runs with the device
+            # the clock must not run ahead of the device, so the step before has to be done
+            jax.block_until_ready(metrics)
             state, average, metrics = step(state, average, batch, *given, rate)
             done += 1
             if done % LOGGED == 0:
                 numbers = {name: float(value) for name, value in jax.device_get(metrics).items()}
-                log.write(
-                    json.dumps({"step": done, "seconds": clock(), "rate": rate} | numbers) + "\n"
-                )
+                line = {"step": done, "seconds": clock(), "rate": rate} | numbers
+                log.write(json.dumps(line) + "\n")
                 if numbers["overflow"]:
                     print(f"step {done}: {numbers['overflow']:.0f} pairs had no room", flush=True)
             if now - saved > SAVED:
-                saved = now
-                save_weights(
-                    out / "weights.safetensors", state_variables(average, state), model, "float16"
-                )
+                saved, made = now, state_variables(average, state)
+                save_weights(out / "weights.safetensors", made, model, "float16")
     if not done:
         raise ValueError(
             f"--minutes {how.minutes:g}: people and compilation took {start:.0f} s, nothing is left"
@@ -152,14 +160,15 @@ def train_by_clock(run: Run, out: Path, how: Clock = Clock()) -> None:
 
 
 def configured(how: Clock) -> TrainConfig:
-    """The preset `small`, with a learning rate that the clock lowers."""
+    """Returns the preset `small` with a constant learning rate, which the clock lowers."""
     config = presets.small()
+    optimizer = dataclasses.replace(
+        config.optimizer, learning_rate=how.learning_rate, warmup_steps=0
+    )
     return dataclasses.replace(
         config,
         loss=dataclasses.replace(config.loss, lpips=LPIPS),
-        optimizer=dataclasses.replace(
-            config.optimizer, learning_rate=how.learning_rate, warmup_steps=0
-        ),
+        optimizer=optimizer,
         splat=dataclasses.replace(config.splat, max_pairs=PAIRS),
         # one program for all blocks: half of the products that an accelerator tries out
         model=config.model.with_runtime(scan=not one_after_the_other()),
@@ -171,7 +180,7 @@ def configured(how: Clock) -> TrainConfig:
 
 
 def examples_of(config: TrainConfig, how: Clock) -> Callable[..., Any]:
-    """(bank, step) -> the batch of a step."""
+    """Returns the function (bank, step) -> batch of the step."""
     views = config.views
     drawn = OnTheFlyConfig(
         input_views=max(views.input_counts),
@@ -196,22 +205,22 @@ def examples_of(config: TrainConfig, how: Clock) -> Callable[..., Any]:
 
 
 def stepper(config: TrainConfig) -> Any:
-    """A step of `training.step.update` at a share of the learning rate, to which an update is
-    proportional.
+    """Returns a compiled step of `training.step.update` at a share of the learning rate.
+
+    An update is proportional to the learning rate, so the share scales the change of the weights.
+    The step returns the new state, the averaged weights and the metrics.
     """
 
     def step(state, average, batch, body, networks, seed, rate):
         new, metrics = update(state, batch, body, networks, seed, config)
         params = jax.tree.map(lambda a, b: a + rate * (b - a), state.params, new.params)
         decay = jnp.minimum(EMA, (1 + state.step) / (10 + state.step))
-        return (
-            replace(new, params=params),
-            optax.incremental_update(params, average, 1 - decay),
-            metrics,
-        )
+        average = optax.incremental_update(params, average, 1 - decay)
+        return replace(new, params=params), average, metrics
 
     return jax.jit(step, donate_argnums=(0, 1), compiler_options=compiler_options())
 
 
 def state_variables(average: Any, state: Any) -> Any:
+    """Returns the variables of a network with averaged weights."""
     return {"params": average, "batch_stats": state.batch_stats}

@@ -1,11 +1,11 @@
 """Trains the learned update of refinement (`humangs_jax/refinement/learned.py`) on avatars of the
 shipped network.
 
-Makes the samples first: people of training seeds that the shipped network has not seen, its avatar
-of each from four photos, and ten views, four of them those photos. A step draws samples and a
-number of photos for each, runs the iterations, and compares the result of each iteration with views
-that are not among the photos. Gradients pass through the iterations, but not through the errors
-that an iteration sees. Validation is on other people.
+The samples are made first. They have people of training seeds that the shipped network has not
+seen, the network's avatar of each from four photos, and ten views, which include these photos. A
+step draws samples and a number of photos for each, runs the iterations, and compares the result of
+each iteration with views that are not among the photos. Gradients pass through the iterations, but
+not through the errors that an iteration sees. Validation is on other people.
 """
 
 import dataclasses
@@ -65,28 +65,31 @@ from humangs_jax.synthetic.on_the_fly import OnTheFlyConfig, on_the_fly_example
 from humangs_jax.synthetic.subject import seeds_of
 
 FIRST_SEED = 6000
-"""Of the training range, after those of the shipped network."""
+"""First seed of the training range after those of the shipped network."""
 PHOTOS, TARGETS = 4, 6
+"""Number of photos of a sample, and of its other views."""
 COUNTS = (1, 2, 4, 4, 4, 4, 6)
-"""Numbers of photos that a step draws from; with 6, the first two targets are photos, too."""
+"""Numbers of photos that a step draws from. With 6, the first two other views are photos, too."""
 ITERATION_WEIGHT = 0.9
-"""An iteration counts this much less than the next."""
+"""Weight of an iteration in the loss, relative to that of the next one."""
 WEIGHTS = {"squared": 10.0, "absolute": 1.0, "structural": 0.2, "silhouette": 0.2}
+"""{term of the loss: its weight}."""
 VALIDATED, VALIDATE_EVERY, SAVE_EVERY = 8, 250, 50
+"""Number of validation people, steps between validations, and steps between states on disk."""
 MARGIN = 2.0
-"""Room in the renderer's buffers beyond the need of the starts."""
+"""Size of the renderer's buffers as a multiple of what the first Gaussians need."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Refining:
     """Options:
-    people: of the samples
-    samples: to train on
+    people: number of people of the samples
+    samples: number of samples to train on
     size: side of the views in pixels
     off: millimetres that the bodies of half of the samples are off, see `refinement`; they are
     displaced to the masks
     start: weights to start from, of all layers or some; default: a network that changes nothing;
-    "shipped": the package's own
+    "shipped": those of the package
     lpips: weight of LPIPS (AlexNet) in the loss; needs the extra `lpips`
     batch: samples in a step, a thread each
     """
@@ -105,10 +108,10 @@ class Refining:
 
 @entry
 def train_refiner(run: Run, out: Path, options: Refining = Refining()) -> None:
-    """Trains the learned update of refinement; the same command continues the run, Ctrl-C saves.
+    """Trains the learned update of refinement. Ctrl-C saves, and the same command continues.
 
-    On two cores of a CPU: 1.7 s a sample, people included, then 2.4 s for a step of two samples and
-    three iterations.
+    On two cores of a CPU a sample takes 1.7 s, with the people, and a step of two samples and three
+    iterations takes 2.4 s.
 
     Options:
     out: folder of the samples, the state and the weights (refiner.safetensors)
@@ -116,13 +119,12 @@ def train_refiner(run: Run, out: Path, options: Refining = Refining()) -> None:
     counts = ("samples", "people", "steps", "iterations", "batch")
     if min(getattr(options, name) for name in counts) < 1:
         raise ValueError(f"expected at least 1 of {', '.join(f'--{name}' for name in counts)}")
-    path, settings = (
-        out / "settings.json",
-        json.loads(json.dumps(dataclasses.asdict(options), default=str)),
-    )
+    path = out / "settings.json"
+    settings = json.loads(json.dumps(dataclasses.asdict(options), default=str))
     if not path.is_file():
         write_json(path, settings)
-    elif (known := read_json(path)) != settings:
+    known = read_json(path)
+    if known != settings:
         raise ValueError(f"{path}: this run has other settings, {known}: give another folder")
     folders = make_samples(out / "samples", FIRST_SEED, options.people, options.samples, options)
     validation = make_samples(
@@ -136,20 +138,20 @@ def train_refiner(run: Run, out: Path, options: Refining = Refining()) -> None:
 
 
 def make_samples(out: Path, first: int, people: int, count: int, options: Refining) -> list[Path]:
-    """Folders with avatar.npz and views.npz, of the training seeds from `first` on; those that are
-    there are kept.
+    """Makes samples of the training seeds from `first` on, and returns their folders with
+    avatar.npz and views.npz. Samples that exist are kept.
     """
     folders = [out / f"{i:05d}" for i in range(count)]
     missing = [folder for folder in folders if not (folder / "views.npz").is_file()]
     if not missing:
         return folders
+
+    # the people of all samples, which are rendered on the fly
     body, weights, path = load_body(), load_weights(), out / "people.npz"
     if not path.is_file():
         out.mkdir(parents=True, exist_ok=True)
-        seeds = seeds_of("train", first, people)
-        save_bank(
-            path, build_bank(seeds, body, "train", processes=os.cpu_count() or 1, progress=True)
-        )
+        seeds, processes = seeds_of("train", first, people), os.cpu_count() or 1
+        save_bank(path, build_bank(seeds, body, "train", processes=processes, progress=True))
     bank, make = load_bank(path), jax.jit(on_the_fly_example, static_argnames="config")
     config = OnTheFlyConfig(
         input_views=PHOTOS, target_views=TARGETS, input_size=options.size, target_size=options.size
@@ -158,6 +160,7 @@ def make_samples(out: Path, first: int, people: int, count: int, options: Refini
         example = jax.device_get(make(bank, jax.random.key(int(folder.name)), config))
         photos, targets = jax.tree.map(jnp.asarray, (example.inputs, example.targets))
         both = jax.tree.map(lambda *x: jnp.concatenate(x), photos, targets)
+        # the bodies of every second sample are off
         poses, betas = BodyPose(both.rotations, both.translations), photos.betas
         if int(folder.name) % 2 and options.off:
             poses, betas = body_off(poses, betas, options.off, int(folder.name))
@@ -185,15 +188,20 @@ def make_samples(out: Path, first: int, people: int, count: int, options: Refini
 
 @dataclasses.dataclass(frozen=True)
 class Sample:
-    """A start and the views of its person, the photos first, as a `Photo` each."""
+    """An avatar to refine, and the views of its person."""
 
     avatar: Any
+    """The avatar of the network."""
     start: Any
+    """Parameters of its Gaussians."""
     views: list[Any]
+    """All views as `Photo`, the photos first."""
     graph: Any
+    """Neighbours of the Gaussians."""
 
 
 def read_sample(folder: Path) -> Sample:
+    """Reads a sample from its folder."""
     avatar, arrays = Avatar.load(folder / "avatar.npz"), read_npz(folder / "views.npz")[0]
     images, masks = (jnp.asarray(arrays[name], jnp.float32) / 255 for name in ("images", "masks"))
     cameras = Camera(
@@ -214,7 +222,7 @@ def read_sample(folder: Path) -> Sample:
 
 @functools.cache
 def compiled(function: Any) -> Any:
-    """Jitted; a configuration of splatting is static."""
+    """Returns a function compiled by JAX. Its argument `splat`, if it has one, is static."""
     static = [name for name in ("splat",) if name in inspect.signature(function).parameters]
     return jax.jit(function, static_argnames=static, compiler_options=compiler_options())
 
@@ -222,7 +230,9 @@ def compiled(function: Any) -> Any:
 def run_iterations(
     variables: Any, sample: Sample, photos: int, iterations: int, splat: Any
 ) -> tuple[list[Any], list[Any]]:
-    """Parameters side by side after each iteration, and the signals that each iteration saw."""
+    """Returns the stacked parameters after each iteration, and the signals that each iteration
+    saw.
+    """
     start = values = stacked(sample.start)
     hidden, after, seen = jnp.zeros((len(start), Refiner.width)), [], []
     for _ in range(iterations):
@@ -242,8 +252,8 @@ def run_iterations(
 def through_iterations(
     variables: Any, start: Any, seen: list[Any], graph: Any, avatar: Any, cotangents: Any
 ) -> Any:
-    """Gradient with respect to the variables, from those with respect to the parameters after each
-    iteration.
+    """Returns the gradient with respect to the variables, from those with respect to the parameters
+    after each iteration.
     """
 
     def iterations(variables):
@@ -261,9 +271,10 @@ def through_iterations(
 def view_loss(
     values: Any, like: Any, avatar: Any, view: Any, perceptual: Any, splat: Any
 ) -> tuple[Any, Any]:
-    """Loss of one view, relative to the person's share of the image; (mean squared error, LPIPS).
+    """Returns the loss of one view, relative to the person's share of the image, and (mean squared
+    error, LPIPS).
 
-    perceptual: weight and network of LPIPS; None: without, and 0.
+    `perceptual` is (weight, network) of LPIPS. None: LPIPS is left out, and is 0.
     """
     drawn = render(posed_gaussians(unstacked(values, like), avatar, view), view.camera, splat)
     terms = {
@@ -283,7 +294,9 @@ def view_loss(
 
 @functools.cache
 def view_gradient() -> Any:
-    """((loss, squared error), gradient with respect to the parameters) of `view_loss`, jitted."""
+    """Returns the compiled function from the arguments of `view_loss` to its result and its
+    gradient with respect to the parameters.
+    """
     differentiated = jax.value_and_grad(view_loss, has_aux=True)
     return jax.jit(differentiated, static_argnames="splat", compiler_options=compiler_options())
 
@@ -291,8 +304,8 @@ def view_gradient() -> Any:
 def validate(
     variables: Any, folders: list[Path], iterations: int, perceptual: Any, splat: Any
 ) -> list[list[float]]:
-    """[PSNR, LPIPS] of views that are not among the photos, mean over samples, before and after
-    each iteration.
+    """Returns [PSNR, LPIPS] of views that are not among the photos, before the iterations and after
+    each of them, as means over samples.
     """
     rows = []
     for folder in folders:
@@ -304,9 +317,10 @@ def validate(
                 view_gradient()(values, sample.start, sample.avatar, view, perceptual, splat=splat)
                 for view in sample.views[PHOTOS:]
             ]
+            # the result of the loss has the errors as its second part
+            errors = [result[1] for result, _ in found]
             return [
-                (-10 * np.log10(float(squared)), float(distance))
-                for ((_, (squared, distance)), _) in found
+                (-10 * np.log10(float(squared)), float(distance)) for squared, distance in errors
             ]
 
         rows.append([np.mean(scored(values), axis=0) for values in (stacked(sample.start), *after)])
@@ -321,8 +335,9 @@ def step_gradient(
     splat: Any,
     seed: tuple[int, int],
 ) -> Any:
-    """Gradient of one sample, which the seed chooses: a new view for each iteration, two for the
-    last one.
+    """Returns the gradient of one sample, which the seed chooses.
+
+    Each iteration is compared with another view, and the last one with two.
     """
     rng = np.random.default_rng(seed)
     sample = read_sample(folders[rng.integers(len(folders))])
@@ -345,28 +360,10 @@ def step_gradient(
 
 
 def train(folders: list[Path], validation: list[Path], out: Path, options: Refining) -> None:
-    """From the first step, or from OUT/state.msgpack, to OUT/refiner.safetensors."""
+    """Trains from the first step or from OUT/state.msgpack, and writes OUT/refiner.safetensors."""
     sample = read_sample(folders[0])
-    splat, values = planned([read_sample(folder) for folder in validation]), stacked(sample.start)
-    nothing = Signals(
-        jnp.zeros((1, *values.shape)), jnp.zeros((1, len(values))), jnp.zeros((1, len(values)))
-    )
-    hidden = jnp.zeros((len(values), Refiner.width))
-    variables = Refiner().init(
-        jax.random.key(0), values, values, hidden, nothing, sample.graph, jnp.zeros(3)
-    )
-    # weights to start from may have fewer layers than a `Refiner` has now
-    if options.start:
-        given = (load_refiner() if options.start == "shipped" else read_refiner(options.start))[
-            "params"
-        ]
-        new = variables["params"]
-        if any(
-            layer not in new or jax.tree.map(jnp.shape, new[layer]) != jax.tree.map(jnp.shape, own)
-            for layer, own in given.items()
-        ):
-            raise ValueError(f"{options.start}: expected weights of a `Refiner`")
-        variables = {"params": new | given}
+    splat = planned([read_sample(folder) for folder in validation])
+    variables = first_variables(sample, options.start)
     perceptual = (options.lpips, load_lpips("alex")) if options.lpips else None
     rate = optax.warmup_cosine_decay_schedule(
         0.0,
@@ -426,8 +423,31 @@ def train(folders: list[Path], validation: list[Path], out: Path, options: Refin
         save_refiner(out / "refiner.safetensors", state["variables"])
 
 
+def first_variables(sample: Sample, start: str | None) -> Any:
+    """Returns the variables that training starts from, see `Refining.start`.
+
+    Raises: ValueError if the weights to start from are of another network.
+    """
+    values = stacked(sample.start)
+    none, hidden = jnp.zeros((1, len(values))), jnp.zeros((len(values), Refiner.width))
+    nothing = Signals(jnp.zeros((1, *values.shape)), none, none)
+    variables = Refiner().init(
+        jax.random.key(0), values, values, hidden, nothing, sample.graph, jnp.zeros(3)
+    )
+    if not start:
+        return variables
+
+    # weights to start from may have fewer layers than a `Refiner` has now
+    given = (load_refiner() if start == "shipped" else read_refiner(start))["params"]
+    new = variables["params"]
+    for layer, own in given.items():
+        if layer not in new or jax.tree.map(jnp.shape, new[layer]) != jax.tree.map(jnp.shape, own):
+            raise ValueError(f"{start}: expected weights of a `Refiner`")
+    return {"params": new | given}
+
+
 def planned(samples: list[Sample]) -> Any:
-    """Buffers that have room for every view of these samples."""
+    """Returns the configuration of splatting with room for every view of these samples."""
     like = SPLAT_PRESETS[samples[0].avatar.rendering]
     plans = [
         plan_buffers(posed_gaussians(sample.start, sample.avatar, view), view.camera, like, MARGIN)

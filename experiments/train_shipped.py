@@ -1,19 +1,18 @@
-"""Train the network that comes with the package on synthetic people, from nothing to weights, in as
-many calls as it takes.
+"""Trains the network that comes with the package on synthetic people, in one call or several.
 
-    python experiments/train_shipped.py --out runs/shipped --hours 2 python
-    experiments/train_shipped.py --out runs/more --init-weights shipped --people 480 --start-share
-    0.5
+    python experiments/train_shipped.py --out runs/shipped --hours 2
+    python experiments/train_shipped.py --out runs/more --init-weights shipped --people 480
+        --start-share 0.5
 
 The run is the preset `small` of training/config.py. Every setting is an option: `--steps 4000
---optimizer.learning-rate 2e-4`. Makes the people first: `--people` of the training seeds, rendered
-anew for every step, and 8 of the validation seeds. The same command continues the run in `--out`;
-Ctrl-C, SIGTERM and the end of `--hours` save. `--loss.lpips 0.1` adds LPIPS (AlexNet), with the
-extra `lpips`. The mean of the first and the trained weights is often better than both (Wortsman et
-al. 2022, https://arxiv.org/abs/2109.01903): `--start-share` writes it.
+--optimizer.learning-rate 2e-4`. The people are made first: `--people` of the training seeds, which
+are rendered anew for every step, and 8 of the validation seeds. Ctrl-C, SIGTERM and the end of
+`--hours` save the run in `--out`, and the same command continues it. `--loss.lpips 0.1` adds LPIPS
+(AlexNet), with the extra `lpips`. The mean of the first and the trained weights is often better
+than both (Wortsman et al. 2022, https://arxiv.org/abs/2109.01903). `--start-share` writes it.
 
-On 2 CPU cores: 2.6 s a person, then 1.2 s a step on an otherwise quiet machine. How the shipped
-weights came about is in humangs_jax/assets/weights.md.
+On 2 CPU cores a person takes 2.6 s, and a step takes 1.2 s on an otherwise idle machine.
+humangs_jax/assets/weights.md describes how the shipped weights were trained.
 """
 
 import logging
@@ -45,6 +44,7 @@ from humangs_jax.training.loop import TrainingInterrupted, train
 from humangs_jax.training.sources import training_people
 
 VALIDATION_SUBJECTS = 8
+"""Number of validation people."""
 
 
 def main(
@@ -53,40 +53,44 @@ def main(
     bank: Path | None = None,
     validation: Path | None = None,
     hours: float | None = None,
-    init_weights: (
-        Literal["shipped"] | Path | None
-    ) = None,  # the word first: tyro takes the first type that fits
+    # tyro takes the first type that fits, so the word comes before the path
+    init_weights: Literal["shipped"] | Path | None = None,
     start_share: float = 0.0,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = small(),  # noqa: B008
 ) -> None:
-    """Train on people rendered on the fly.
+    """Trains on people rendered on the fly.
 
     Args:
-        out: checkpoints, log, images and weights of the run.
-        people: how many people of the training seeds; kept in out/people.npz.
-        bank: people.npz of another run instead.
-        validation: folder of captures of other people, for validation; made in out/validation by
-            default.
-        hours: save and end after so long; the same command goes on. Default: until the last step.
-        init_weights: start from these weights instead of fresh ones, of a network with the tensors
-            of that of `config`; "shipped": the package's own.
-        start_share: when the last step is done, also write out/mean.safetensors: this share of the
-            first weights and the rest of the trained ones.
+        out: folder of checkpoints, log, images and weights of the run.
+        people: number of people of the training seeds, which are kept in out/people.npz.
+        bank: people.npz of another run, instead of new people.
+        validation: folder of captures of other people for validation; default: made in
+            out/validation.
+        hours: save and end after this time; the same command continues. Default: until the last
+            step.
+        init_weights: start from these weights instead of fresh ones; their network must have the
+            same tensors as that of `config`. "shipped": those of the package.
+        start_share: also write out/mean.safetensors after the last step, with this share of the
+            first weights and the other share of the trained ones.
         config: the run.
 
     Raises: ValueError for a share that is not in [0, 1), or without `init_weights`, and for weights
-    of another network.
+        of another network.
     """
     if not 0 <= start_share < 1 or (start_share and init_weights is None):
         raise ValueError(
             f"start_share {start_share}: expected a number in [0, 1), and init_weights if it is"
             " not 0"
         )
+
+    # the end of the hours stops the run in the same way as SIGTERM
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     if hours is not None:
         timer = threading.Timer(3600 * hours, os.kill, (os.getpid(), signal.SIGTERM))
         timer.daemon = True
         timer.start()
+
+    # weights to start from, and the people
     body, variables = load_body(), None
     if init_weights is not None:
         variables, _ = load_weights(None if init_weights == "shipped" else init_weights)
@@ -95,11 +99,11 @@ def main(
     if validation is None:
         validation = out / "validation"
         write_set(validation, VALIDATION_SUBJECTS, Layout(256, poses=2, views=12), "validation")
-    training = (
-        training_people(None, people, out, body)
-        if bank is None
-        else on_the_fly_people(load_bank(bank))
-    )
+    if bank is None:
+        training = training_people(None, people, out, body)
+    else:
+        training = on_the_fly_people(load_bank(bank))
+
     try:
         networks = load_loss_networks(lpips_net="alex", installed=True)
         state = train(

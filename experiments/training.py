@@ -1,5 +1,5 @@
-"""One step of training: settings, arguments, program, time, arithmetic and memory; and the curve of
-a run.
+"""Measures time, arithmetic and memory of one step of training, counts what a step costs on many
+chips, and draws the curve of a run.
 """
 
 import dataclasses
@@ -43,8 +43,16 @@ from humangs_jax.training.step import seed_numbers, update
 
 
 def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -> Any:
-    """The `TrainConfig` of a preset for photos and targets of `size` pixels, numbers of views as
-    given.
+    """Returns the `TrainConfig` of a preset.
+
+    Args:
+        preset: a key of `PRESETS`
+        size: side of photos and targets in pixels
+        views: number of photos of an example
+        targets: number of targets of an example
+        batch: subjects of a step
+
+    Raises: ValueError for an unknown preset.
     """
     if preset not in PRESETS:
         raise ValueError(f"unknown preset {preset}: expected one of {', '.join(PRESETS)}")
@@ -60,10 +68,13 @@ def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -
 
 
 def with_model(config: Any, **runtime: Any) -> Any:
+    """Returns a configuration with other fields of its network's runtime."""
     return dataclasses.replace(config, model=config.model.with_runtime(**runtime))
 
 
 def random_weights(key: Any, slices: Any) -> Any:
+    """Returns {layer: random weights} of the convolutions of a loss network."""
+
     def draw(layer, key):
         shape = (layer.size, layer.size, layer.inputs, layer.outputs)
         scale = (2 / (layer.size**2 * layer.inputs)) ** 0.5
@@ -77,8 +88,9 @@ def random_weights(key: Any, slices: Any) -> Any:
 
 
 def random_networks(config: Any) -> Any:
-    """`LossNetworks` with made-up weights for the losses that need some: they cost what the real
-    ones cost.
+    """Returns `LossNetworks` with random weights for the losses that need networks.
+
+    They cost as much as the real ones.
     """
     key = jax.random.key(0)
     perceptual = Vgg19(random_weights(key, VGG19)) if config.loss.perceptual else None
@@ -91,13 +103,12 @@ def random_networks(config: Any) -> Any:
 
 
 def written_subject(folder: Path, config: Any, body: Any) -> Path:
-    """Writes the capture of a synthetic person with as many views as an example takes; its folder
-    in `folder`.
+    """Writes the capture of a synthetic person with as many views as an example takes, and returns
+    its folder inside of `folder`.
     """
     views = config.views.input_counts[0] + config.views.target_count
-    write_person(
-        folder / "person", 0, body, Layout(config.model.conventions.image_size, views=views)
-    )
+    layout = Layout(config.model.conventions.image_size, views=views)
+    write_person(folder / "person", 0, body, layout)
     return folder / "person"
 
 
@@ -107,57 +118,52 @@ CASES = {
     "published 512": ("published", 512, 4, 4),
     "tiny 32": ("tiny", 32, 2, 2),
 }
-"""Preset, size of photos and targets, input views, targets. The last one is for tests."""
+"""{case: (preset, side of photos and targets, input views, targets)}. The last one is for tests."""
 
 
 @entry
 def training_steps(run: Run, only: tuple[str, ...] = ("small 256",), repeats: int = 3) -> None:
-    """Time, arithmetic and memory of one step of training, in turns with plain matrix products,
-    which give the floor.
+    """Measures time, arithmetic and memory of one step of training, in turns with plain matrix
+    products, which give the floor.
 
-    A synthetic person is made and read by the loader; all weights are random, also those of loss
-    networks. Operations are counted from the traced step, loops included. The floor is the time
-    that these operations take as plain products in the same turns. `small` takes two minutes on 2
-    cores, `published` half an hour.
+    A synthetic person is made and read by the loader. All weights are random, also those of loss
+    networks. Operations are counted in the traced step, with its loops. The floor is the time that
+    these operations take as plain products in the same turns. `small` takes two minutes on 2 cores,
+    `published` half an hour.
 
     Options:
-    only: of "small 256", "published 256", "published 512", "tiny 32"
+    only: cases among "small 256", "published 256", "published 512", "tiny 32"
     repeats: timed iterations
     """
-    if unknown := set(only) - set(CASES):
+    unknown = set(only) - set(CASES)
+    if unknown:
         raise ValueError(f"--only: {unknown.pop()} is none of {', '.join(CASES)}")
     cases = {
         f"{n}, {CASES[n][2]} + {CASES[n][3]} views": functools.partial(step_numbers, n, repeats)
         for n in only
     }
+
+    # a line for each case
     rows, table = run.rows(cases, {"repeats": repeats}), []
     for name, row in rows.items():
         cells = [
             row["tokens"],
             f"{row['gaussians']:,}",
             f"{row['ms'] / 1e3:.1f}, {row['cpu_ms'] / 1e3:.2f}",
-        ]
-        cells += [
             f"{row['flops'] / 1e12:.2f}",
             f"{row['share_of_floor_cpu']:.2f}",
             f"{row['temporary_mb']:.0f}",
+            f"{row['peak_rss_mb']:.0f}",
+            f"{row['compile_cpu_s']:.0f}",
         ]
-        table.append([name, *cells, f"{row['peak_rss_mb']:.0f}", f"{row['compile_cpu_s']:.0f}"])
-    header = [
-        "one subject a step",
-        "tokens",
-        "Gaussians",
-        "wall, CPU s",
-        "TFLOP",
-        "share of floor (CPU)",
-    ]
-    run.show(
-        markdown_table([*header, "MiB temporaries", "peak MiB", "compile, CPU s"], table), rows
-    )
+        table.append([name, *cells])
+    header = ["one subject a step", "tokens", "Gaussians", "wall, CPU s", "TFLOP"]
+    header += ["share of floor (CPU)", "MiB temporaries", "peak MiB", "compile, CPU s"]
+    run.show(markdown_table(header, table), rows)
 
 
 def step_numbers(name: str, repeats: int) -> dict[str, Any]:
-    """Time, arithmetic and memory of a training step of a case."""
+    """Returns time, arithmetic and memory of a training step of a case."""
     jax.config.update("jax_enable_compilation_cache", False)
     config, body = settings(*CASES[name]), load_body()
     config = with_model(config, dtype="float32" if jax.default_backend() == "cpu" else "bfloat16")
@@ -171,12 +177,10 @@ def step_numbers(name: str, repeats: int) -> dict[str, Any]:
     # room for the person's foreground tokens, as a run would have
     if config.model.tokens == "foreground":
         first = jax.tree.map(lambda x: x[0], batch)
-        inputs = jax.jit(prepare_inputs, static_argnames="config")(
-            carrier, first.inputs, config.model
-        )
-        config = with_model(
-            config, token_capacity=foreground(inputs, config.model)[0].runtime.token_capacity
-        )
+        prepare = jax.jit(prepare_inputs, static_argnames="config")
+        inputs = prepare(carrier, first.inputs, config.model)
+        model, _, _ = foreground(inputs, config.model)
+        config = with_model(config, token_capacity=model.runtime.token_capacity)
     # the step is compiled apart from its runs
     state = init_state(config, random_variables(config.model))
     given = batch, carrier, networks, seed_numbers(config.seed)
@@ -227,17 +231,20 @@ VARIANTS = {
     "foreground": {"tokens": "foreground"},
     "foreground, recomputed": {"tokens": "foreground", "scan": True, "remat": "full"},
 }
-"""What the backward pass finds of the blocks, and which patches become tokens."""
+"""{variant: fields of the runtime}, which say whether blocks are computed again in the backward
+pass, and which patches become tokens.
+"""
 FOREGROUND_SHARE = 0.22
-"""Room for foreground tokens: a person by the published protocol touches a fifth
-(docs/performance.md).
+"""Share of the tokens that the foreground has room for. A person of the published protocol touches
+a fifth (docs/performance.md).
 """
 XLA_TOKENS = 8192
+"""Number of tokens from which on attention is computed in chunks."""
 PEAKS = {
     "TPU v5e: 197 TFLOP/s, 200 GB/s to other chips": (197, 200),
     "H100: 989 TFLOP/s, 50 GB/s beyond 8": (989, 50),
 }
-"""TFLOP/s and GB/s of data sheets."""
+"""{chip: (TFLOP/s, GB/s)} of data sheets."""
 
 
 @entry
@@ -248,22 +255,23 @@ def training_cost(
     sizes: tuple[int, ...] = (256, 512),
     variants: tuple[str, ...] = ("kept", "recomputed", "foreground"),
 ) -> None:
-    """What a step of training costs on a mesh of many chips, one subject each, counted from the
+    """Counts what a step of training costs on a mesh of many chips with one subject each, from the
     traced program.
 
-    Counts what one chip does in one step, without the chips and without running anything:
-    operations and what it sends, from the step as it is written (XLA removes next to nothing of
-    either). A minute each. Loss networks have made-up weights. The last columns are these counts
-    over numbers of data sheets.
+    Counted are the operations of one chip in one step, and the bytes that it sends, without the
+    chips and without running anything. The step is counted as it is written; XLA removes next to
+    nothing of it. Takes a minute for each case. Loss networks have random weights. The last columns
+    divide these counts by the numbers of data sheets.
 
     Options:
-    sizes: of photos and targets, pixels
-    variants: of "kept", "recomputed", "foreground", "foreground, recomputed"
+    sizes: sides of photos and targets, pixels
+    variants: variants among "kept", "recomputed", "foreground", "foreground, recomputed"
     """
+    # virtual devices of the CPU stand for the chips
     os.environ["XLA_FLAGS"] = (
         f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={chips}"
     )
-    jax.config.update("jax_platforms", "cpu")  # virtual devices to count for
+    jax.config.update("jax_platforms", "cpu")
 
     def measure(size: int, variant: str) -> dict[str, Any]:
         mesh = sharding.training_mesh(None, jax.devices())
@@ -274,11 +282,14 @@ def training_cost(
         for size in sizes
         for v in variants
     }
+
+    # a line for each case, with the least time on each kind of chip
     rows, table = run.rows(cases, {"chips": chips}), []
     for what, row in rows.items():
         sent = sum(row["sent_bytes"].values())
-        cells = [f"{row['flops'] / 1e12:.2f}", f"{row['convolution_flops'] / row['flops']:.0%}"]
-        cells += [
+        cells = [
+            f"{row['flops'] / 1e12:.2f}",
+            f"{row['convolution_flops'] / row['flops']:.0%}",
             sum(row["messages"].values()),
             f"{sent / 1e6:.0f}",
             f"{row['state_bytes'] / row['chips'] / 1e6:.1f}",
@@ -286,27 +297,21 @@ def training_cost(
         for flops, bandwidth in PEAKS.values():
             cells.append(f"{1e-9 * row['flops'] / flops:.1f}; {1e-6 * sent / bandwidth:.1f}")
         table.append([what, *cells])
-    header = [
-        "one chip, one step",
-        "TFLOP",
-        "of them convolutions",
-        "messages",
-        "MB sent",
-        "state, MB",
-    ]
-    run.show(markdown_table([*header, *(f"{name}: ms; sending" for name in PEAKS)], table), rows)
+    header = ["one chip, one step", "TFLOP", "of them convolutions", "messages", "MB sent"]
+    header += ["state, MB", *(f"{name}: ms; sending" for name in PEAKS)]
+    run.show(markdown_table(header, table), rows)
 
 
 def step_cost(config: Any, mesh: Any) -> dict[str, Any]:
+    """Returns what one chip of a mesh does in a step of training, counted in the traced program."""
     body = gaussian_body(load_body(), config.model)
 
+    # only shapes are needed, and where their arrays are placed
     def shapes(tree):
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
 
-    state, networks = (
-        jax.eval_shape(lambda: init_state(config)),
-        jax.eval_shape(lambda: random_networks(config)),
-    )
+    state = jax.eval_shape(lambda: init_state(config))
+    networks = jax.eval_shape(lambda: random_networks(config))
     batch = abstract_batch(config, len(body.parents), body.shape_directions.shape[-1])
 
     def placed(tree, shardings):
@@ -334,7 +339,7 @@ def step_cost(config: Any, mesh: Any) -> dict[str, Any]:
 
 
 def abstract_batch(config: Any, joints: int, betas: int) -> Any:
-    """Shapes of an `Example` with a leading axis of `config.batch_size` subjects."""
+    """Returns the shapes of an `Example` with a leading axis of `config.batch_size` subjects."""
 
     def views(count: int, size: int) -> SubjectViews:
         def camera(K, pose):
@@ -357,12 +362,13 @@ def abstract_batch(config: Any, joints: int, betas: int) -> Any:
 
 
 def as_variant(config: Any, variant: str) -> Any:
+    """Returns a configuration as a variant of `VARIANTS`, with one subject at a time."""
     fields: dict[str, Any] = dict(VARIANTS[variant])
     side = config.model.conventions.image_size // config.model.architecture.encoder.patch_size
     tokens = config.views.input_counts[0] * side**2
     if fields.get("tokens") == "foreground":
         tokens = fields["token_capacity"] = int(FOREGROUND_SHARE * tokens)
-    # what "auto" would choose there: it asks for the devices at hand
+    # what "auto" would choose on the chips; it would look at the devices of this machine
     fields["attention"] = "xla" if tokens < XLA_TOKENS else "chunked"
     return dataclasses.replace(with_model(config, **fields), microbatch_size=1)
 
@@ -371,18 +377,19 @@ def as_variant(config: Any, variant: str) -> Any:
 # --------------------------------------------------------------------------------------------------
 
 SMOOTHING = 20
-"""Log lines that a point of the smooth curves averages, at most a quarter of all."""
+"""Number of log lines that a point of the smooth curves averages, at most a quarter of all."""
 
 
 @entry
 def training_curve(run: Run, logs: tuple[Path, ...], out: Path = Path("training.png")) -> None:
-    """Draws the curve of a training run from its log: loss, and PSNR of training views and of
-    validation people.
+    """Draws the curve of a training run from its log: the loss, and the PSNR of training views and
+    of validation people.
 
     Options:
-    logs: log.jsonl of a run, and of runs that continue it: their steps are added up
+    logs: log.jsonl of a run, and of runs that continue it; their steps are added up
     out: picture to write
     """
+    # lines of all logs, with steps counted from the begin of the first run
     lines: list[dict[str, Any]] = []
     begins = []
     for path in logs:
@@ -392,6 +399,8 @@ def training_curve(run: Run, logs: tuple[Path, ...], out: Path = Path("training.
         lines += [line | {"step": line["step"] + offset} for line in read]
     trained = [line for line in lines if line.get("loss") is not None and "event" not in line]
     validated = [line for line in lines if "val_psnr" in line]
+
+    # points and smooth curves of training, points of validation, and the begins of the runs
     steps, count = [line["step"] for line in trained], max(1, min(SMOOTHING, len(trained) // 4))
     with figure(out, 2, (9, 3.2)) as (left, right):
         for axis, name, color in ((left, "loss", "C0"), (right, "psnr", "0.6")):
@@ -401,15 +410,9 @@ def training_curve(run: Run, logs: tuple[Path, ...], out: Path = Path("training.
                 axis.plot(steps, values, ".", ms=2, color="0.8")
                 axis.plot(steps[count - 1 :], smooth, color=color, label="training views")
         left.set(xlabel="step", ylabel="training loss", yscale="log")
+        places = [line["step"] for line in validated]
         psnr = [line["val_psnr"] for line in validated]
-        right.plot(
-            [line["step"] for line in validated],
-            psnr,
-            "o-",
-            ms=4,
-            color="C1",
-            label="validation people",
-        )
+        right.plot(places, psnr, "o-", ms=4, color="C1", label="validation people")
         right.set(xlabel="step", ylabel="PSNR, dB")
         right.legend(loc="lower right")
         for axis in (left, right):

@@ -1,4 +1,6 @@
-"""What an avatar is like where no photo was: guesses from what the photos show, against none."""
+"""Measures how good an avatar is where no photo was taken, with guesses from what the photos show
+and without.
+"""
 
 import dataclasses
 import functools
@@ -27,10 +29,15 @@ CASES = {
     2: ("two, 60 degrees apart", (0, 2), (6, 7, 8)),
     4: ("four, all around", (0, 3, 6, 9), (1, 5, 8, 10)),
 }
-"""By their number, photos, and the views to compare with: those of the other side, or between the
-photos. Numbers of cameras on a ring, 30 degrees apart, the first in front."""
+"""{number of photos: (name, cameras of the photos, cameras of the views to compare with)}.
+
+The views are on the other side, or between the photos. Cameras are numbered on a ring, 30 degrees
+apart, from the front on.
+"""
 BEFORE, AFTER = "network alone", "guessed"
+"""Names of the avatars without and with guesses."""
 SHOWN = {"psnr": ("PSNR", 2), "psnr_fg": ("foreground", 2), "lpips_alex": ("LPIPS alex", 4)}
+"""{score: its heading and digits in the table}."""
 
 
 @entry
@@ -39,16 +46,21 @@ def unseen(
     people: People = People(8, held_out=1, poses=0, pose_views=1),
     photos: tuple[int, ...] = tuple(CASES),
 ) -> None:
-    """Avatars of few photos from the other side, with and without guesses; needs extra `lpips`.
+    """Compares avatars of few photos, with and without guesses, with views from the other side.
 
-    Four photos from all around are to lose nothing by guesses. Other cameras than --held-out.
+    Needs the extra `lpips`. Avatars of four photos from all around should lose nothing by guesses.
+    The views are not those of --held-out.
 
     Options:
-    photos: their numbers
+    photos: numbers of photos
     """
     start, lpips = people.start(), load_lpips("alex")
     protocol = dataclasses.replace(PROTOCOLS["humangs"], lpips=("alex",))
-    person = functools.cache(lambda seed: start.subject(seed, (RING,)).photos)
+
+    # all cameras of the ring take a photo, of which some are inputs and some are compared with
+    @functools.cache
+    def person(seed):
+        return start.subject(seed, (RING,)).photos
 
     def scores(avatar: Avatar, truth: Capture) -> dict[str, Any]:
         drawn = predict_views(avatar, truth)
@@ -61,30 +73,31 @@ def unseen(
         made = both_avatars(start.variables, start.config, given)
         return {name: scores(avatar, others) for name, avatar in made.items()}
 
+    # people with the same number of photos follow each other, because they share a program
     cases = {
         f"{count} photos: {seed}": functools.partial(measure, seed, count)
-        for count in photos  # those of one number share a program
+        for count in photos
         for seed in start.seeds
     }
     found = run.rows(cases, start.settings)
-    table, numbers, said = [], {}, []
+    table, numbers, gains = [], {}, []
     for count in photos:
         case, rows = CASES[count][0], [found[f"{count} photos: {seed}"] for seed in start.seeds]
         mean = means(rows)
         table += [[case, state, *cells(mean[state], SHOWN)] for state in (BEFORE, AFTER)]
         gain = mean[AFTER]["lpips_alex"] / mean[BEFORE]["lpips_alex"] - 1
         better = sum(row[AFTER]["lpips_alex"] < row[BEFORE]["lpips_alex"] for row in rows)
-        said.append(f"{case}: LPIPS {100 * gain:+.0f} %, lower for {better} of {len(rows)}")
+        gains.append(f"{case}: LPIPS {100 * gain:+.0f} %, lower for {better} of {len(rows)}")
         numbers[str(count)] = {"means": mean, "lpips": gain, "better": better}
     header = ["photos", "avatar", *(heading for heading, _ in SHOWN.values())]
     shown = markdown_table(header, table, "ll" + "r" * len(SHOWN))
     seeds = f"{len(start.seeds)} people of the {start.settings['split']} seeds, {start.size} px"
-    text = f"{seeds}. Guessed against the network alone: {'; '.join(said)}.\n\n{shown}"
+    text = f"{seeds}. Guessed against the network alone: {'; '.join(gains)}.\n\n{shown}"
     run.show(text, {"settings": start.settings, "cases": numbers})
 
 
 def both_avatars(variables: Any, config: HumanGSConfig, capture: Capture) -> dict[str, Avatar]:
-    """The avatars of a capture as the network makes it, and with guesses, by one pass."""
+    """Returns the avatars of a capture without and with guesses, from one pass of the network."""
     prepared = prepare_capture(capture, config)
     body, size, crop = prepared.body, config.image_size, config.runtime.crop
     assert body is not None  # prepared for this network

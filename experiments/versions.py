@@ -1,6 +1,4 @@
-"""Speed of the package with several versions of Python and JAX, and with flags of XLA, on this
-machine.
-"""
+"""Measures the speed of the package with versions of Python and JAX, and with flags of XLA."""
 
 import functools
 import json
@@ -16,9 +14,9 @@ FLAGS = {
     "": "",
     "matrix products by YNN": "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_DOT",
 }
-"""Name -> XLA_FLAGS that are compared.
+"""{name: value of XLA_FLAGS that is compared}.
 
-The default of jax 0.11 and 0.12 leaves the library YNNPACK out.
+By default jax 0.11 and 0.12 do not use the library YNNPACK.
 """
 MEASURED = {
     "render_ms": "image, CPU ms",
@@ -26,26 +24,30 @@ MEASURED = {
     "refine_ms": "refine, steps=0, CPU s",
     "step_ms": "training step, CPU s",
 }
-"""Key of a measurement -> its heading."""
+"""{measurement: its heading}."""
 WORKER = "from experiments.versions import print_times; print_times({train}, {repeats})"
+"""Program of a process that measures."""
 
 
 @entry
 def versions(
     run: Run, pythons: tuple[str, ...], rounds: int = 3, repeats: int = 7, train: bool = False
 ) -> None:
-    """CPU time of rendering, refinement and training with each interpreter and flag, in turns.
+    """Measures the CPU time of rendering, refinement and training with each interpreter and flag,
+    in turns.
 
-    Every interpreter needs the package's dependencies. The demo's person at 512 px is drawn, with
-    and without gradients; the demo's avatar is refined by `steps=0`; the step is that of `small` at
-    256 px. Each turn is a new process; programs come from the compile cache after the first.
+    Every interpreter needs the package's dependencies. The demo's person at 512 px is drawn with
+    and without gradients. The demo's avatar is refined with `steps=0`. The step is that of `small`
+    at 256 px. Each turn is a new process. After the first turn programs come from the compile
+    cache.
 
     Options:
-    pythons: interpreters, by path
-    rounds: turns of every interpreter and flag
+    pythons: paths of the interpreters
+    rounds: number of turns of every interpreter and flag
     repeats: timed iterations in a turn
-    train: time the step of training, too, in the first turn (two minutes each)
+    train: also time the step of training, in the first turn (two minutes each)
     """
+    # every interpreter with every flag
     variants = {}
     for python in pythons:
         for flag, value in FLAGS.items():
@@ -54,7 +56,7 @@ def versions(
 
     @functools.cache
     def samples() -> dict[str, list[dict[str, float]]]:
-        """All turns of all variants."""
+        """Measures all turns of all variants."""
         found = {name: [] for name in variants}
         for turn in range(rounds):
             for name, (python, value) in variants.items():
@@ -62,7 +64,7 @@ def versions(
         return found
 
     def row(name: str) -> dict[str, float]:
-        """Medians over the turns."""
+        """Returns the medians of a variant over the turns."""
         own = samples()[name]
         keys = [key for key in MEASURED if key in own[0]]
         return {key: float(np.median([each[key] for each in own if key in each])) for key in keys}
@@ -78,7 +80,7 @@ def versions(
 
 
 def _versions_of(python: str) -> str:
-    """The versions of an interpreter and of its JAX, in words."""
+    """Describes the versions of an interpreter and of its JAX."""
     code = (
         "import platform, importlib.metadata as m; print(platform.python_version(),"
         " m.version('jax'))"
@@ -89,7 +91,10 @@ def _versions_of(python: str) -> str:
 
 
 def _times(python: str, flags: str, train: bool, repeats: int) -> dict[str, float]:
-    """What a process of an interpreter measures. Raises: OSError with the end of its errors."""
+    """Returns what a process of an interpreter measures.
+
+    Raises: OSError with the end of the process's errors.
+    """
     environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": str(REPOSITORY)}
     command = [python, "-c", WORKER.format(train=train, repeats=repeats)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=REPOSITORY)

@@ -1,4 +1,4 @@
-"""What the options of `humangs animate` and `humangs render` give, as a sheet of images."""
+"""Draws a sheet of images that shows the options of `humangs animate` and `humangs render`."""
 
 import dataclasses
 from pathlib import Path
@@ -28,49 +28,49 @@ from humangs_jax.io.images import to_uint8
 from humangs_jax.motion import load_motion
 
 WALKED = 2.5
-"""Metres."""
+"""Metres that the person walks forward."""
 SHOWN = 6
 """Images in a row of the sheet."""
 FIRST = 10
-"""The frame of the walk that stands for the others."""
+"""Number of the frame of the walk that is shown where one frame is enough."""
 
 
 @entry
 def video(run: Run, image: Path) -> None:
-    """A sheet of what options of `humangs animate` and `humangs render` give: the shipped person
-    and walk, 2.5 m forward.
+    """Draws a sheet that shows options of `humangs animate` and `humangs render`, with the shipped
+    person and walk, 2.5 m forward.
 
-    A row each: the camera follows, it stands still, its angles, backgrounds and poses, layers.
+    The rows show a camera that follows, a camera that stands still, angles of the camera,
+    backgrounds and poses, and layers.
 
     Options:
     image: JPEG to write
     """
     person, motion = shipped_person(), forward_walk()
     rows = [
-        *(walked(person, motion, follow) for follow in (True, False)),
+        walked(person, motion, follow=True),
+        walked(person, motion, follow=False),
         looked_at(person, motion),
+        posed_before(person),
+        layered(person, motion),
     ]
-    rows += [posed_before(person), layered(person, motion)]
-    sheet = [
-        tile(
-            np.stack([image for _, image in row]), labels=[label for label, _ in row], columns=SHOWN
-        )
-        for row in rows
-    ]
+    sheet = []
+    for row in rows:
+        labels, pictures = zip(*row, strict=True)
+        sheet.append(tile(np.stack(pictures), labels=list(labels), columns=SHOWN))
     Image.fromarray(to_uint8(np.concatenate(sheet))).save(image, quality=88)
 
 
 def forward_walk() -> Motion:
-    """The shipped walk, which is on the spot, moved forward."""
+    """Returns the shipped walk, which is on the spot, moved forward."""
     motion = load_motion()
-    path = np.asarray(motion.translations) + np.linspace(
-        [0, 0, 0], [0, 0, WALKED], len(motion.translations)
-    )
+    forward = np.linspace([0, 0, 0], [0, 0, WALKED], len(motion.translations))
+    path = np.asarray(motion.translations) + forward
     return replace(motion, translations=jnp.asarray(path, jnp.float32))
 
 
 def walked(avatar: Avatar, motion: Motion, follow: bool) -> list[tuple[str, np.ndarray]]:
-    """Frames of the walk, seen from the side."""
+    """Returns (label, image) of frames of the walk, seen from the side."""
     shot = FrameSettings(size=240, azimuth=70.0)
     poses, cameras = motion_views(avatar, motion, shot, follow=follow)
     chosen = np.linspace(0, len(poses) - 1, SHOWN).astype(int)
@@ -82,7 +82,9 @@ def walked(avatar: Avatar, motion: Motion, follow: bool) -> list[tuple[str, np.n
 
 
 def looked_at(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
-    """The walk from other sides, and drawn otherwise."""
+    """Returns (label, image) of a frame of the walk with other options of the camera and the
+    renderer.
+    """
     drawn = []
     changes = [
         ("azimuth", 180),
@@ -101,7 +103,7 @@ def looked_at(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
 
 
 def posed_before(avatar: Avatar) -> list[tuple[str, np.ndarray]]:
-    """Poses before backgrounds."""
+    """Returns (label, image) of poses in front of backgrounds."""
     drawn = []
     for name, pose in (("T-pose", rest_pose_of(avatar)), ("--pose a", a_pose_of(avatar))):
         for color in ("white", "#24425c", "transparent"):
@@ -112,7 +114,7 @@ def posed_before(avatar: Avatar) -> list[tuple[str, np.ndarray]]:
 
 
 def over_checks(image: np.ndarray) -> np.ndarray:
-    """A transparent image over grey squares; another one as it is."""
+    """Returns a transparent image over grey squares, and an image without alpha unchanged."""
     if image.shape[-1] == 3:
         return image
     rows, columns = (np.arange(size) // 12 for size in image.shape[:2])
@@ -121,7 +123,8 @@ def over_checks(image: np.ndarray) -> np.ndarray:
 
 
 def layered(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
-    """The layers of an EXR file, as colors."""
+    """Returns (label, image) of the layers of an EXR file, as colors."""
+    # one frame with all layers
     shot = FrameSettings(size=240, azimuth=20.0)
     poses, cameras = motion_views(avatar, motion, shot)
     pose, camera, how = poses[FIRST], cameras[FIRST], splatting_of(shot, avatar)
@@ -129,14 +132,14 @@ def layered(avatar: Avatar, motion: Motion) -> list[tuple[str, np.ndarray]]:
     view = exr_view("view", avatar, pose, camera, rendering, LAYERS, how)
     seen = view.rgba[..., 3:] > 0
     assert view.depth is not None  # asked for
-    position, normal = (
-        np.stack([view.channels[f"{name}.{axis}"] for axis in "XYZ"], -1)
-        for name in ("position", "normal")
-    )
-    low, high = (
-        np.asarray([edge(position[..., i][seen[..., 0]]) for i in range(3)])
-        for edge in (np.min, np.max)
-    )
+
+    # ranges of the numbers over the person, and a color for each part
+    def vectors(name):
+        return np.stack([view.channels[f"{name}.{axis}"] for axis in "XYZ"], -1)
+
+    position, normal = vectors("position"), vectors("normal")
+    inside = position[seen[..., 0]]
+    low, high = inside.min(axis=0), inside.max(axis=0)
     near, far = view.depth[seen[..., 0]].min(), view.depth[seen[..., 0]].max()
     palette = np.random.default_rng(3).uniform(0.15, 1, (len(avatar.joint_names) + 1, 3))
     palette[0] = 0

@@ -1,4 +1,4 @@
-"""A folder of photos as a photographer has it, made of a synthetic person, and what comes of it."""
+"""Makes a folder of photos of a synthetic person as a photographer has it, and its avatar."""
 
 from pathlib import Path
 
@@ -22,18 +22,22 @@ from humangs_jax.synthetic.writer import Layout, write_person
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 SEED, VIEWS, SIZE, NOISE = 4_000_009, 4, 512, 2.0
+"""Seed of the person, number of photos, their side in pixels, and standard deviation of the noise
+of keypoints in pixels.
+"""
 OPENCV_FROM_Y_UP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Rotation between a world with y up and one with y down."""
 WIDTH = 1200
-"""Pixels of a figure."""
+"""Largest side of a figure in pixels."""
 
 
 @entry
 def your_photos(run: Run, out: Path, docs: bool = False) -> int:
-    """The figures of docs/your_photos.md: OUT/photos as a photographer has it, and what `humangs
-    start` makes of it, OUT/me.
+    """Makes OUT/photos as a photographer has it, and OUT/me, which `humangs start` makes of it, for
+    the figures of docs/your_photos.md.
 
-    Images in a room, calibration.json of OpenCV, masks, keypoints as MMPose writes them (with 2
-    pixels of noise). Two minutes.
+    OUT/photos has images in a room, calibration.json of OpenCV, masks, and keypoints as MMPose
+    writes them (with 2 pixels of noise). Takes two minutes.
 
     Options:
     out: a new folder
@@ -52,8 +56,8 @@ def your_photos(run: Run, out: Path, docs: bool = False) -> int:
 
 
 def write_material(folder: Path, capture, points: np.ndarray) -> None:
-    """Photos, masks, calibration and keypoints (v, 133, 2) of a capture as other programs write
-    them.
+    """Writes photos, masks, calibration and keypoints (v, 133, 2) of a capture as other programs
+    write them.
     """
     for name in ("images", "masks", "keypoints"):
         (folder / name).mkdir(parents=True)
@@ -61,12 +65,10 @@ def write_material(folder: Path, capture, points: np.ndarray) -> None:
     for i, name in enumerate(f"cam{i}" for i in range(capture.view_count)):
         write_png(folder / "images" / f"{name}.png", in_a_room(capture.images[i], capture.masks[i]))
         write_png(folder / "masks" / f"{name}.png", capture.masks[i])
-        K, matrix = (
-            np.array(capture.cameras.K[i], float),
-            np.array(capture.cameras.cam_from_world[i], float),
-        )
-        K[:2, 2] -= 0.5  # OpenCV counts pixels, also in keypoints
-        matrix = matrix @ OPENCV_FROM_Y_UP
+        # OpenCV has the centre of the first pixel at 0, also for keypoints
+        K = np.array(capture.cameras.K[i], float)
+        K[:2, 2] -= 0.5
+        matrix = np.array(capture.cameras.cam_from_world[i], float) @ OPENCV_FROM_Y_UP
         size = [capture.cameras.width, capture.cameras.height]
         calibration[name] = {
             "K": K.tolist(),
@@ -82,45 +84,40 @@ def write_material(folder: Path, capture, points: np.ndarray) -> None:
 
 
 def landmarks_in(capture, names: tuple[str, ...] | None = None) -> np.ndarray:
-    """Where points are in each photo, (v, k, 2) pixels; NaN for those that the body does not have.
+    """Returns the places of landmarks in each photo, (v, k, 2) pixels.
 
-    Default: COCO-WholeBody's.
+    Landmarks that the body does not have are NaN. The default names are those of COCO-WholeBody.
     """
-    model, betas = (
-        landmark_model(capture.body, names or COCO_WHOLEBODY_133.names),
-        jnp.asarray(capture.betas),
-    )
+    model = landmark_model(capture.body, names or COCO_WHOLEBODY_133.names)
+    known, betas = np.asarray(model.known)[:, None] > 0, jnp.asarray(capture.betas)
     points = []
     for i, frame in enumerate(capture.frames):
         landmarks = np.asarray(pose_landmarks(model, betas, capture.pose(int(frame)))[0])
         matrix, K = np.asarray(capture.cameras.cam_from_world[i]), np.asarray(capture.cameras.K[i])
         seen = (landmarks @ matrix[:3, :3].T + matrix[:3, 3]) @ K.T
-        points.append(
-            np.where(np.asarray(model.known)[:, None] > 0, seen[:, :2] / seen[:, 2:], np.nan)
-        )
+        points.append(np.where(known, seen[:, :2] / seen[:, 2:], np.nan))
     return np.stack(points)
 
 
 def in_a_room(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """A person on white, in front of a wall and on a floor."""
+    """Returns a person on white in front of a wall and on a floor."""
     height, width = mask.shape
     y = np.linspace(0, 1, height)[:, None, None]
     wall, floor = np.array([0.62, 0.66, 0.70]), np.array([0.45, 0.38, 0.32])
-    room = np.where(y < 0.78, wall * (1.05 - 0.25 * y), floor * (0.7 + 0.4 * y)) * np.ones(
-        (1, width, 1)
-    )
-    return image - (1 - mask[..., None]) * (
-        1 - room
-    )  # the edge's share of white becomes the room's
+    column = np.where(y < 0.78, wall * (1.05 - 0.25 * y), floor * (0.7 + 0.4 * y))
+    room = column * np.ones((1, width, 1))
+    # the share of white at the edge becomes that of the room
+    return image - (1 - mask[..., None]) * (1 - room)
 
 
 def draw_figures(out: Path, points: np.ndarray) -> None:
-    def read(folder, i):
-        return read_image(out / "photos" / folder / f"cam{i}.png")[0]
+    """Draws the figures of the docs: the material, the check and the avatar."""
 
-    photos, masks = (
-        np.stack([read(folder, i) for i in range(VIEWS)]) for folder in ("images", "masks")
-    )
+    def read(folder):
+        paths = [out / "photos" / folder / f"cam{i}.png" for i in range(VIEWS)]
+        return np.stack([read_image(path)[0] for path in paths])
+
+    photos, masks = read("images"), read("masks")
     marked = np.stack([with_points(photo, own) for photo, own in zip(photos, points, strict=True)])
     rows = np.concatenate([photos, masks, marked])
     labels = [
@@ -130,13 +127,12 @@ def draw_figures(out: Path, points: np.ndarray) -> None:
     save(read_image(out / "me" / "check.png")[0], IMAGES / "your_photos_check.jpg")
     avatar, shot = Avatar.load(out / "me" / "avatar.npz"), FrameSettings(size=SIZE)
     turn = turntable_views(avatar, a_pose_of(avatar), VIEWS, shot)
-    save(
-        tile(np.stack(list(images(avatar, *turn, shot))), columns=VIEWS),
-        IMAGES / "your_photos_avatar.jpg",
-    )
+    drawn = np.stack(list(images(avatar, *turn, shot)))
+    save(tile(drawn, columns=VIEWS), IMAGES / "your_photos_avatar.jpg")
 
 
 def with_points(photo: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Returns a photo with a dot at each point that is known."""
     image = Image.fromarray((255 * photo).round().astype(np.uint8))
     pen = ImageDraw.Draw(image)
     for x, y in points[np.isfinite(points).all(-1)]:
@@ -145,6 +141,7 @@ def with_points(photo: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def save(image: np.ndarray, path: Path) -> None:
+    """Saves a figure as a JPEG of at most `WIDTH` pixels a side."""
     picture = Image.fromarray((255 * np.clip(image[..., :3], 0, 1)).round().astype(np.uint8))
     picture.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
     picture.save(path, quality=88)
