@@ -1,5 +1,6 @@
-"""Sizes of the buffers of splatting: how many (splat, tile) pairs fit. Sizes are measured on a
-scene, or guessed for traced calls. Pairs that do not fit are reported.
+"""Chooses the sizes of splatting's buffers: how many (splat, tile) pairs and (splat, row of tiles)
+pairs fit. Sizes are measured on a scene, or guessed for traced calls. Pairs that do not fit are
+reported.
 """
 
 import dataclasses
@@ -71,15 +72,15 @@ def plan_buffers(
     Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation.
     Measures concrete arrays: call it outside of transformations.
 
-    No margin is enough for Gaussians that are optimised for long: they grow. `Rendering.overflow`
-    above 0 tells, and `SplatConfig.warn_overflow` logs it. Then plan again from the Gaussians as
-    they are; the program compiles again.
+    No margin is enough for Gaussians that are optimised for long, because they grow. If pairs no
+    longer fit, `Rendering.overflow` is above 0, and `SplatConfig.warn_overflow` logs it. Then plan
+    again from the current Gaussians; the program compiles again.
 
     Args:
         gaussians: one set.
         cameras: one, or a batch.
-        config: what the buffers are added to.
-        margin: how many times as many pairs as there are fit.
+        config: the configuration that the buffers are added to, or a preset's name.
+        margin: size of the buffers, relative to the need.
 
     Returns:
         `config` with `max_pairs` and `max_rows`.
@@ -104,8 +105,8 @@ _PLANNED: dict[tuple[SplatConfig, int, int], list[tuple[int, int]]] = {}
 
 def plan_near(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
     """Returns a configuration with buffers for one camera. Buffers that were planned before are
-    taken if everything fits and they are not much larger, because drawing costs less than another
-    compilation.
+    taken if everything fits and they are at most `ROOMY` times the need, because drawing with them
+    costs less than another compilation.
     """
     rows, pairs = _needed(gaussians, camera, config)
     known = _PLANNED.setdefault((config, camera.width, camera.height), [])

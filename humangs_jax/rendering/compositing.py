@@ -9,11 +9,11 @@ the splat's centre,
     C       = sum_k w_k f_k
 
 Here r^T r = conic / 2 and conic = cov2d^-1. T_0 = 1 before the nearest splat, and f_k holds the
-splat's features, rgb and z.
+splat's features: rgb, z and any others.
 
-A pixel ends before the first splat whose T_k+1 <= transmittance_stop. The exponent is a sum of
-squares. Hence it is never positive, and it is accurate for needles, for which the quadratic form of
-the conic loses digits.
+A pixel ends before the first splat whose T_k+1 <= transmittance_stop. Apart from log opacity, the
+exponent is minus a sum of squares. Hence it is never positive, and it is accurate for needles, for
+which the quadratic form of the conic loses digits.
 
 The gradient runs front to back as well. With g the cotangent of C, g_T that of the final T, and Q =
 g . C + g_T T_end,
@@ -90,8 +90,8 @@ composite.defvjp(_composite_fwd, _composite_bwd)
 def _scheduled(
     on_cpu: Schedule, elsewhere: Schedule, grid: TileGrid, config: SplatConfig, *arrays: Array
 ) -> PyTree:
-    """Calls the function that one of two schedules makes. The platform for which the program is
-    compiled decides which one.
+    """Calls the function that one of two schedules makes, and returns its result. The platform for
+    which the program is compiled decides which one.
     """
     return lax.platform_dependent(
         *arrays, cpu=on_cpu(grid, config), default=elsewhere(grid, config)
@@ -101,8 +101,8 @@ def _scheduled(
 def _splat_gradients(
     splats: Float[Array, "g width"], sums: Float[Array, "g width"]
 ) -> Float[Array, "g width"]:
-    """Returns the gradient of the rows, (g, width), from sums over pixels: sums of e (1, dx, dy,
-    dx^2, dx dy, dy^2) in the first six columns, and of w g in the others.
+    """Returns the gradient of the rows of splats, (g, width). sums: sums over pixels for each
+    splat, of e (1, dx, dy, dx^2, dx dy, dy^2) in the first six columns, and of w g in the others.
     """
     r00, r01, r11 = (splats[:, i] for i in (R00, R01, R11))
     e, ex, ey, exx, exy, eyy = sums[:, :6].T

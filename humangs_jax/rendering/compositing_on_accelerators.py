@@ -9,9 +9,9 @@ accumulates, so the chain over the list becomes products:
               + (strict lower triangle (k, k)) @ log(1 - alpha)
 
 The sum before the chunk is a product, too, with the 0-1 matrix (B, B) that says "earlier chunk of
-the same list". The first list of a step may continue from the step before. Its sum so far is added,
-and is all that steps hand on. The backward pass forms the sums over i <= j of w_i g . f_i by the
-same two products.
+the same list". The first list of a step may continue from the step before. A step therefore hands
+on the sum of its last list, and the next step adds it. The backward pass forms the sums over i <= j
+of w_i g . f_i by the same two products.
 
 T agrees with that of the other schedule to |log T| eps. Behind the stop, rounding can raise log T
 only while alpha is 0. Hence the final log T is the sum of log(1 - alpha) over the splats before the
@@ -248,7 +248,7 @@ def _chunks_per_step(grid: TileGrid, dtype: np.dtype | type, capacity: int, t: i
 
 
 def _log_stop(config: SplatConfig) -> float:
-    """Returns the logarithm of T at which a pixel ends."""
+    """Returns the logarithm of T at which a pixel ends, or minus infinity if pixels never end."""
     if config.transmittance_stop > 0:
         return math.log(config.transmittance_stop)
     return -math.inf
@@ -286,7 +286,10 @@ def _sums_before(
 
 
 def _tail(tiles: Array, before: Array, through: Array) -> _Tail:
-    """Returns the sum of the step's last list, up to the end of its last chunk in this step."""
+    """Returns the tail of a step: the tile of its last list, and the list's sum up to the end of
+    the step. tiles: tile of each chunk, (B,). before: sums before the chunks, (B, p). through: sums
+    from the beginning of a chunk through each splat, (B, k, p).
+    """
     return _Tail(tiles[-1], before[-1] + through[-1, -1])
 
 

@@ -2,12 +2,13 @@
 
 Tiles are ordered by list length, longest first, and taken in blocks of `config.block`. A block
 takes its lists in chunks until the longest list ends or all its pixels have ended. The arrays of a
-chunk (block, chunk, pixels) stay in the cache. The chain of splats in a chunk is unrolled, once for
-each array that the loop carries. XLA makes ONE kernel of each chain, which runs in registers. Once
-a pixel has ended, the loop carries -T, which keeps the final T.
+chunk (block, chunk, pixels) stay in the cache. The chain of splats in a chunk is unrolled. The
+forward pass has two chains, one for T and one for everything else, so that XLA makes ONE kernel of
+each chain, which runs in registers. Once a pixel has ended, the loop carries -T, which keeps the
+final T.
 
-Compile with `core.processes.compiler_options`. To share small kernels out over threads would cost
-more than it gains, and the barriers have to be kept.
+Compile with `core.processes.compiler_options`. Its options keep XLA from sharing small kernels out
+over threads, which would cost more than it gains, and from removing the barriers.
 """
 
 import functools
@@ -119,7 +120,9 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Comp
             final = jnp.abs(chain.transmittance)  # the sign marked pixels that had ended
 
             def placed(of_all, of_block):
-                """Puts the block's tiles at their places among all tiles, and drops padding."""
+                """Returns the values of all tiles with those of this block's tiles put in. Padding
+                is dropped.
+                """
                 return of_all.at[tile].set(of_block, mode="drop", unique_indices=True)
 
             medians = None
@@ -226,5 +229,7 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
 
 
 def _lists_of(tile: Array, starts: Array, counts: Array) -> Iterator[Array]:
-    """Returns the starts and lengths of the lists of some tiles. Padding tiles get empty lists."""
+    """Returns two arrays, the starts and the lengths of the lists of some tiles. Padding tiles get
+    empty lists.
+    """
     return (v.at[tile].get(mode="fill", fill_value=0) for v in (starts, counts))

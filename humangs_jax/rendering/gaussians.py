@@ -1,8 +1,8 @@
 """3D Gaussians, the scene that every splatter here draws.
 
 The covariance of a Gaussian is A R diag(s)^2 R^T A^T. R is the rotation of its quaternion, and s
-are its scales (standard deviations, metres). A is an optional linear deformation, which blend
-skinning leaves; the identity if absent.
+are its scales (standard deviations, metres). A is the linear deformation that blend skinning
+leaves. Without `deformations` it is the identity.
 """
 
 import functools
@@ -30,7 +30,9 @@ class Gaussians(Batchable):
     means: Float[Array, "g 3"]
     """Centres, (g, 3), metres."""
     quats: Float[Array, "g 4"]
-    """Rotations, (g, 4), quaternions wxyz, normalised where they are used."""
+    """Rotations, (g, 4), quaternions wxyz. They are normalised where they are used, except with
+    `SplatConfig.normalize_quats` False.
+    """
     scales: Annotated[Float[Array, "g 3"], NOT_NEGATIVE]
     """Standard deviations along the Gaussians' axes, (g, 3), metres."""
     opacities: Annotated[Float[Array, " g"], UNIT]
@@ -47,19 +49,20 @@ class Gaussians(Batchable):
     """
     pixel_footprint: Annotated[Float[Array, " g"] | None, NOT_NEGATIVE] = None
     """Side of the pixels of the images whose low-pass the scales contain (`avatar.animate`), (g,),
-    metres, or None. Renderers then add at most `MIP_EPS2D` pixels^2, and dim Gaussians that this
-    makes larger in images of larger pixels.
+    metres. Renderers then add at most `MIP_EPS2D` pixels^2. In images with larger pixels, they dim
+    the Gaussians that this enlarges. None: the scales contain no low-pass.
     """
     harmonics: Float[Array, "g k 3"] | None = None
-    """Spherical harmonics of the colors that the direction of sight adds (see below), (g, k, 3), or
-    None. Degrees are 1 (k = 3), 1 to 2 (k = 8) or 1 to 3 (k = 15), in the frame of the means.
-    `skin_gaussians` turns them with the Gaussians, so those of an avatar are in its T-pose.
+    """Factors of the spherical harmonics, which add colors by the direction of sight (see below),
+    (g, k, 3), or None. Degrees are 1 (k = 3), 1 to 2 (k = 8) or 1 to 3 (k = 15), in the frame of
+    the means. `skin_gaussians` turns them with the Gaussians, so those of an avatar are in its
+    T-pose.
     """
 
 
 def added_variance(pixel_footprint: Float[Array, " g"] | None, eps2d: float) -> float:
-    """Returns the variance that is added to projected variances, pixels^2: `eps2d`, but at most
-    `MIP_EPS2D` if the scales contain a low-pass.
+    """Returns the variance that is added to projected variances, pixels^2. It is `eps2d`, but at
+    most `MIP_EPS2D` if there is a `pixel_footprint`.
     """
     if pixel_footprint is None:
         return eps2d
@@ -69,8 +72,9 @@ def added_variance(pixel_footprint: Float[Array, " g"] | None, eps2d: float) -> 
 def widened(
     scales: Float[Array, "g 3"], pixel_footprint: Float[Array, " g"] | None, sign: int = 1
 ) -> Float[Array, "g 3"]:
-    """Returns scales with the low-pass of pixels of `pixel_footprint` metres added, except
-    `MIP_EPS2D` of it. sign: -1 removes the low-pass again.
+    """Returns scales with a low-pass added, metres. The variance of the low-pass is `EPS2D -
+    MIP_EPS2D` times the square of `pixel_footprint`, the side of a pixel in metres. sign: -1
+    subtracts the variance again. Without a `pixel_footprint` the scales are unchanged.
     """
     if pixel_footprint is None:
         return scales
@@ -91,14 +95,14 @@ def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Fl
 
 
 def covariances(gaussians: Gaussians) -> Float[Array, "g 3 3"]:
-    """Returns the world-space covariance matrices, metres^2."""
+    """Returns the covariance matrices in the world, (g, 3, 3), metres^2."""
     factors = covariance_factors(gaussians)
     return jnp.einsum("gik,gjk->gij", factors, factors, precision=transform.EXACT)
 
 
 def factored(gaussians: Gaussians) -> Gaussians:
     """Returns Gaussians with the same covariances but without `deformations`. Quats and scales come
-    from the singular vectors of A R diag(s).
+    from the singular value decomposition of A R diag(s).
 
     This is not meant to be differentiated: the factors are not unique where two scales coincide.
     """
@@ -115,13 +119,13 @@ def skin_gaussians(
     transforms: Float[Array, "g 4 4"],
     mode: Literal["affine", "rotation"] = "affine",
 ) -> Gaussians:
-    """Returns the Gaussians moved by their (blended) transforms. Scales, opacities and colors stay,
-    and harmonics are turned by the rotation part of the transform.
+    """Returns the Gaussians moved by their (blended) transforms. Scales, opacities and colors stay.
+    Harmonics are turned by the rotation that is read from the transform.
 
-    affine: the covariance is transformed by the full linear part, which is put in front of
-    `deformations`. rotation: as published, the linear part times the Gaussian's rotation matrix is
-    read as a quaternion. Where blending left no rotation, the quaternion's norm is below 1; draw
-    with `normalize_quats=False` to reproduce this.
+    With "affine", the linear part of the transform is multiplied into `deformations`, and so
+    transforms the whole covariance. With "rotation", as published, the linear part times the
+    Gaussian's rotation matrix is read as a quaternion. Where the blended transform is no rotation,
+    the quaternion's norm is not 1. Draw with `normalize_quats=False` to reproduce this.
 
     Raises: ValueError for another mode, or for `rotation` of Gaussians that have deformations
     already.
@@ -180,11 +184,12 @@ class UnconstrainedGaussians(Batchable):
 
 @checked_arguments
 def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """Returns parameters from which `constrain` makes these Gaussians, except for opacities and
-    colors within `OPACITY_MARGIN` and `COLOR_MARGIN` of 0 or 1.
+    """Returns parameters from which `constrain` makes these Gaussians. Opacities and colors are
+    first clamped to `OPACITY_MARGIN` and `COLOR_MARGIN` from 0 and 1, and scales to at least
+    `SMALLEST_SCALE`. `pixel_footprint` is lost.
 
     Args:
-        gaussians: without deformations. A low-pass is no parameter: it stays in the scales.
+        gaussians: without deformations. A low-pass stays in the scales.
 
     Returns:
         Parameters without bounds: log scales, logits.
@@ -260,7 +265,9 @@ the number of functions.
 
 
 def check_count(count: int) -> None:
-    """Checks that a number of functions is that of whole degrees. Raises: ValueError."""
+    """Checks that a number of functions is 3, 8 or 15, which whole degrees have. Raises:
+    ValueError.
+    """
     if count not in COUNTS[1:]:
         raise ValueError(
             f"harmonics: expected (g, 3, 3), (g, 8, 3) or (g, 15, 3), got (g, {count}, 3)"
@@ -273,8 +280,8 @@ def basis(
     z: Array | np.ndarray | float,
     count: int,
 ) -> list:
-    """Returns Y_1 to Y_count of unit vectors, which are given as planes. Raises: as
-    `check_count`.
+    """Returns the values of Y_1 to Y_count at unit vectors, a list. x, y, z: coordinates of the
+    vectors. Raises: as `check_count`.
     """
     check_count(count)
     xx, yy, zz = x * x, y * y, z * z
@@ -307,7 +314,7 @@ def added_colors(
 def turned_harmonics(
     harmonics: Float[Array, "*g k 3"], rotations: Float[Array, "*#g 3 3"]
 ) -> Float[Array, "*g k 3"]:
-    """Returns harmonics turned by rotations R: colors that were seen along d are then seen along R
+    """Returns harmonics turned by rotations R. Colors that were seen along d are then seen along R
     d.
     """
     count = harmonics.shape[-2]
@@ -320,8 +327,8 @@ def turned_harmonics(
 
 @functools.cache
 def _points(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns unit vectors on a spiral (p, 3), and the matrix (k, p) that maps values at these to
-    the factors of the functions.
+    """Returns unit vectors on a spiral, (p, 3), and the matrix (k, p) that maps values at these
+    vectors to the factors of k functions.
     """
     z = 1 - (2 * np.arange(POINTS) + 1) / POINTS
     angle = np.pi * (1 + math.sqrt(5)) * np.arange(POINTS)

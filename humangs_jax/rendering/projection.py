@@ -11,25 +11,26 @@ where J is the projection's derivative at p, and A R diag(s) the factor of the c
 (2, 3).
 
 Everything is kept as planes of g numbers rather than as (g, 2, 2) arrays: XLA then fuses the
-projection, and its gradient, into a few loops. Its determinant is not taken from the entries of
-cov2d, where float32 cancels for needles, but as a sum of squares: |m0 x m1|^2 + eps2d (|m0|^2 +
+projection, and its gradient, into a few loops. The determinant of cov2d is not computed from its
+entries, where float32 cancels for needles, but as a sum of squares: |m0 x m1|^2 + eps2d (|m0|^2 +
 |m1|^2) + eps2d^2 for the rows m0, m1 of M. What is drawn is the upper triangular r with r^T r =
 cov2d^-1 / 2, whose gradient is written by hand for the same reason.
 
-The added variance makes small Gaussians larger. Those whose scales contain the low-pass of pixels
-of s metres (`Gaussians.pixel_footprint`) have their opacity times sqrt(det(M M^T + e I) / det
-cov2d), where e = eps2d (s fx/Z)^2 <= eps2d is what was added in images of such pixels: what they
-weigh together stays the same in smaller images (Mip-Splatting's 2D filter,
-https://arxiv.org/abs/2311.16493, equation 9, which has e = 0). `SplatConfig.antialiased` dims all
-others with e = 0.
+The added variance makes small Gaussians larger. If the scales contain the low-pass of pixels of s
+metres (`Gaussians.pixel_footprint`), the opacity is multiplied by sqrt(det(M M^T + e I) / det
+cov2d). Here e, the smaller of eps2d (s fx/Z)^2 and eps2d, is the variance that was added in images
+of such pixels. So the total weight of a Gaussian stays the same in smaller images (Mip-Splatting's
+2D filter, https://arxiv.org/abs/2311.16493, equation 9, which has e = 0). `SplatConfig.antialiased`
+dims all other Gaussians with e = 0.
 
-Where the camera has a lens, mean2d is where the lens puts (X/Z, Y/Z), and J is that of the whole
-map (`geometry.lens`): K's focal lengths, times the lens's Jacobian, times that of the division by
-Z. Of an orthographic camera J = [[fx, 0, 0], [0, fy, 0]], and all directions of sight are its axis.
+If the camera has a lens, mean2d is where the lens puts (X/Z, Y/Z). J is then the derivative of the
+whole map (`geometry.lens`): the focal lengths of K, times the Jacobian of the lens, times the
+Jacobian of the division by Z. An orthographic camera has J = [[fx, 0, 0], [0, fy, 0]], and all its
+directions of sight are its axis.
 
 Gaussians that are not drawn (centre nearer than `near`, behind, or beyond the reach of the lens,
-footprint beyond `LARGEST_FOOTPRINT`) have finite values and pass zero gradients. K's skew is taken
-as 0.
+footprint beyond `LARGEST_FOOTPRINT`) have finite values, and pass zero gradients when they are
+drawn by `splatting`. K's skew is taken as 0.
 """
 
 import functools
@@ -87,7 +88,7 @@ class ProjectedGaussians(NamedTuple):
     visible: Bool[Array, " g"]
     """Whether each Gaussian is drawn, (g,)."""
     dimming: Float[Array, " g"] | None = None
-    """Factor of the opacity, (g,), in (0, 1]; None where nothing is dimmed."""
+    """Factor of the opacity, (g,), in (0, 1]. None if no Gaussian is dimmed."""
     added_colors: Float[Array, "g 3"] | None = None
     """RGB that harmonics add to the colors, as seen from this camera, (g, 3); None without
     harmonics.
@@ -100,14 +101,16 @@ class ProjectedGaussians(NamedTuple):
         return opacities * self.dimming
 
     def seen_from_here(self, colors: Float[Array, "g 3"]) -> Float[Array, "g 3"]:
-        """Returns the colors with `added_colors`, at least 0, as they are drawn."""
+        """Returns the colors as they are drawn: with `added_colors`, and at least 0. Without
+        `added_colors` the colors are unchanged.
+        """
         if self.added_colors is None:
             return colors
         return jnp.maximum(colors + self.added_colors, 0.0)
 
     @property
     def means2d(self) -> Float[Array, "g 2"]:
-        """Centres on the image, pixels."""
+        """Centres on the image, (g, 2), pixels."""
         return jnp.stack([self.x, self.y], axis=-1)
 
     @property
@@ -120,11 +123,12 @@ class ProjectedGaussians(NamedTuple):
 def project_gaussians(
     gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG
 ) -> ProjectedGaussians:
-    """Returns every Gaussian projected onto the image, as `config` says. This is the first half of
+    """Returns every Gaussian projected onto the image, as `config` says. This is the first step of
     `splatting.render`.
 
-    `config.jacobian_margin` clamps the point where the Jacobian is evaluated, to that fraction of
-    the half field of view beyond the border. It applies to cameras without lens.
+    With `config.jacobian_margin`, the Jacobian is evaluated no farther beyond the border of the
+    image than this fraction of half the field of view. It applies to pinhole cameras without
+    distortion.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
     eps2d = added_variance(gaussians.pixel_footprint, config.eps2d)
@@ -207,7 +211,7 @@ def project_gaussians(
 
 
 def _covariance(m0: Planes, m1: Planes, eps2d: Array | float) -> tuple[Array, Array, Array, Array]:
-    """Returns xx, xy, yy and the determinant of cov2d for the rows of M."""
+    """Returns xx, xy, yy and the determinant of cov2d, (g,) each. m0, m1: the rows of M."""
     xx, xy, yy = _dot(m0, m0), _dot(m0, m1), _dot(m1, m1)
     normal = [_cross(m0, m1, 1, 2), _cross(m0, m1, 2, 0), _cross(m0, m1, 0, 1)]
     determinant = _dot(normal, normal) + eps2d * (xx + yy) + eps2d * eps2d
@@ -215,7 +219,8 @@ def _covariance(m0: Planes, m1: Planes, eps2d: Array | float) -> tuple[Array, Ar
 
 
 def _dimming(m0: Planes, m1: Planes, determinant: Array, eps2d: float, footprint: Array) -> Array:
-    """Returns the factor of the opacity, (g,). It is 1 where the determinant overflows.
+    """Returns the factor of the opacity, (g,). It is at least `LEAST_DIMMING`, and 1 where the
+    determinant overflows.
 
     footprint: side of the pixels of the images that the scales were fitted to, in pixels of this
     image.
@@ -248,9 +253,9 @@ def _conic_factor(m0: Planes, m1: Planes, eps2d: float) -> tuple[Array, Array, A
         (r M)_0j = r00 / yy (sum_i m1_i (m_j x m_i) + eps2d m0_j),     (r M)_1j = r11 m1_j
 
     the term that would cancel, m_j x m_j, is left out. Autodiff sums two terms that cancel, through
-    yy and through the determinant; that is ten times less accurate, and once the determinant passes
-    2e19 pixels^4 (7e4 pixels square: the square of the determinant overflows) one of them is lost
-    and the gradient along the long axis is as large as across.
+    yy and through the determinant; that is ten times less accurate. Once the determinant passes
+    2e19 pixels^4 (7e4 pixels square), its square overflows. One of the terms is then lost, and the
+    gradient along the long axis is as large as across.
     """
     _, xy, yy, determinant = _covariance(m0, m1, eps2d)
     regular = determinant > 0
@@ -285,7 +290,7 @@ _conic_factor.defvjp(_conic_factor_fwd, _conic_factor_bwd)
 def _times_factors(
     rows: Sequence[Planes], gaussians: Gaussians, normalize_quats: bool
 ) -> list[Planes]:
-    """Returns rows @ A R diag(s), for 2 x 3 rows of planes."""
+    """Returns rows @ A R diag(s), 2 x 3 planes. rows: 2 x 3 planes."""
     if gaussians.deformations is not None:
         entries = _planes(gaussians.deformations.reshape(-1, 9))
         rows = _times(rows, [entries[:3], entries[3:6], entries[6:]])
@@ -298,7 +303,7 @@ def _times_factors(
 
 
 def _rotation_planes(quats: Float[Array, "g 4"]) -> list[Planes]:
-    """Returns the rotation matrices of quaternions as planes, the same numbers as
+    """Returns the rotation matrices of quaternions as 3 x 3 planes, with the same numbers as
     `quaternion.to_matrix`.
     """
     w, x, y, z = _planes(quats)
@@ -315,11 +320,11 @@ def _times(rows: Sequence[Planes], matrix: Sequence[Planes]) -> list[Planes]:
 
 @jax.custom_vjp
 def _planes(columns: Array) -> Planes:
-    """Splits columns (g, c) into c planes of (g,).
+    """Returns the c columns of an array (g, c), as planes of (g,).
 
     The gradient joins the planes by selection. Autodiff's concatenation (or sum of padded planes)
-    gets fused with the expressions that it joins, and XLA's CPU backend then evaluates their common
-    parts anew at each use: measured, 50 to 100 times slower.
+    gets fused with the expressions that it joins. XLA's CPU backend then evaluates their common
+    parts anew at each use, which was measured to be 50 to 100 times slower.
     """
     return [columns[:, i] for i in range(columns.shape[1])]
 

@@ -1,9 +1,9 @@
-"""The image by its definition: every Gaussian on every pixel, one after the other. The oracle of
-`splatting`.
+"""Draws the image by its definition: every Gaussian on every pixel, one after the other. It is the
+oracle of `splatting`.
 
-Shares no code with the tiled renderer: its projection multiplies plain matrices, its compositing is
-the loop of the formula, its gradients are autodiff's. With a_j the columns of M and C = cov2d = M
-M^T + eps2d I, the exponent is
+It shares only small functions with the tiled renderer, such as the checks of arguments. Its
+projection multiplies plain matrices, its compositing is the loop of the formula, and its gradients
+are autodiff's. With a_j the columns of M and C = cov2d = M M^T + eps2d I, the exponent is
 
     d^T C^-1 d = (sum_j (a_j x d)^2 + eps2d |d|^2) / det C,
     det C      = sum_i<j (a_i x a_j)^2 + eps2d |M|^2 + eps2d^2,
@@ -47,7 +47,8 @@ def render_reference(
     """Draws the image of `render` by its definition, without tiles or buffers, in the precision of
     its arguments.
 
-    Of `config`, only what decides on what is drawn is read. Values are not checked.
+    Footprints never end: `radius_sigma` and `square` of `config` are ignored, and so are buffers
+    and schedule. Values are not checked.
 
     Args:
         gaussians: as `render`; float64 arrays give float64 images.
@@ -78,7 +79,7 @@ def _reference(
     features: Array | None,
     shifts: Array | None,
 ) -> Rendering:
-    """Draws all Gaussians on all pixels, see the module."""
+    """Returns the rendering of all Gaussians on all pixels, see the module."""
     # Gaussians on the image: centres, axes, opacities as they are drawn
     centers, axes, depths, visible = _project(gaussians, camera, config)
     if shifts is not None:
@@ -161,7 +162,8 @@ def _project(
     gaussians: Gaussians, camera: Camera, config: SplatConfig
 ) -> tuple[Array, Array, Array, Array]:
     """Returns the centres (g, 2), axes (g, 2, 3) and depths (g,) of projected Gaussians, and
-    whether each is drawn. Gaussians that are not drawn get depth 1.
+    whether each is drawn. Gaussians that are too near, behind the camera or beyond the reach of its
+    lens get depth 1.
 
     Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + eps2d
     I.
@@ -244,8 +246,8 @@ def _pixel(p: Float[Array, "3"], camera: Camera) -> Float[Array, "2"]:
 
 
 def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
-    """Returns the real spherical harmonics of degrees 1 to `degree` of unit vectors: N P_l^m (cos m
-    phi, sin m phi), by recurrence.
+    """Returns the real spherical harmonics of degrees 1 to `degree` at unit vectors, (g, k). They
+    are N P_l^m (cos m phi, sin m phi), computed by recurrence.
     """
     x, y, z = sight.T
     # of m phi, times sin(theta)^m, which P leaves out
@@ -271,13 +273,13 @@ def _harmonics(sight: Float[Array, "g 3"], degree: int) -> Float[Array, "g k"]:
 
 
 def _determinant(axes: Float[Array, "g 2 3"], eps2d: Array | float) -> Float[Array, " g"]:
-    """Returns the determinant of axes axes^T + eps2d I, (g,), by Cauchy-Binet. For needles the
-    entries of the matrix cancel, even in float64.
+    """Returns the determinant of axes axes^T + eps2d I, (g,), by the formula of Cauchy and Binet.
+    For needles the entries of the matrix would cancel, even in float64.
     """
     pairs = _cross(axes[..., jnp.asarray([0, 1, 2])], axes[..., jnp.asarray([1, 2, 0])])
     return jnp.sum(pairs**2, axis=-1) + eps2d * jnp.sum(axes**2, axis=(-1, -2)) + eps2d**2
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Returns cross products of the columns of two (..., 2, n): (..., n)."""
+    """Returns the cross products of the columns of a and b, (..., n). a, b: (..., 2, n)."""
     return a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :]

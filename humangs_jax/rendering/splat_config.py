@@ -3,9 +3,10 @@ pytree without leaves.
 
 Two rasterizers set the conventions: INRIA's diff-gaussian-rasterization
 (https://github.com/graphdeco-inria/diff-gaussian-rasterization) and gsplat
-(https://github.com/nerfstudio-project/gsplat). Where they differ, ours are those of gsplat, with
-one exception: nothing is cut at three standard deviations. A footprint ends where its alpha falls
-below `ALPHA_MIN`, so the image follows from the formula and not from a bounding box.
+(https://github.com/nerfstudio-project/gsplat). Where they differ, ours are those of gsplat. Two
+points differ from both. Alphas are clamped at `ALPHA_MAX`, and nothing is cut at three standard
+deviations: a footprint ends where its alpha falls below `ALPHA_MIN`, so the image follows from the
+formula and not from a bounding box.
 """
 
 import dataclasses
@@ -62,8 +63,8 @@ of this or less. INRIA and gsplat have the same value.
 """
 
 LARGEST_FOOTPRINT = 1e9
-"""Longest axis of a projected Gaussian, pixels. Gaussians with a longer axis are not drawn, because
-its fourth power could overflow float32.
+"""Largest coordinate of the axes (one standard deviation long) of a projected Gaussian, pixels.
+Gaussians with a larger one are not drawn, because its fourth power could overflow float32.
 """
 
 
@@ -81,7 +82,8 @@ class SplatConfig:
     antialiased: bool = False
     """Whether opacities are dimmed as the added variance enlarges the footprint, so that the total
     weight of a Gaussian stays the same (gsplat's "antialiased"; Mip-Splatting's 2D filter).
-    Gaussians with a `pixel_footprint` are always dimmed, by their part.
+    Gaussians with a `pixel_footprint` are always dimmed, but only where a pixel of the image is
+    larger, at their depth, than `pixel_footprint`.
     """
     alpha_min: Annotated[float, Range(1e-12, 1)] = ALPHA_MIN
     """Smaller alphas are skipped."""
@@ -95,8 +97,9 @@ class SplatConfig:
     )
     """A pixel ends before its transmittance would fall to this."""
     jacobian_margin: Spread | None = None
-    """None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat. It applies to
-    cameras without lens.
+    """None: the exact Jacobian. A number: the Jacobian is evaluated no farther beyond the border of
+    the image than this fraction of half the field of view. INRIA and gsplat have 0.3. It applies to
+    pinhole cameras without distortion.
     """
     normalize_quats: bool = True
     """Whether quaternions are normalised. INRIA's rasterizer does not."""
@@ -106,13 +109,15 @@ class SplatConfig:
         gain="14 %, 27 %, 35 % of the time",
         measured="performance.md",
     )
-    """Number of standard deviations at which footprints end. None: they end where alpha falls below
-    alpha_min, so that nothing is lost. Smaller values draw faster. A splat is drawn on all tiles
-    that its footprint meets, so with a number the image depends on tile_size.
+    """Number of standard deviations at which footprints end, unless alpha falls below alpha_min
+    before. None: footprints end where alpha falls below alpha_min, so that nothing is lost. Smaller
+    values draw faster. A splat is drawn on all tiles that its footprint meets, so with a number the
+    image depends on tile_size.
     """
     square: bool = False
     """Whether footprints are those of INRIA: squares around the splat, on tiles as INRIA counts
-    them. Half a side is `radius_sigma` times the larger standard deviation, rounded up to pixels.
+    them. Half a side is `radius_sigma`, which must not be None, times the larger standard
+    deviation, rounded up to pixels.
     """
     visibility: bool = knob(
         False,
@@ -127,7 +132,7 @@ class SplatConfig:
     means2d: bool = False
     """Whether `Rendering.means2d`, the centres on the image, is returned."""
     radii: bool = False
-    """Whether `Rendering.radii`, half the sides of footprints, is computed."""
+    """Whether `Rendering.radii`, half the width and height of each footprint, is computed."""
     depth_sum: bool = False
     """Whether `Rendering.depth_sum`, gsplat's "D", is computed."""
     depth_median: bool = False
@@ -148,7 +153,9 @@ class SplatConfig:
     max_rows: Capacity | None = knob(
         None, cost="as max_pairs", gain="a little time", measured="performance.md"
     )
-    """Room for (splat, row of tiles) pairs. None: as many as pairs, which is enough in practice."""
+    """Room for (splat, row of tiles) pairs. None: as many as `max_pairs`, which is enough in
+    practice. An eager call that measures pairs measures these, too.
+    """
     warn_overflow: bool = False
     """Whether traced calls log a warning when something did not fit. It adds a callback to the
     program.
@@ -160,7 +167,8 @@ class SplatConfig:
         measured="performance.md",
     )
     """Side of a tile, pixels. This field and the next ones are the schedule. They change the time,
-    and the image only by rounding.
+    and the image only by rounding. With a radius_sigma, tile_size also decides where splats are cut
+    off.
     """
     block: Chunk = 32
     """Number of tiles that are composited together, on CPUs only. From 16 to 64 times differ by 4

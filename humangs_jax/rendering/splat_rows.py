@@ -32,9 +32,7 @@ R11 = 4
 LOG_OPACITY = 5
 """Column with the logarithm of the opacity."""
 FEATURES = slice(6, None)
-"""Columns of red, green, blue, z, and any further features. Their number is static, because XLA
-unrolls them.
-"""
+"""Columns of red, green, blue, z, and any further features."""
 Z = 9
 """Column with z."""
 HALF = 0.5
@@ -47,8 +45,8 @@ def pack_splats(
     features: Float[Array, "g n"],
     alpha_min: float,
 ) -> Float[Array, "g width"]:
-    """Packs splats into rows: x, y (pixels), r00, r01, r11 (1 / pixels), log opacity, features. All
-    numbers are finite, also those of splats that are not drawn.
+    """Returns the rows of splats, (g, 6 + n): x, y (pixels), r00, r01, r11 (1 / pixels), log
+    opacity, features. Splats that are not drawn get the log opacity 0, so that it is finite.
     """
     p = projected
     drawn = p.visible & (opacities >= alpha_min)
@@ -57,8 +55,8 @@ def pack_splats(
 
 
 class Composited(NamedTuple):
-    """What compositing lists of splats gives: values at p pixels of each of t tiles, and values of
-    each of g splats.
+    """The result of compositing: values at p pixels of each of t tiles, and values of each of g
+    splats.
     """
 
     features: Float[Array, "t n p"]
@@ -66,19 +64,21 @@ class Composited(NamedTuple):
     transmittance: Float[Array, "t p"]
     """The final T, (t, p); 1 where lists are empty."""
     lengths: Int[Array, " t"]
-    """Number of splats of each list that were read until all pixels of its tile had ended, (t,)."""
+    """Number of splats of each list that were read, (t,). Reading stops at the end of the list, or
+    after the chunk in which the last pixels of the tile end.
+    """
     peaks: Float[Array, " g"]
     """The largest w of each splat, (g,). 0 unless `config.visibility`."""
     medians: Float[Array, "t p"] | None
-    """The z of the splat at which T falls to one half, (t, p), metres. Infinite where it never
-    does. Lists run front to back, so this is the smallest z behind which T is one half or less.
+    """The z of the splat behind which T is at most one half for the first time, (t, p), metres.
+    Infinite where T stays above one half. Lists run front to back, so this is the smallest such z.
     None unless `config.depth_median`.
     """
 
 
 def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """Wraps a function of (splats, items, starts, further arrays per tile...) so that `vmap` calls
-    it once, with the tiles of all images together.
+    """Returns the function, wrapped so that `vmap` calls it once, with the tiles of all images
+    together. Its arguments are (splats, items, starts, further arrays per tile...).
 
     The function must return arrays per tile or per splat. They are divided among the images
     afterwards.
@@ -112,11 +112,12 @@ def take_chunk(
 ) -> tuple[
     Int[Array, "b k"], Float[Array, "b k width"], Float[Array, "2 b k"], Float[Array, "b k p"]
 ]:
-    """Takes the first k splats of each of b lists, `items[starts : starts + counts]`, which lie on
-    `tiles`.
+    """Returns the first k splats of each of b lists. A list is `items[start : start + count]`, and
+    lies on its tile of `tiles`.
 
-    Returns the numbers of the splats (g past the end of a list), their rows, their centres relative
-    to that of the tile, pixels, and raw alphas (0 past the end).
+    The results are the numbers of the splats (b, k), which are g past the end of a list; their rows
+    (b, k, width); x and y of their centres (2, b, k), relative to the tile's centre, pixels; and
+    their raw alphas (b, k, p), which are 0 past the end.
     """
     # numbers and rows of the splats
     slot = jnp.arange(k, dtype=jnp.int32)
@@ -144,8 +145,8 @@ def take_chunk(
 def largest_weights(
     weights: Float[Array, "b k p"], tiles: Int[Array, " b"], grid: TileGrid
 ) -> Float[Array, "b k"]:
-    """Returns the largest weight of each splat on those pixels of its tile that lie inside the
-    image.
+    """Returns the largest weight of each splat on the pixels of its tile that lie inside the image,
+    (b, k).
     """
     place = tiles % grid.tiles
     x, y = (0.5 * grid.tile_size + offset for offset in grid.offsets())

@@ -3,12 +3,13 @@
 
 Projected Gaussians -> depth order -> lists by tile -> composited tiles -> image over a background.
 `reference` draws the same image by the definition. Gradients reach means, quats, scales, opacities,
-colors, harmonics, deformations, the background, and K and cam_from_world of the camera.
+colors, harmonics, deformations, features, shifts, the background, and K and cam_from_world of the
+camera.
 
 Shapes are static, so how many (splat, tile) pairs fit is decided before drawing. A call outside of
-transformations measures what its scene needs. A traced call takes `default_pairs`, or what
-`plan_buffers` has measured on a scene like its own. What does not fit is counted
-(`Rendering.overflow`), and eager calls raise `BufferOverflowError`.
+transformations measures what its scene needs. A traced call takes the sizes of its configuration,
+which `plan_buffers` measures on a similar scene, or else `default_pairs`. Pairs that do not fit are
+counted (`Rendering.overflow`), and eager calls raise `BufferOverflowError`.
 """
 
 import dataclasses
@@ -94,19 +95,19 @@ class Rendering(Batchable):
     means2d: Float[Array, "g 2"] | None = None
     """Centres on the image, (g, 2), pixels; None unless `SplatConfig.means2d`."""
     radii: Float[Array, "g 2"] | None = None
-    """Half the width and height of the footprints, (g, 2), pixels, 0 where nothing is drawn. They
-    are not differentiable. None unless `SplatConfig.radii`.
+    """Half the width and height of the footprints, (g, 2), pixels; 0 for Gaussians that are not
+    drawn. They are not differentiable. None unless `SplatConfig.radii`.
     """
     depth_sum: Float[Array, "h w"] | None = None
-    """Sum of z by weight, (h, w), metres: depth times alpha. None unless
+    """Sum of z times weight, (h, w), metres, which is depth times alpha. None unless
     `SplatConfig.depth_sum`.
     """
     depth_median: Float[Array, "h w"] | None = None
-    """z of the Gaussian at which half of the light is left, (h, w), metres; 0 where more than half
-    passes. It is not differentiable. None unless `SplatConfig.depth_median`.
+    """z of the first Gaussian behind which at most half of the light is left, (h, w), metres; 0
+    where more than half passes. It is not differentiable. None unless `SplatConfig.depth_median`.
     """
     distortion: Float[Array, "h w"] | None = None
-    """Sum over pairs of w_i w_j (z_i - z_j)^2, (h, w), squared metres (2DGS,
+    """Sum over all i and j of w_i w_j (z_i - z_j)^2, (h, w), squared metres (2DGS,
     https://arxiv.org/abs/2403.17888, eq. 13, with squares). None unless `SplatConfig.distortion`.
     """
 
@@ -136,32 +137,33 @@ def render(
 
     After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079).
 
-    Called directly, arguments are checked and buffers sized to the scene. Inside `jit`, `vmap` and
-    `grad` values are not checked, and buffers come from `config`: `plan_buffers` sizes them once.
-    Pairs of splats and tiles that do not fit are not drawn there; they are counted in
-    `Rendering.overflow`, which `SplatConfig.warn_overflow` logs. Conventions are gsplat's
-    (`rendering.splat_config`).
+    A call outside of transformations checks its arguments, and sizes buffers to the scene if
+    `config.max_pairs` is None. Inside `jit`, `vmap` and `grad` values are not checked, and buffers
+    come from `config`; `plan_buffers` sizes them once. Pairs of splats and tiles that do not fit
+    are not drawn there. `Rendering.overflow` counts them, and `SplatConfig.warn_overflow` logs
+    them. Conventions are gsplat's (`rendering.splat_config`).
 
     Args:
         gaussians: one set of g, metres.
         camera: one camera; its size is the image's.
         config: what is drawn, and the buffers; or the name of one of `SPLAT_PRESETS`.
         background: (3,) RGB, three numbers, or a color's name. None: white.
-        features: (g, n) any other numbers of the Gaussians, drawn with the colors: normals, labels,
-            what a network has learned.
-        shifts: (g, 2) pixels that are added to the centres on the image. The gradient by zeros is
-            what gsplat's `means2d.grad` holds.
+        features: (g, n) other numbers of the Gaussians, drawn as the colors are, such as normals,
+            labels or learned features.
+        shifts: (g, 2) pixels that are added to the centres on the image. The gradient with respect
+            to shifts of 0 is what gsplat's `means2d.grad` holds.
 
     Returns:
-        A `Rendering`: rgb (h, w, 3), alpha, depth, features, overflow, visibility, and what
+        A `Rendering`: rgb (h, w, 3), alpha, depth, overflow, features if there are any, and what
         `config` asks for.
 
     Raises:
         TypeError: for arguments of other classes.
         ValueError: for a batch of cameras or of sets, shapes that do not fit each other, a
             background that is no color, values that are not finite, opacities outside of [0, 1],
-            and negative scales or focal lengths.
-        BufferOverflowError: if `config.max_pairs` or `max_rows` is too small.
+            negative scales, focal lengths that are not positive, and an unknown name of a preset.
+        BufferOverflowError: outside of transformations, if `config.max_pairs` or `max_rows` is too
+            small.
 
     Examples:
         >>> rendering = hg.render(gaussians, camera)
@@ -186,11 +188,10 @@ def render_views(
     config: SplatConfig | str = DEFAULT_CONFIG,
     background: Background = None,
 ) -> Rendering:
-    """Draw every camera of a batch (leading axis v), one after the other: working memory does not
-    grow with v.
-
-    What a gradient keeps of each view does. `jax.vmap` of `render` draws all views at once and
-    holds the buffers of all. On CPUs it is as fast, but slower with gradients of many views.
+    """Draw every camera of a batch (leading axis v), one after the other. Working memory does not
+    grow with v, but the values that a gradient keeps do. `jax.vmap` of `render` draws all views at
+    once and holds the buffers of all views. On CPUs it is as fast, but slower with gradients of
+    many views.
 
     Args:
         gaussians: as `render`.
@@ -202,7 +203,7 @@ def render_views(
         A `Rendering` with a leading axis v.
 
     Raises:
-        ValueError: as `render`; also for a single camera or several batch axes.
+        ValueError: as `render`, and for a single camera or several batch axes.
 
     Examples:
         >>> images = hg.render_views(gaussians, cameras).rgb  # (v, h, w, 3)
@@ -225,7 +226,7 @@ def visible_gaussians(
     """Returns which Gaussians weigh at least `threshold` on some pixel of some camera, (g,).
     `cameras` has one leading axis.
 
-    The other Gaussians can be left out for cameras like these: an avatar's inside is never seen.
+    The other Gaussians, such as those inside of an avatar, can be left out for similar cameras.
     """
     visibility = render_views(
         gaussians, cameras, dataclasses.replace(splat_config(config), visibility=True)
@@ -323,7 +324,7 @@ def _own_in_batch(
 def with_background(
     gaussians: Gaussians, cameras: Camera, background: Background
 ) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
-    """Returns Gaussians, cameras and the background's color (3,), all at least float32.
+    """Returns Gaussians, cameras and the background's color (3,), all in float32 or a wider type.
 
     Raises: ValueError if the background is no color.
     """
@@ -331,7 +332,7 @@ def with_background(
 
 
 def features_of(features: Float[Array, "g n"] | None, count: int) -> Float[Array, "g n"] | None:
-    """Returns the features, at least float32. None stays None.
+    """Returns the features in float32 or a wider type. None stays None.
 
     Raises: ValueError unless there is one row for each of `count` Gaussians.
     """
@@ -369,8 +370,8 @@ def _color(background: object, dtype: np.dtype) -> Array:
 
 
 def _of_bytes(color: Any) -> bool:
-    """Says whether an array of integers has a value above 1, as colors in bytes have. False for
-    traced values, which cannot be read.
+    """Returns whether an array of integers has a value above 1, as colors in bytes have. False for
+    traced values, which cannot be read, and for floats.
     """
     if isinstance(color, Tracer) or jnp.issubdtype(color.dtype, jnp.inexact):
         return False
@@ -499,8 +500,8 @@ def _blank(
 
 
 def _powers(behind: Float[Array, " g"], visible: Array) -> Float[Array, "g 2"]:
-    """Returns z and z^2 of each Gaussian, (g, 2). z is relative to the mean of the visible
-    Gaussians, because small numbers have small squares.
+    """Returns z and z^2 of each Gaussian, (g, 2). z is relative to the mean z of the visible
+    Gaussians, because small numbers have small squares. It is 0 for the others.
     """
     count = jnp.maximum(jnp.sum(visible), 1)
     z = jnp.where(visible, behind - lax.stop_gradient(jnp.sum(behind) / count), 0.0)
@@ -518,8 +519,9 @@ def _blended(
 ) -> Rendering:
     """Returns the rendering of composited tiles over the background.
 
-    features: (t, 4 + n, p), premultiplied rgb, z - nearest, and n others. transmittance: (t, 1, p),
-    the share of light that passes all Gaussians.
+    features: (t, 4 + n, p), premultiplied rgb, z - nearest, and n others, of which the last two are
+    the `_powers` if `config.distortion`. transmittance: (t, 1, p), the share of light that passes
+    all Gaussians.
 
     Each output is computed separately, tile by tile. An output that nobody reads then costs
     nothing, nor does its gradient.

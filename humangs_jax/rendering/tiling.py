@@ -1,24 +1,26 @@
-"""Tiles: finds which splats (or triangles) touch which square of pixels, and keeps one list per
-tile in one buffer of fixed size.
+"""Finds which splats touch which tile, a square of pixels, and keeps one list per tile in one
+buffer of fixed size.
 
-A rasterizer takes five steps. All have static shapes, and none is differentiated:
+Splatting takes five steps. All have static shapes, and no gradient passes the first three:
 
 1. `expand` the counts of the tiles that each item touches: slot -> item. Splats take two such
    steps, item -> rows of tiles -> tiles (`emit_pairs`).
 2. `sort_into_tiles` sorts the (tile, item) pairs by tile, and by item inside a tile. Number the
    items by depth first (`depth_order`), and every list runs front to back.
 3. `blocks_by_length` orders tiles by falling list length. A block of consecutive tiles then has
-   lists of about the same length, and empty tiles come last and are never visited.
-4. The rasterizer loops over blocks and over chunks of their lists. The pixels of a tile are one
-   axis of `tile_size`^2 values, row by row, at `grid.offsets` from the tile's centre.
+   lists of about the same length. Empty tiles come last, and blocks of empty tiles are not visited.
+   Only the schedule for CPUs uses blocks.
+4. Compositing loops over blocks and over chunks of their lists. The pixels of a tile are one axis
+   of `tile_size`^2 values, row by row, at `grid.offsets` from the tile's centre.
 5. `tiles_to_image` puts the image together.
 
-What does not fit in a buffer is counted: `Expansion.needed` is exact whatever the capacity. Where
-the last row and column of tiles reach beyond the image, the pixels outside are cut off.
+What does not fit in a buffer is counted: `Expansion.needed` is exact up to `SUM_LIMIT`, whatever
+the capacity. Where the last row and column of tiles reach beyond the image, the pixels outside are
+cut off.
 
 A splat's footprint is the ellipse d^T cov2d^-1 d <= reach around its centre, outside of which alpha
 < alpha_min. The footprint meets a tile if it meets the rectangle spanned by the tile's pixel
-centres. With D the determinant of cov2d, the ellipse at height dy above its centre spans
+centres. With D the determinant of cov2d, the ellipse spans, dy below its centre,
 
     dx = (xy / yy) dy -+ sqrt(D / yy (reach - dy^2 / yy)),     |dy| <= sqrt(reach yy).
 
@@ -38,9 +40,7 @@ from humangs_jax.rendering.projection import ProjectedGaussians
 from humangs_jax.rendering.splat_config import ALPHA_MIN, SplatConfig
 
 SUM_LIMIT = 1 << 30
-"""Running sums stop here instead of wrapping past 2^31. The limit is far above any buffer, so a sum
-of this size only says "too many".
-"""
+"""Running sums stop here instead of wrapping past 2^31. A sum of this size only says "too many"."""
 
 _ROW = 64
 """Width of the triangular products in `cumsum`: 64 numbers below 2^18 add up exactly in float32."""
@@ -228,7 +228,7 @@ def _bits_for(count: int) -> int:
 
 
 def sort_keys(keys: UInt[Array, " n"]) -> UInt[Array, " n"]:
-    """Returns keys in ascending order.
+    """Returns the keys in ascending order.
 
     Equal keys are identical, so the sort need not be stable. XLA's stable sort is used on CPUs,
     where it is a third faster; elsewhere it would have to carry the positions along.
@@ -245,8 +245,8 @@ def sort_into_tiles(
     `tile_count` ("no tile") are left out.
 
     If the tile number and the item number fit together in a uint32, one sort of such keys is enough
-    (sorting a key with a payload costs several times as much). Otherwise the pairs are sorted by
-    two keys.
+    (sorting keys with a payload costs several times as much). Otherwise the pairs are sorted by two
+    keys.
     """
     bits = _bits_for(item_count)
     if (tile_count + 1) << bits <= 1 << 32:
@@ -354,7 +354,7 @@ class _Bands(NamedTuple):
     height: Float[Array, " g"]
     """Half the height of the ellipse, pixels."""
     tip: Float[Array, " g"]
-    """How high above the centre the rightmost point is, pixels."""
+    """y of the rightmost point, relative to the centre, pixels. Positive is down."""
     slope: Float[Array, " g"]
     """xy / yy, no unit."""
     ratio: Float[Array, " g"]
@@ -367,8 +367,8 @@ class _Bands(NamedTuple):
     def columns(
         self, row: Int[Array, " g"], grid: TileGrid
     ) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
-        """Returns the first and last tile column that each ellipse touches within row `row`, (g,)
-        each.
+        """Returns the first and the last column of tiles that each ellipse touches in one row of
+        tiles, (g,) each. row: number of that row for each ellipse.
         """
         size = grid.tile_size
         top = jnp.maximum(row * size + 0.5 - SLACK - self.y, -self.height)
@@ -412,8 +412,8 @@ class Squares(NamedTuple):
     def columns(
         self, row: Int[Array, " g"], grid: TileGrid
     ) -> tuple[Int[Array, " g"], Int[Array, " g"]]:
-        """Returns the first and last tile column of each square, (g,) each. They are the same in
-        all rows.
+        """Returns the first and the last column of tiles that each square touches, (g,) each. They
+        are the same in all rows.
         """
         return self._range(self.x, grid.tile_size, grid.columns)
 
@@ -433,7 +433,7 @@ class Pairs(NamedTuple):
     splats: Int[Array, " capacity"]
     """Splat of each pair, (capacity,)."""
     needed: Int[Array, ""]
-    """Number of pairs that the scene has in all."""
+    """Number of pairs that the image needs (saturates at `SUM_LIMIT`)."""
     overflow: Int[Array, ""]
     """Number of pairs that did not fit and are missing here."""
 
@@ -462,8 +462,8 @@ def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
 def squared_reach(
     opacities: Float[Array, " g"], alpha_min: float = ALPHA_MIN
 ) -> Float[Array, " g"]:
-    """Returns the d^T cov2d^-1 d, (g,), at which a splat's alpha falls to `alpha_min`. It is 0 for
-    a splat whose opacity is not above `alpha_min`.
+    """Returns the value of d^T cov2d^-1 d at which each splat's alpha falls to `alpha_min`, (g,).
+    It is 0 for a splat whose opacity is not above `alpha_min`.
 
     No gradient passes.
     """
@@ -501,8 +501,9 @@ def footprints_by(
 ) -> Footprints | Squares:
     """Returns the footprints that a configuration asks for.
 
-    These are ellipses that end at `alpha_min`, or at `radius_sigma` standard deviations if that is
-    nearer, or squares.
+    They are squares if `config.square`. Otherwise they are ellipses that end where alpha falls to
+    `alpha_min`, or at `radius_sigma` standard deviations if that is nearer. opacities: as they are
+    drawn, (g,).
     """
     reach = squared_reach(opacities, config.alpha_min)
     if config.radius_sigma is None:
@@ -570,14 +571,18 @@ def emit_pairs(
 
 
 def _first(v: Array, tile_size: int, tiles: Size) -> Array:
-    """Returns the first tile whose last pixel centre is not left of v (or above v, for rows)."""
+    """Returns the first column (or row) of tiles whose last pixel centre is not left of v (or above
+    v).
+    """
     return jnp.clip(jnp.ceil((v - (tile_size - 0.5) - SLACK) / tile_size), 0, tiles).astype(
         jnp.int32
     )
 
 
 def _last(v: Array, tile_size: int, tiles: Size) -> Array:
-    """Returns the last tile whose first pixel centre is not right of v (or below v, for rows)."""
+    """Returns the last column (or row) of tiles whose first pixel centre is not right of v (or
+    below v).
+    """
     return jnp.clip(jnp.floor((v - 0.5 + SLACK) / tile_size), -1, tiles - 1).astype(jnp.int32)
 
 

@@ -1,11 +1,12 @@
-"""Makes UV atlases: a mesh is cut into charts that lie flat without folding over, and the charts
+"""Makes UV atlases. A mesh is cut into charts that lie flat without folding over, and the charts
 are packed into the unit square.
 
 A chart is a connected set of faces of one piece that look towards about the same side, projected
-along the mean of their normals. Where a chart folds over itself, the hidden faces become separate
-charts. They are found by rasterizing the charts front to back and back to front. Charts are placed
-as bitmaps, the largest first, each at the first free place. All charts have one scale, times the
-density that the caller asks for.
+along the mean of their normals (or along one of `SIDES` if the mean looks away from a face). Where
+a chart folds over itself, the hidden faces become separate charts. To find them, the charts are
+rasterized once with the highest face in front and once with the lowest. Charts are placed as
+bitmaps, the largest first, each at the first free place. All charts have one scale, which is
+multiplied by the density that the caller asks for.
 
 Texture coordinates follow `rendering.mesh.rasterizer.sample_texture`: u to the right, v up.
 """
@@ -61,7 +62,7 @@ class Atlas:
     size: int
     """Side of the texture, texels."""
     texel: float
-    """Metres of (flat) chart in a texel where the density is 1."""
+    """Side of a texel on the flat chart where the density is 1, metres."""
 
 
 def unwrap(
@@ -71,10 +72,11 @@ def unwrap(
     size: int,
     density: Float[np.ndarray, " f"],
 ) -> Atlas:
-    """Cuts a mesh into charts and packs them into a texture of size x size texels.
+    """Returns the atlas of a mesh: cuts the mesh into charts and packs them into a texture of size
+    x size texels.
 
-    pieces: number of the piece of each face; no chart extends over two pieces. density: texels per
-    metre of each face relative to others, the same all over a piece.
+    pieces: number of each face's piece. No chart extends over two pieces. density: texels per metre
+    on each face, relative to other faces. It must be the same all over a piece.
 
     Raises: ValueError for a size that is no multiple of `CELLS`.
     """
@@ -104,7 +106,9 @@ class _Flat:
     """Charts before packing."""
 
     points: np.ndarray
-    """Points of all charts, (u, 2), metres from the lower left corner of their chart."""
+    """Points of all charts, (u, 2), metres times density, from the lower left corner of their
+    chart.
+    """
     heights: np.ndarray
     """Heights of the points above the plane of their chart, (u,), metres."""
     faces: np.ndarray
@@ -130,7 +134,7 @@ def edges_of(faces: Faces) -> Int[np.ndarray, "e 2"]:
 def fill_gaps(
     image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w c"]:
-    """Returns the image with each unknown texel replaced by the nearest known one."""
+    """Returns the image with each unknown texel replaced by the nearest known texel."""
     from scipy.ndimage import distance_transform_edt
 
     rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
@@ -163,8 +167,8 @@ def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _connected(count: int, pairs: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Returns the number of the connected set that each face belongs to, (f,). A set has one
-    label.
+    """Returns the number of the connected set that each face belongs to, (f,). All faces of a set
+    have one label. count: number of faces. pairs: faces that share an edge.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -182,8 +186,9 @@ def _flatten(
     sides: np.ndarray,
     density: np.ndarray,
 ) -> _Flat:
-    """Returns charts laid into planes across their mean normals. Each is turned so that its box is
-    small, and scaled by its density.
+    """Returns the charts laid into planes across their mean normals, or across a side where the
+    mean normal looks away from a face. Each chart is turned so that its box is small, and scaled by
+    its density.
     """
     count = int(charts.max()) + 1
     # a vertex is a point in each chart that it belongs to
@@ -216,8 +221,8 @@ def _flatten(
 
 
 def _turned(flat: np.ndarray, owner: np.ndarray, count: int, angles: int = 8) -> np.ndarray:
-    """Returns the points (u, 2) with every chart turned by the one of a few angles that makes its
-    bounding box smallest, the wide side to the right.
+    """Returns the points (u, 2) with every chart turned. Of `angles` angles, each chart takes the
+    one that makes its bounding box smallest, with the wide side to the right.
 
     flat: points of the charts, (u, 2). owner: chart of each point.
     """
@@ -236,7 +241,9 @@ def _turned(flat: np.ndarray, owner: np.ndarray, count: int, angles: int = 8) ->
 
 
 def _extreme(function: np.ufunc, values: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
-    """Returns the smallest or the largest values of each chart, (charts, 2), of values (u, 2)."""
+    """Returns the smallest or the largest coordinates of each chart, (charts, 2). function:
+    `np.minimum` or `np.maximum`. values: points of the charts, (u, 2). owner: chart of each point.
+    """
     worst = np.inf if function is np.minimum else -np.inf
     result = np.full((count, 2), worst)
     function.at(result, owner, values)
@@ -244,13 +251,13 @@ def _extreme(function: np.ufunc, values: np.ndarray, owner: np.ndarray, count: i
 
 
 def _sizes(flat: _Flat) -> np.ndarray:
-    """Returns widths and heights of the charts, (2, charts), metres."""
+    """Returns the widths and heights of the charts, (2, charts), metres times density."""
     return _extreme(np.maximum, flat.points, flat.point_charts, int(flat.charts.max()) + 1).T
 
 
 def _hidden(flat: _Flat, size: int) -> np.ndarray:
-    """Returns which faces lie below others of their chart, where charts overlap themselves,
-    (f,).
+    """Returns which faces lie below other faces of their chart, (f,). There are such faces where a
+    chart overlaps itself.
     """
     corners, scale = _shelves(flat, size)
     pixels = (flat.points * scale + corners[flat.point_charts]).astype(np.float32)
@@ -264,8 +271,8 @@ def _hidden(flat: _Flat, size: int) -> np.ndarray:
 
 
 def _shelves(flat: _Flat, size: int) -> tuple[np.ndarray, float]:
-    """Returns rough places of the charts (charts, 2), texels, and the scale, texels per metre.
-    Charts lie in rows of falling height.
+    """Returns rough places of the charts, (charts, 2), texels, and the scale in texels per metre.
+    The charts lie in rows, and the highest come first.
     """
     width, height = _sizes(flat)
     order = np.argsort(-height)
@@ -286,8 +293,11 @@ def _shelves(flat: _Flat, size: int) -> tuple[np.ndarray, float]:
 def _rasterize(
     pixels: np.ndarray, depth: np.ndarray | np.floating, faces: np.ndarray, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the face of every texel, (size, size), -1 for none, and the weights of its corners,
-    (size, size, 3). y points up, and row 0 is the top.
+    """Returns the face of every texel, (size, size), which is -1 where there is no face, and the
+    weights of the face's corners, (size, size, 3). Row 0 is the top.
+
+    pixels: points (u, 2), texels, y up. depth: of the points; the nearest face is taken. faces:
+    indices of points, (f, 3).
     """
     points = np.stack(
         [pixels[:, 0] * depth, (size - pixels[:, 1]) * depth, depth * np.ones(len(pixels))], 1
@@ -302,7 +312,8 @@ def _rasterize(
 
 
 def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s 3"]]:
-    """Returns the face that every texel shows, -1 for none, and the weights of the face's corners.
+    """Returns the face that every texel shows, which is -1 where there is no face, and the weights
+    of the face's corners.
 
     Row 0 is the top (v = 1).
     """
@@ -349,8 +360,8 @@ def _place(flat: _Flat, scale: float, size: int) -> np.ndarray | None:
 
 
 def _first_free(free: np.ndarray, mask: np.ndarray) -> tuple[int, int] | None:
-    """Returns the lowest (row, column) at which all cells of a bitmap are free. None if there is
-    none.
+    """Returns the first (row, column) at which all cells of a bitmap are free, by row, then column.
+    None if there is no such place.
     """
     rows, columns = (n - m + 1 for n, m in zip(free.shape, mask.shape, strict=True))
     if rows < 1 or columns < 1:

@@ -1,18 +1,19 @@
-"""Rasterizes triangle meshes: finds for every pixel centre which face is seen, where on that face,
-and how far away.
+"""Rasterizes triangle meshes. Finds for every pixel centre which face is seen, the place on the
+face, and the depth. Makes position maps from this.
 
 Conventions: cameras are OpenCV's, pixel centres are at +0.5, and depth is the camera's z. The
 nearest face wins, and of equally near faces the one with the lower index. Both sides of a face are
 seen. A face covers the pixel centres inside it AND on its edges. Faces without area in the image
-cover nothing. Faces that reach behind the near plane are dropped whole. Those that also reach in
-front of it may be missing from the image, and are counted in `Fragments.overflow`.
+cover nothing. A face with a corner at z <= near is dropped. If another of its corners is in front
+of the near plane, the image may lack the face, so `Fragments.overflow` counts it.
 
 Method: the rasterizer works by scanlines. Faces of a body cover a few pixels or none, so tiles of
 pixels times lists of faces would mostly test pixels that a face does not touch. Instead each face
 is expanded to its rows of pixel centres, and each row to the pixels of its span (see `_window`).
 These fragments meet in a z-buffer by two scatters: first the smallest depth of a pixel, then the
 smallest face number at that depth. Both levels run in steps of a fixed number of slots, and take as
-many steps as the mesh needs. So shapes are static, and no capacity can be exceeded.
+many steps as the mesh needs. So shapes are static, and the only limit is 2^30 rows of pixels of all
+faces.
 
 Watertightness: an edge function is computed relative to the pixel, (a - p) x (b - p), and the order
 of the ends a and b depends on their positions alone. Two faces that share an edge therefore compute
@@ -75,9 +76,7 @@ class Fragments(Batchable):
     is no face.
     """
     depth: Float[Array, "h w"]
-    """z in the frame of the camera, (h, w), in the units of the vertices; -1 where there is no
-    face.
-    """
+    """z in the camera's frame, (h, w), in the units of the vertices; -1 where there is no face."""
     overflow: Int[Array, ""]
     """Number of faces that may be missing from the image. They cross the near plane, have pixel
     positions that are not finite, or come after the first 2^30 rows of pixels.
@@ -92,7 +91,9 @@ def rasterize_mesh(
     camera: Camera,
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> Fragments:
-    """Returns the nearest face at every pixel centre of one camera. Use `jax.vmap` for batches."""
+    """Returns the nearest face at every pixel centre of one camera, a pinhole without distortion.
+    Use `jax.vmap` for batches. Raises: ValueError for a camera with a lens.
+    """
     vertices, camera = lax.stop_gradient((vertices, camera))
     if faces.shape[0] == 0 or vertices.shape[0] == 0:  # a face without area stands for no face
         vertices, faces = jnp.ones((1, 3), vertices.dtype), jnp.zeros((1, 3), jnp.int32)
@@ -126,8 +127,8 @@ def interpolate_attributes(
     attributes: Float[Array, "n c"],
     background: Float[Array, " c"],
 ) -> Float[Array, "h w c"]:
-    """Returns the attributes (h, w, c) interpolated over the seen surface; `background` where there
-    is no face.
+    """Returns the attributes interpolated over the seen surface, (h, w, c). They are `background`
+    where there is no face.
 
     faces: rows of `attributes` at the corners of each face, in the order of the rasterized faces.
     They need not be the faces that were rasterized: with texture faces and texture coordinates, the
@@ -146,7 +147,7 @@ def interpolate_attributes(
 
 
 def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3"]:
-    """Returns the pixel position x, y and the depth z of vertices, (n, 3).
+    """Returns the position x, y of vertices on the image, pixels, and their depth z, (n, 3).
 
     The products are written out, because matrix products have low precision on GPU and TPU.
     """
@@ -161,12 +162,16 @@ def _project(vertices: Float[Array, "n 3"], camera: Camera) -> Float[Array, "n 3
 
 
 def _first_pixel(low: Array, size: int) -> Array:
-    """Returns the first pixel whose centre is at `low` or after, clipped to [0, size]."""
+    """Returns the number of the first pixel whose centre is at `low` or after it, clipped to [0,
+    size].
+    """
     return jnp.clip(jnp.ceil(low - 0.5), 0, size).astype(jnp.int32)
 
 
 def _last_pixel(high: Array, size: int) -> Array:
-    """Returns the last pixel whose centre is at `high` or before, clipped to [-1, size - 1]."""
+    """Returns the number of the last pixel whose centre is at `high` or before it, clipped to [-1,
+    size - 1].
+    """
     return jnp.clip(jnp.floor(high - 0.5), -1, size - 1).astype(jnp.int32)
 
 
@@ -202,8 +207,9 @@ def _rows(
 
 
 def _spans(corners: Array, row: Array, width: int) -> tuple[Array, Array]:
-    """Returns the first column of the pixel centres in this row that may lie inside the face, and
-    their number.
+    """Returns the first column of the pixel centres that may lie inside a face in one row of
+    pixels, (n,), and the number of such columns, (n,). corners: of the face, (n, 9). row: number of
+    the row.
     """
     y = row.astype(corners.dtype) + 0.5
     left, right = jnp.full_like(y, jnp.inf), jnp.full_like(y, -jnp.inf)
@@ -283,8 +289,8 @@ def _z_buffer(
     height: int,
     config: RasterConfig,
 ) -> tuple[Array, Array]:
-    """Returns the depth and the face number of every pixel, (h w,) each: infinity and NO_FACE where
-    there is no face.
+    """Returns the depth and the face number of every pixel, (h w,) each. They are infinity and
+    `NO_FACE` where there is no face.
     """
 
     def draw_rows(state):
@@ -363,7 +369,7 @@ def sample_texture(
 # through a Gouraud shader with a point light.
 
 BACKGROUND = 1.0
-"""Each coordinate of the position of pixels beside the body, normalised units."""
+"""Value of each coordinate of the position at pixels beside the body, normalised units."""
 BACKGROUND_DEPTH = -1.0
 """Depth of pixels beside the body."""
 
@@ -398,8 +404,8 @@ def gouraud_position_map(
 
 @jax.jit
 def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> Float[Array, "n 3"]:
-    """Returns unit normals, (n, 3): the direction of the sum of (v1 - v0) x (v2 - v0) over the
-    faces at a vertex. A normal is 0 where this sum is.
+    """Returns the unit normal of each vertex, (n, 3). It is the direction of the sum of the cross
+    products of v1 - v0 and v2 - v0 over the vertex's faces. If the sum is 0, the normal is 0.
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normals = jnp.cross(b - a, c - a)
@@ -409,8 +415,8 @@ def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> F
 
 @jax.jit
 def _light(albedo: Array, points: Array, normals: Array, eye: Array) -> Array:
-    """Returns the colors of vertices lit by Phong's model: ambient and diffuse light times the
-    albedo, plus a white highlight.
+    """Returns the colors of vertices by Phong's model, (n, 3): ambient and diffuse light times the
+    albedo, plus a white highlight. eye: the camera's centre, (3,), normalised units.
     """
 
     def dot(a, b):
