@@ -1,7 +1,7 @@
 """Animatable 3D Gaussian humans from a few photos, in functional JAX.
 
 The public interface is the list in `__init__.pyi`, which editors and type checkers read. Each name
-is imported when it is first used, so that `import humangs_jax` and `humangs --help` cost nothing.
+is imported when it is first used, so that `import humangs_jax` and `humangs --help` are fast.
 The import sets one flag of XLA if the installed version of JAX would compute wrong numbers without
 it. Modules that have moved can still be imported under their old names.
 """

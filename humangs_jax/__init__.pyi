@@ -1,7 +1,7 @@
 # ruff: noqa: I001
 """The public interface, in the order photos -> avatar -> image.
 
-This file is its only list: `__init__.py` imports from it.
+This file is the only list of its names. `__init__.py` reads the list from here.
 """
 
 # captures: photos, cameras, poses of one person

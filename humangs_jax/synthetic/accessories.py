@@ -131,10 +131,10 @@ def _followed(
     columns: int,
     closed: bool = True,
 ) -> Surface:
-    """Sweeps a tube along a path; it moves with the nearest skin.
+    """Sweeps a tube along a path. It moves with the nearest skin.
 
-    Its template and cloth coordinates are positions relative to the neck. Other arguments are those
-    of `surfaces.sweep`.
+    Its template and cloth coordinates are positions, shifted so that the neck has the height 0.19
+    m. The arguments but `anatomy` are those of `surfaces.sweep`.
     """
     (x, y, _) = anatomy.skin.template.T
     (vertices, faces) = sweep(path, across, widths, columns, closed)

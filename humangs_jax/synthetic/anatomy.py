@@ -57,7 +57,7 @@ LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9,
 """Largest rotation angle of each joint in the prior, radians; jaw and eyes stay at rest."""
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
-"""Factors that make a rotation vector that of the rotation with left and right exchanged."""
+"""Factors (3,) for a rotation vector. They exchange left and right."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,7 +254,8 @@ def _knee_angle(thigh: Vector, shin: Vector, distance: float) -> float:
 def _frame(direction: Vector, across: Vector) -> Matrix:
     """Returns a rotation matrix whose first column has the direction `direction`.
 
-    The second column is the part of `across` that is orthogonal to the first one.
+    The second column has the direction of the part of `across` that is orthogonal to the first
+    column.
     """
     u = direction / np.linalg.norm(direction)
     s = across - (across @ u) * u
@@ -334,10 +335,10 @@ def _leg_membership(template: np.ndarray) -> np.ndarray:
 
 
 def cloth_coordinates(template: np.ndarray) -> np.ndarray:
-    """Returns cloth coordinates (n, 4): x, y, z relative to the axis of trunk or leg, a radius.
+    """Returns cloth coordinates (n, 4): x, y, z relative to the axis of trunk or leg, and a radius.
 
-    The angle atan2(x, z) is 0 in front; times the radius, it is metres around the body. Arms have
-    the coordinates of the trunk; `sewn_coordinates` gives them other ones.
+    The angle atan2(x, z) is 0 in front. Times the radius, it is metres around the body. Arms have
+    coordinates relative to the axis of the trunk; `sewn_coordinates` replaces them.
     """
     x, y, z = template.T
     trunk = np.stack([x, y, z - 0.02, np.full_like(x, TRUNK_GIRTH)], -1)
@@ -348,7 +349,7 @@ def cloth_coordinates(template: np.ndarray) -> np.ndarray:
 def leg_coordinates(template: np.ndarray) -> np.ndarray:
     """Returns the cloth coordinates (n, 4) of trousers, which are sewn along the middle.
 
-    They are relative to the axis of the nearer leg, from the waist down.
+    They are relative to the axis of the leg on the point's side, above the crotch, too.
     """
     x, y, z = template.T
     knee = np.interp(-y, [0.358, 0.764, 1.159], [0.101, 0.130, 0.137])
@@ -363,7 +364,7 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
 
     The new ones are relative to the axis of the limb, and change abruptly at seams: at armholes and
     in the middle of trousers. Arms are turned down, so that y runs along every limb. Points on arms
-    are replaced if they have the girth of the trunk, points on legs if they have that of legs.
+    are replaced if their girth is the trunk's, points on legs if it is that of a leg.
     """
     x, y, girth = template[:, 0], template[:, 1], cloth[:, 3]
     on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(girth - TRUNK_GIRTH) < SAME_GIRTH)

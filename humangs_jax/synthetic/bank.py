@@ -119,10 +119,10 @@ def bake_subject(
 def strongest_joints(
     weights: Float[np.ndarray, "n j"], count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keeps the `count` joints of most weight of each vertex.
+    """Keeps the `count` joints with the largest weights of each vertex.
 
     Returns: indices of the joints (n, k), strongest first, and their weights (n, k), scaled so that
-    they sum to 1.
+    the weights of a vertex sum to 1.
     """
     ids = np.argsort(-weights, axis=1, kind="stable")[:, :count]
     kept = np.take_along_axis(weights, ids, axis=1)
@@ -130,9 +130,10 @@ def strongest_joints(
 
 
 def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 2048) -> None:
-    """Writes a posed subject as a mesh whose texture contains the light, whole or not at all.
+    """Writes a posed subject as a mesh whose texture contains the light.
 
-    An existing scan in the folder is replaced. texture_size: texels a side.
+    An existing scan in the folder is replaced. If writing fails, the folder stays as before.
+    texture_size: texels a side.
     """
     import trimesh
     from PIL import Image
@@ -273,8 +274,8 @@ def build_bank(
     `data.views.gaussian_body`. None: the bank has no displacements. processes: number of processes
     that make people; if more than one, they use the CPU and load the shipped body themselves.
 
-    Raises: ValueError if there are no seeds, if a seed lies in another range, or if the body is not
-    the package's body.
+    Raises: ValueError if there are no seeds, if a seed lies in another range, if the body is not
+    the package's body, or if the size of the textures is no such multiple.
     """
     seeds = list(seeds)
     if not seeds:
@@ -294,7 +295,7 @@ def build_bank(
 
 
 def save_bank(path: str | Path, bank: PeopleBank) -> None:
-    """Writes a bank as one .npz file, whole or not at all."""
+    """Writes a bank as one .npz file. If writing fails, no file appears."""
     fields = {name: np.asarray(getattr(bank, name)) for name in (*_ARRAYS, *_STATIC)}
     write_npz(path, fields | {"format": np.asarray(_FORMAT), "version": np.asarray(_VERSION)})
 

@@ -64,7 +64,7 @@ class Complexion:
 
 
 def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Complexion:
-    """Draws colors. Fair skin goes with any hair, dark skin with dark hair, age with grey hair."""
+    """Draws colors. Hair of dark skin is mostly dark, and hair of old people is mostly grey."""
     darkness = rng.beta(1.05, 1.15)
     fair = np.asarray([0.86, 0.67, 0.57])
     mid = np.asarray([0.70, 0.49, 0.36])
@@ -335,9 +335,10 @@ def eye_material(tones: Complexion) -> Material:
 
 
 def hair_material(rng: np.random.Generator, base: np.ndarray, haircut: Haircut) -> Material:
-    """Makes the material of hair: fine and coarse streaks that run down from the crown.
+    """Makes the material of hair, with fine and coarse streaks that run down from the crown and a
+    bright ring around the head.
 
-    Hair that is not curly has a bright ring around the head. base: color of the hair (3,).
+    Curly hair has fine and coarse noise instead. base: color of the hair (3,).
     """
     seed = int(rng.integers(1 << 20))
     tips = base * rng.uniform(0.75, 1.35)

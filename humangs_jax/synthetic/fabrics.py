@@ -217,7 +217,8 @@ patterns that are not replaced.
 def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabric:
     """Draws a fabric that suits a kind of garment.
 
-    plainness: probability of a plain pattern, which has one dye or two similar ones.
+    plainness: probability of a plain pattern. This has one dye, or shows little of a second one.
+    Some kinds of garments replace their pattern, see `_PATTERN_RULES`.
     """
     plain_ones = {"plain": 0.66, "melange": 0.2, "tweed": 0.14}
     odds = {name: share for name, (share, _) in PATTERNS.items() if share}
@@ -258,20 +259,22 @@ def _seed(rng: np.random.Generator) -> int:
 
 
 def _plain(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
-    """Colors cloth in one dye, slightly uneven."""
+    """Returns the colors of cloth in one dye, slightly uneven, (n, 3)."""
     return base * (1 + 0.03 * Ripples(rng, 0.12)(s.cloth[:, :3]))[:, None]
 
 
 def _stripes(
     s: Spots, rng: np.random.Generator, base: Vector, other: Vector, upright: bool = False
 ) -> Points:
-    """Colors stripes around the trunk or limb, or along it if `upright`."""
+    """Returns the colors of cloth with stripes, (n, 3). They run around the trunk or limb, or along
+    it if `upright`.
+    """
     period, share = rng.choice([0.014, 0.02, 0.035, 0.055, 0.09]), rng.uniform(0.25, 0.6)
     return mix(base, other, _lines(s.around if upright else s.along, period, share * period))
 
 
 def _checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Colors gingham, or tartan, which has thin lines of a third dye."""
+    """Returns the colors of gingham, or of tartan with thin lines of a third dye, (n, 3)."""
     period, third, tartan = rng.choice([0.03, 0.05, 0.08]), accent(rng, base), rng.random() < 0.6
     result = mix(
         base,
@@ -285,7 +288,9 @@ def _checks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> 
 
 
 def _dots(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Colors polka dots in a triangular grid."""
+    """Returns the colors of cloth with polka dots, (n, 3). Every other row of dots is shifted by
+    half the distance between dots.
+    """
     period, size = rng.choice([0.03, 0.045, 0.07]), rng.uniform(0.2, 0.34)
     row = np.floor(s.along / period)
     x = ((s.around / period + 0.5 * (row % 2)) % 1 - 0.5) * period
@@ -294,7 +299,7 @@ def _dots(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Po
 
 
 def _flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Colors scattered blossoms of five petals, in two dyes."""
+    """Returns the colors of scattered blossoms of five petals, in two dyes, (n, 3)."""
     period, seed, third = rng.choice([0.05, 0.075]), _seed(rng), accent(rng, base)
     plane = np.stack([s.around, s.along], -1) / period
     cell = np.floor(plane).astype(np.int64)
@@ -311,7 +316,7 @@ def _flowers(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) ->
 
 
 def _mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Colors noise with sharp or soft edges, like batik or tie-dye."""
+    """Returns the colors of noise with sharp or soft edges, like batik or tie-dye, (n, 3)."""
     scale, seed = rng.choice([0.03, 0.06, 0.1]), _seed(rng)
     width = 0.02 if rng.random() < 0.5 else 0.2
     third = accent(rng, other)
@@ -323,13 +328,15 @@ def _mottled(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) ->
 
 
 def _melange(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Colors knitted cloth with a fine grain."""
+    """Returns the colors of knitted cloth with a fine grain, (n, 3)."""
     seed, share = _seed(rng), rng.uniform(0.2, 0.5)
     return mix(base, other, share * _grain(s, 0.006, 0.009, seed))
 
 
 def _denim(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
-    """Colors denim: faded on the front of thighs and at creases, with a grain along the thread."""
+    """Returns the colors of denim, (n, 3). It is faded on the front of the thighs and at creases,
+    has a grain along the thread, and sometimes has frayed holes at the knees.
+    """
     cloud, seed = Ripples(rng, 0.15), _seed(rng)
     fade, holes = rng.uniform(0.1, 0.6), rng.random() < 0.12
     front = (
@@ -370,7 +377,9 @@ _CAMOUFLAGES = np.asarray(
 
 
 def _camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vector) -> Points:
-    """Colors camouflage: torn blots of four colors, large ones below small ones."""
+    """Returns the colors of camouflage, (n, 3): torn blots of three colors on a fourth one. Small
+    blots lie on large ones.
+    """
     dyes = _CAMOUFLAGES[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])]
     scale, seed = rng.uniform(0.045, 0.09), _seed(rng)
     p = s.cloth[:, :3] / scale * np.asarray([0.8, 1.4, 0.8], np.float32)
@@ -383,7 +392,7 @@ def _camouflage(s: Spots, rng: np.random.Generator, _base: Vector, _other: Vecto
 
 
 def _herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Colors zigzags of slanted threads."""
+    """Returns the colors of cloth with zigzags of slanted threads, (n, 3)."""
     period = rng.choice([0.03, 0.045])
     pitch = rng.choice([0.008, 0.012])
     share = rng.uniform(0.35, 0.7)
@@ -392,7 +401,7 @@ def _herringbone(s: Spots, rng: np.random.Generator, base: Vector, other: Vector
 
 
 def _argyle(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Colors diamonds with thin lines across."""
+    """Returns the colors of cloth with diamonds and thin lines across, (n, 3)."""
     period, third = rng.choice([0.06, 0.09]), accent(rng, other)
     x, y = s.around / period, s.along / (1.6 * period)
     u, v = (x + y) % 1, (x - y) % 1
@@ -402,7 +411,9 @@ def _argyle(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> 
 
 
 def _dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Colors one dye that runs into another, along the garment or in rings (tie-dye)."""
+    """Returns the colors of cloth on which one dye runs into another, (n, 3), along the garment or
+    in rings (tie-dye).
+    """
     rings, level, wide = rng.random() < 0.5, rng.uniform(-0.35, 0.0), rng.uniform(0.05, 0.25)
     wobble, third = lattice(s.cloth[:, :3] / 0.05, _seed(rng)) - 0.5, accent(rng, other)
     if not rings:
@@ -417,7 +428,7 @@ def _dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) ->
 
 
 def _tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Colors cloth woven in two threads, of which the second shows little."""
+    """Returns the colors of cloth of two threads, of which the second shows little, (n, 3)."""
     seed, share = _seed(rng), rng.uniform(0.08, 0.25)
     return mix(
         base, other, share * _grain(s, 0.004, 0.02, seed) * _grain(s, 0.02, 0.004, seed + 1) * 2
@@ -425,7 +436,7 @@ def _tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> P
 
 
 def _cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector) -> Points:
-    """Colors plaits of thick yarn, light and dark, in one dye."""
+    """Returns the colors of plaits of thick yarn, light and dark, in one dye, (n, 3)."""
     period = rng.choice([0.05, 0.07])
     x, y = (s.around / period) % 1 - 0.5, s.along / 0.045
     strand = np.sin(2 * np.pi * (y + 0.8 * np.abs(x))) * np.sign(x)
@@ -435,7 +446,9 @@ def _cable_knit(s: Spots, rng: np.random.Generator, base: Vector, _other: Vector
 
 
 def _color_blocks(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Colors the upper part in another dye, with a line in a third one below it."""
+    """Returns the colors of cloth whose upper part has another dye, with a line in a third dye
+    below it, (n, 3).
+    """
     level, wide, third = rng.uniform(-0.15, 0.06), rng.uniform(0.01, 0.03), accent(rng, other)
     return mix(
         mix(base, other, band(s.along, level, 9.0)), third, band(s.along, level - wide, level)

@@ -212,7 +212,7 @@ are positive where hair or cloth is, and negative where the face is free.
 
 
 def _fringe(rng: np.random.Generator, haircut: Haircut) -> _Opening:
-    """Returns the function that tells how far points are above the edge of a fringe, metres."""
+    """Returns the function that returns how far points are above the edge of a fringe, metres."""
     angles, heights = (np.asarray(x) for x in _FRINGE_LINES[haircut.fringe])
     phase = rng.uniform(0, 6.28, 3)
 
@@ -426,7 +426,8 @@ def _beard(rng: np.random.Generator, anatomy: Anatomy, thickness: float, kind: s
 def _painted(surface: Surface) -> Surface:
     """Adds template and cloth coordinates to hair that is not cut from the scalp.
 
-    Both are positions relative to the middle of the hair.
+    Cloth coordinates are positions relative to the middle of the hair. Template coordinates are the
+    same positions around `SKULL`.
     """
     flat = surface.vertices - surface.vertices.mean(0)
     return surface.painted(flat + SKULL, flat, 0.09)

@@ -119,7 +119,7 @@ class Scene:
     dyes: Float[Array, "m 3 3"]
     """Matrix that recolors each piece, (m, 3, 3), see `surroundings.dyes_from`."""
     lights: surroundings.Lights
-    """What the person stands in."""
+    """The light that the person stands in."""
 
 
 def on_the_fly_example(
@@ -491,7 +491,8 @@ class GeneratedSource:
     def drawn_key(self, seed: int, index: int) -> Key:
         """Returns the key of example number `index` of a run that `seed` starts.
 
-        The key is that of a random person of the split, in appearance number `index`.
+        The key is the `subject_key` of a random person of the split, in appearance number `index`.
+        `make` may show another person, see `person_of`.
         """
         return subject_key(self._person(seed, index), index)
 
@@ -558,7 +559,7 @@ def jitted_example(
 ) -> Example:
     """Calls `on_the_fly_example`, compiled once for each configuration and shape of the bank.
 
-    On a CPU it is compiled with `CPU_COMPILER_OPTIONS`.
+    On a CPU it is compiled with `core.processes.CPU_COMPILER_OPTIONS`.
     """
     return _compiled()(bank, key, config=config, person=person)
 

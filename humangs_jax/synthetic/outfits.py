@@ -86,7 +86,7 @@ class _Style:
     headwear: Odds = dataclasses.field(
         default_factory=lambda: {"beanie": 0.05, "cap": 0.07, "brim_hat": 0.05}
     )
-    """Probability of each kind of headwear; the rest wear none."""
+    """Probability of each kind of headwear. The remaining people have no headwear."""
     no_sunglasses: float = 0.96
     """1 less the probability of sunglasses."""
 
@@ -563,7 +563,7 @@ def _shoes(
 def _fastened(
     rng: np.random.Generator, style: str, male: bool, worn: Sequence[Garment]
 ) -> list[Garment]:
-    """Chooses a belt and a tie, or neither; a coat or jacket goes over both."""
+    """Chooses a belt, a tie, both or nothing. A coat or jacket goes over them."""
     result = []
     trousers = next((g for g in worn if g.kind in BOTTOMS), None)
     belted = (
@@ -587,7 +587,7 @@ def _fastened(
 def _extras(
     rng: np.random.Generator, style: _Style, male: bool, years: float, worn: Sequence[Garment]
 ) -> list[Garment]:
-    """Chooses accessories: scarf, headwear, glasses, bag, watch and necklace, each or none."""
+    """Chooses accessories: scarf, headwear, glasses, bag, watch, necklace. Any may be missing."""
     kinds = {g.kind for g in worn}
     hooded = any("hood_up" in g.details for g in worn)
     result: list[Garment] = []

@@ -353,9 +353,8 @@ def bend_arm(
 
 
 def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
-    """Returns the least distance of the forearms and hands from the body and from the other arm.
-
-    In metres; negative if a forearm or hand is inside.
+    """Returns the least distance of the forearms and hands from the body and from the other arm, in
+    metres. It is negative if a forearm or hand is inside.
     """
     world, positions = kin.joint_positions(build, rotations)
     body, worst = _body_capsules(build, world, positions), np.inf
@@ -437,7 +436,7 @@ _GESTURES = {
 }
 """Gestures by name. Each has its odds; the curl of index, middle, ring and pinky, radians per
 knuckle; the angle between fingers, radians; and how far the thumb lies across the palm, from 0
-(beside the palm) to 1 (across it)."""
+(beside the palm) to 1 (across it), negative if it points away."""
 
 
 def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> None:

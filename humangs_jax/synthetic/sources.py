@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 def people_of_run(people: int, out: Path, body: BodyModel) -> SourceFactory:
     """Makes a source of the first people of the training split, rendered anew for every step.
 
-    people: their number. out: folder of the run, which keeps their bank.
+    people: number of people. out: folder of the run, which keeps their bank.
     """
     return on_the_fly_people(_bank(people, out, body))
 
@@ -31,7 +31,8 @@ def people_of_split(
 ) -> SourceFactory:
     """Makes a source of the first people of a split, rendered anew for every step.
 
-    people: their number. size: of the images, pixels; textures are as fine as these need.
+    people: number of people. size: side of the images, pixels. Textures are as fine as images of
+    this size need.
     each_once: see `on_the_fly_people`.
     """
     texture = 1024
@@ -80,7 +81,7 @@ def on_the_fly_people(
 
 
 def _bank(people: int, out: Path, body: BodyModel) -> PeopleBank:
-    """Returns the bank in out/people.npz. One process makes it if it is missing or another one."""
+    """Returns the bank in out/people.npz. One process makes it unless it has the right seeds."""
     path, seeds, bank = out / "people.npz", SPLITS["train"][:people], None
     if jax.process_index() == 0:
         bank = load_bank(path) if path.is_file() else None

@@ -7,8 +7,8 @@ and averaged.
 
 A seed names a person. Each purpose, such as training or testing, has a range of seeds (`SPLITS`),
 and the ranges share no person. People that are written to files are made from the seed, by numpy.
-People on the fly are made from keys, whose two words are (appearance, seed): every key shows which
-person and which split it belongs to.
+Examples on the fly are made from keys, whose two words are (appearance, seed). A key therefore
+shows which split its example belongs to. The example may show another person of that split.
 """
 
 import dataclasses
@@ -89,7 +89,7 @@ def split_of(seed: int) -> str:
 def seeds_of(split: str, first: int, count: int) -> range:
     """Returns `count` seeds of a split, from number `first` on.
 
-    Raises: ValueError if the split has no such seeds.
+    Raises: ValueError if the split has no such seeds; KeyError if there is no such split.
     """
     people = SPLITS[split]
     if first < 0 or count < 1 or first + count > len(people):
@@ -101,7 +101,8 @@ def seeds_of(split: str, first: int, count: int) -> range:
 
 
 def subject_key(seed: int, appearance: int = 0) -> Key:
-    """Returns the random key of a person in an appearance: dyes of the clothes, poses and light.
+    """Returns the random key of a person in an appearance. Dyes of the clothes, poses, light and
+    cameras are drawn from it.
 
     Raises: ValueError if the seed lies in no range of `SPLITS`.
     """
@@ -303,7 +304,7 @@ def _host_arrays(
     """Returns numpy arrays of a body, which are kept for the body that was used last.
 
     Returns: template (n, 3), faces (f, 3), skinning weights (n, j), the height of the mean body in
-    metres, and the metres (s,) that a unit of each shape coefficient adds to that height.
+    metres, and the metres (s,) that a unit of each shape coefficient adds to the height.
     """
     if id(body) not in _HOST:
         template, faces, weights = (
@@ -462,7 +463,7 @@ def padded(
 def render_view(
     posed: PosedSubject, camera: Camera, background: float = 1.0
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """Renders a posed person in one camera.
+    """Renders a posed person in one camera. background: gray level of the background, 0 to 1.
 
     Returns: the image (h, w, 3), and the covered share of each pixel (h, w), both in [0, 1].
     """

@@ -396,7 +396,9 @@ _EMPTY = 1e-3
 _GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
 _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
-"""The 1 / cos(a - b) of: radius(a) = min over b of support(b) / cos(a - b)."""
+"""Values of 1 / cos(a - b) for pairs of angles a and b; infinite where the cosine is at most 0.1.
+The radius of a convex silhouette at a is the least support(b) / cos(a - b) over all b.
+"""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -48,7 +48,9 @@ _Each = Float[Array | np.ndarray, "3 ..."]
 
 
 def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
-    """Returns the middle of the bounding box (3,) and the largest distance from it, metres."""
+    """Returns the middle of the bounding box (3,) and the largest distance of a vertex from it, in
+    metres.
+    """
     center = 0.5 * (vertices.min(0) + vertices.max(0))
     return center, float(np.linalg.norm(vertices - center, axis=1).max())
 
@@ -68,7 +70,8 @@ def cameras_around(
 ) -> Camera:
     """Makes a batch of square cameras that see the whole person, one for each azimuth in radians.
 
-    Distances and elevations are drawn from the ranges of the protocol.
+    Distances and elevations are drawn from the ranges of the protocol. A camera that would not see
+    the whole person is moved away from the person until it does.
     """
     center, radius = bounding_sphere(vertices)
     distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
@@ -367,7 +370,7 @@ def _lights(
     ground: _Each,
     gain: _Each,
 ) -> Lights:
-    """Makes lights of their angles, strengths and tints.
+    """Makes lights from their angles, strengths and tints.
 
     numpy: the module that the arrays belong to, numpy or jax.numpy. angles, elevations: of the
     three lights, radians. power: strengths of the three lights. tint: deviations of their colors
@@ -391,9 +394,10 @@ def shaded_vertices(
 ) -> tuple[_Values, _Values]:
     """Returns how much light reaches each vertex of a posed person.
 
-    faces: given for training on the fly. Their middles then fill the grid too, because meshes may
-    have edges longer than a voxel; and the way to the light is sampled at the nearest voxels, which
-    takes an eighth of the lookups.
+    faces: triangles, given for training on the fly. The middles of the faces then fill the grid
+    too, because meshes may have edges longer than a voxel. The way to the light is then sampled at
+    the nearest voxels, which takes an eighth of the lookups. None: only vertices fill the grid, and
+    the samples are interpolated.
 
     Returns: the openness of each vertex to its surroundings (n,), in [0.35, 1], and the share of
     the light from `direction` that arrives at each vertex (n,), in [DARKEST, 1].

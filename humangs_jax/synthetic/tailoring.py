@@ -46,7 +46,7 @@ NECKLINES = {
 the neck beyond which the shoulder is always covered; metres.
 """
 HEM_MARGIN = 0.012
-"""How far inside of a hem the skin below cloth is removed, metres of template coordinates."""
+"""Skin that is further inside of a hem than this is removed, metres of template coordinates."""
 
 
 def neckline(template: Points, style: str, depth: float) -> Field:
@@ -208,11 +208,11 @@ class Fit:
     hang: float = 3.0
     """Slope by which hanging cloth may narrow downwards, metres per metre; large values cling."""
     sleeve: float = 0.0
-    """Distance from the arm that is added at the end of the sleeve."""
+    """Distance from the arm that is added at the wrist. Towards the shoulder it falls to 0."""
     leg: float = 0.0
-    """Distance from the leg that is added at the end of the trouser leg."""
+    """Distance from the leg that is added at the ankle. Towards the crotch it falls to 0."""
     leg_hang: float = 3.0
-    """The same slope for the cloth of each leg."""
+    """Slope as `hang`, for the cloth of each leg."""
     fold: float = 0.004
     """Height of the folds; 0 for none."""
     hem: float = 0.008

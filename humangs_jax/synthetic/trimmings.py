@@ -1,9 +1,9 @@
 """Paints what is sewn on or printed on cloth: prints, buttons, zips, seams, pockets, ribs, laces.
 
-`sewn` makes the fabric of a garment with all of these; the table `_SEWN_ON` says which garments
-have which. A trimming is a function that takes the colors (n, 3) of points, the points, a generator
-and the garment, and returns the colors with the trimming. Words are set in an alphabet of 5 x 7
-cells a letter, which is part of this module.
+`sewn` returns the colors of a garment with its trimmings. The table `_SEWN_ON` says which garments
+have which pockets, buttons, zips and sashes. A trimming is a function that takes the colors (n, 3)
+of points, the points, a generator and the garment, and returns the colors with the trimming. Words
+are set in an alphabet of 5 x 7 cells a letter, which is part of this module.
 """
 
 from collections.abc import Callable
@@ -238,7 +238,9 @@ def _side_striped(colors: Points, s: Spots, rng: np.random.Generator, garment: G
 
 
 def _ribbed(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
-    """Adds knitted bands at the hem and the cuffs: upright ribs that are a little darker."""
+    """Adds knitted bands at the hem and the cuffs, a little darker than the cloth. Their ribs run
+    along the trunk and the sleeves.
+    """
     x, width = np.abs(s.template[:, 0]), 0.04
     at_hem = s.template[:, 1] < garment.sizes["bottom"] + 1.3 * width
     inside = np.where(x > 0.2, x > garment.sizes["sleeve"] - width, at_hem)
@@ -360,10 +362,11 @@ def sewn(
 ) -> Callable[[Spots], Points]:
     """Returns a function that gives the colors (n, 3) of points of a garment.
 
-    They are those of the fabric with stitches, seams, prints and the trimmings of `_SEWN_ON`.
+    The colors are those of the fabric with stitches, seams, prints, stripes, ribs and the trimmings
+    of `_SEWN_ON`.
 
     hem: template height of the stitches at the hem. sleeve: |x| of the stitches at the cuffs. None:
-    no cuffs. seams: whether there are seams.
+    there are no cuffs and no ribs. seams: whether there are seams.
     """
     details = garment.details
     if "collar" in details and "open" not in details:

@@ -1,6 +1,7 @@
 """Dresses a body: builds the surfaces and materials of garments, layer on layer.
 
-Each garment hides the skin and cloth that lie well below it.
+Clothes and closed shoes hide the skin well inside of their hems, and most of them the cloth there,
+too. Straps, collars, belts, ties and most accessories hide nothing.
 """
 
 import dataclasses
@@ -85,8 +86,8 @@ class Outfit:
         """Hides what lies more than a margin inside of the hems of the garment that is put on next.
 
         cover: function of template points (n, 3) that returns how far they are inside of the
-        garment's hems (n,), metres, negative outside. margin: metres; at least
-        30 mm for cloth. cloth: whether cloth is hidden too; otherwise only skin is.
+        garment's hems (n,), metres, negative outside. margin: metres. For cloth it is at least
+        30 mm. cloth: whether cloth is hidden too; otherwise only skin is.
         """
         field = cover(self.template)
         self.cover = np.maximum(self.cover, field)
@@ -357,9 +358,9 @@ def _skirt(outfit: Outfit, garment: Garment) -> None:
 def _hem_of(sizes: Mapping[str, float]) -> tuple[float, tuple[int, float]]:
     """Returns the flare and the pleats of a skirt.
 
-    The flare is the metres by which a skirt gets wider per metre down. Short skirts have more of
-    it, so that hems of all lengths stand off alike. The pleats are their number and their depth in
-    metres.
+    The flare is the metres by which the radius grows per metre down. Short skirts have a larger
+    flare, so that hems of all lengths stand off alike. The pleats are their number and their depth
+    in metres.
     """
     return sizes["flare"] / max(0.3, -0.2 - sizes["end"]), (int(sizes["pleats"]), sizes["depth"])
 

@@ -70,7 +70,9 @@ CAPTURE = "capture.json"
 
 
 class Stream:
-    """Numbers of the random streams of a seed. Stream 0 makes the person."""
+    """Numbers of the random streams of a seed that poses and cameras are drawn from. Stream 0 and
+    those from 11 on make the person.
+    """
 
     POSES, CAMERAS, HELD_OUT_CAMERAS, CLOSE_CAMERAS, MOTION = range(1, 6)
 
@@ -86,7 +88,9 @@ class Layout:
     views: int = 60
     """Number of cameras of the published protocol that see each pose."""
     close_views: int = 0
-    """Number of further cameras of each pose that are nearer and see parts of the person."""
+    """Number of close cameras for each pose, besides `views`. They are nearer to the person than
+    the cameras of `views`, and see only a part of the person.
+    """
     held_out_views: int = 0
     """Number of cameras in held_out/ that see the first pose, and each of the novel poses."""
     novel_poses: int = 0
@@ -165,7 +169,9 @@ def capture_views(
 
 
 def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout) -> None:
-    """Writes one person, whole or not at all. An existing capture in the folder is replaced."""
+    """Writes one person. An existing capture in the folder is replaced. If writing fails, the
+    folder stays as before.
+    """
     subject = make_subject(seed, body)
     # poses are independent, or evenly spaced frames of one motion
     motion = None
@@ -229,9 +235,9 @@ def write_set(
 
     Returns: the folders.
 
-    Raises: ValueError if the people reach beyond the split, `out` was written with other settings
-    or by another version of the generator, or (at the end) some could not be made; OSError if
-    nothing can be written there.
+    Raises: ValueError if the people reach beyond the split, if `out` was written with other
+    settings or by another version of the generator, or at the end if some people could not be made;
+    OSError if nothing can be written there; KeyError if there is no such split.
     """
     out, seeds = Path(out), seeds_of(split, first, subjects)
     # a set is made with one set of settings, which its manifest keeps
@@ -295,8 +301,8 @@ def _views(
 ) -> list[View]:
     """Makes `count` views of each pose.
 
-    stream: seed of the random numbers. place: function that makes the cameras of one pose. size: of
-    the images, pixels. mark: a part of the views' names.
+    stream: seed of the random numbers. place: function that makes the cameras of one pose. size:
+    side of the images, pixels. mark: a part of the views' names.
     """
     rng, views = np.random.default_rng(stream), []
     shown = poses if count else ()

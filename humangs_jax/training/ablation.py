@@ -1,8 +1,8 @@
 """Compares variants of a training run with the run itself: the same people, steps and seeds, with
 intervals of the differences.
 
-All runs are compared on the same people, photos and targets, those that the base is validated on,
-whatever a variant changes.
+All runs are compared on the people, photos and targets that the base is validated on, whatever a
+variant changes.
 """
 
 import dataclasses
@@ -61,7 +61,7 @@ class AblationRow(NamedTuple):
 
     @property
     def clear(self) -> bool:
-        """Whether the difference is outside of its interval."""
+        """Whether the interval around the difference exists and does not contain 0."""
         return self.interval is not None and abs(self.difference) > self.interval
 
 
@@ -76,7 +76,9 @@ class Ablation:
 
     @property
     def rows(self) -> list[AblationRow]:
-        """The row of the base, then those of the variants that have a score, in their order."""
+        """The row of the base, then the rows of the variants, in their order. A variant has a row
+        if it and the base have a score of the same seed.
+        """
         base = self.scores[BASE]
         return [
             _row(name, own, base) for name, own in self.scores.items() if own.keys() & base.keys()
@@ -94,8 +96,9 @@ class Ablation:
         return "\n".join(text_table([head, *cells]))
 
     def plot(self) -> Any:
-        """Returns a figure of the differences to the base with their intervals, gray where the
-        interval contains 0. If no variant has a score, the figure says so.
+        """Returns a figure of the differences from the base with their intervals. A difference
+        that is not clear is gray (see `AblationRow.clear`). If no variant has a row, the figure has
+        a text instead.
 
         Raises: ImportError without matplotlib, which the extra `notebooks` installs.
         """
@@ -134,35 +137,39 @@ def ablate(
     networks: LossNetworks = NO_NETWORKS,
     progress: bool = True,
 ) -> Ablation:
-    """Train a base and its variants with several seeds each, and compare them on other people.
+    """Trains a base and its variants with several seeds each, and compares them on other people.
 
-    Each run is a folder `out/VARIANT/SEED` that `train` goes on with: the same call resumes.
+    Each run has a folder `out/VARIANT/SEED`. The same call continues runs that were interrupted.
 
     Args:
-        base: a run, or the name of a preset of training ("tiny", "small", "paper", "published").
-        variants: fields that change, by their paths (`vary`), of each variant by its name.
-        seeds: runs of each variant.
-        people: to train on: a number of synthetic people, who are rendered during training; capture
-            folders; or a source.
-        validation: other people to compare on, in the same forms. Of a number and of folders each
-            is looked at once, of a source the first eight. Photos and targets are those of the base
-            for all variants.
+        base: configuration of the base, or its name or file as `read_config` takes it, such as
+            "tiny" or "small".
+        variants: for each variant, by its name, the fields that change. They are values by path, as
+            `vary` takes them.
+        seeds: number of runs of the base and of each variant.
+        people: people to train on. This is a number of synthetic people, who are rendered during
+            training, or capture folders, or a function that makes a source.
+        validation: other people to compare on, in the same three forms. A source shows its first
+            eight people, and the other forms show everybody. Photos and targets are those of the
+            base for all variants.
         out: folder of the runs.
-        metric: of validation: "psnr", "psnr_fg", "ssim" and so on.
-        body: that the people's parameters belong to. None: the shipped one.
-        networks: of losses that need them; those of the base without one are replaced
-            (`fitting_losses`).
-        progress: show a bar.
+        metric: name of the metric of validations to compare, such as "psnr", "psnr_fg" or "ssim".
+        body: body that the people's parameters belong to. None: the shipped one.
+        networks: networks of the losses that need them. If one is missing for a loss of the base,
+            that loss is replaced (see `fitting_losses`).
+        progress: whether a bar and the result are shown.
 
     Returns:
-        Rows with means, differences to the base and intervals; `print` and `.plot()` show them.
+        The scores of all runs. `print` and `.plot()` show means, differences from the base and
+        intervals.
 
     Raises:
-        ValueError: before the first run, for a variant that cannot be trained: named "base", with a
-            path that is no field, another seed, or a loss whose network is missing; for a
-            metric or number of seeds that cannot be meant. Later, for a folder with runs of
-            other settings.
-        TrainingInterrupted: after Ctrl-C; what is trained is kept.
+        ValueError: before the first run, if a variant is named "base", has a path that is no field,
+            changes the seed, needs a network that is missing or cannot be made, or cannot use
+            people on disk that the base can use; if there is no such metric; if `seeds` is below
+            1. Later, if a folder holds a run of other settings, or if there is nobody to compare
+            on.
+        TrainingInterrupted: after Ctrl-C. What is trained is kept.
 
     Examples:
         >>> class_token = "model.architecture.encoder.transformer.class_token"
@@ -224,8 +231,9 @@ def _check_metric(metric: str, networks: LossNetworks) -> None:
 def _checked_variants(
     base: TrainConfig, variants: Mapping[str, Mapping[str, Any]], networks: LossNetworks
 ) -> dict[str, TrainConfig]:
-    """Returns the run of each variant. Raises: ValueError, which names a variant that cannot be
-    trained.
+    """Returns the configuration of each variant, by name.
+
+    Raises: ArgumentError, which names a variant that cannot be trained.
     """
     runs = {}
     for name, changes in variants.items():
@@ -254,8 +262,7 @@ def _checked_variants(
 def _check_people(
     runs: Mapping[str, TrainConfig], people: Sequence[str | Path] | SourceFactory, body: BodyModel
 ) -> None:
-    """Checks that each run, in all of its stages, can use those people on disk that the base can
-    use.
+    """Checks that each run can use, in all of its stages, the people on disk that the base can use.
 
     No photo is decoded.
 
@@ -293,8 +300,8 @@ def _folder_names(names: Sequence[str]) -> dict[str, str]:
     """Returns the name of a folder for each variant.
 
     It is the variant's name, with `_` for characters that file systems dislike. A checksum is added
-    if another variant has the same folder name, also if they differ only in upper and lower case,
-    or if the name is too long or has no letter or digit.
+    if the name is longer than `LONGEST_NAME` or has no other characters than `.`, `+` and `-`, or
+    if an earlier variant has that name, in upper or lower case.
     """
     plain = {name: re.sub(r"[^\w.+-]+", "_", name) for name in names}
     unusable = [
@@ -357,7 +364,9 @@ def _source(
 
 
 def _validated(folder: Path, step: int) -> dict[str, float]:
-    """Returns the numbers of the validation after a step, by name. Empty if there was none."""
+    """Returns the metrics that a run's log has of the validation after `step`, by name without
+    "val_". Empty if the log has none.
+    """
     file = folder / "log.jsonl"
     lines = []
     if file.is_file():

@@ -37,24 +37,24 @@ class Augmentation:
     tint: Spread = 0.03
     """Standard deviation of the natural logarithm of the gain of each channel of a photo."""
     mask_pixels: Annotated[int, Range(0, 64)] = 2
-    """Largest number of pixels by which masks are eroded or dilated, uniformly distributed. A
-    random background color appears there.
+    """Largest number of pixels by which masks are eroded or dilated. The number is uniformly
+    distributed. Where a mask grows, a random background color appears.
     """
     camera_degrees: Annotated[float, Range(0, 360)] = 0.25
-    """Standard deviation of the turn of a camera about the person, degrees."""
+    """Standard deviation of the turn of a camera about the person, for each axis, degrees."""
     camera_metres: Spread = 0.002
     """Standard deviation of the shift of a camera along each axis, metres."""
     pose_degrees: Annotated[float, Range(0, 360)] = 0.15
-    """Standard deviation of each axis of each joint, degrees. The error is the same in all photos
-    of an example.
+    """Standard deviation of the error of each joint's rotation vector, for each axis, degrees. The
+    error is the same in all photos of an example.
     """
     body_metres: Spread = 0.002
-    """Standard deviation of each axis of the translation, metres. The error is the same in all
-    photos of an example.
+    """Standard deviation of the error of the translation, for each axis, metres. The error is the
+    same in all photos of an example.
     """
     betas: Spread = 0.1
-    """Standard deviation of each shape coefficient. The error is the same in all photos of an
-    example and in its targets.
+    """Standard deviation of the error of each shape coefficient. The error is the same in all
+    photos of an example and in its targets.
     """
 
 
@@ -74,7 +74,8 @@ def random_numbers(key: Key, views: SubjectViews) -> Numbers:
 
 
 def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -> Example:
-    """Returns the example with errors of exposure and tint, or with errors of all inputs and betas.
+    """Returns the example with errors. All inputs of a share of the examples have errors, and so do
+    the betas of their targets. Other examples have errors of exposure and tint only.
 
     Pure and jittable.
     """

@@ -1,15 +1,15 @@
-"""Saves and restores the checkpoints of a run: the newest few and the best. Each is complete or
-does not exist, and is restored bit for bit.
+"""Saves and restores the checkpoints of a run: the newest few and the best one. A checkpoint is
+complete or does not exist, and it is restored bit for bit.
 
-Each records a checksum of its arrays. A damaged one is never used: the run continues from the
-newest good one and reports it.
+A checkpoint records a checksum of its arrays. A damaged checkpoint is never used: the run continues
+from the newest good one and reports the damaged one.
 
-They are written while the run goes on. Each process writes what its devices hold. A run on other
-devices can read them.
+Checkpoints are written while the run goes on. Each process writes what its devices hold. A run on
+other devices can read them.
 
 out/config.json          the configuration of the run
-out/checkpoints/STEP             Orbax checkpoints of the TrainState, with the score of their
-                                 validation
+out/checkpoints/STEP             Orbax checkpoints of the TrainState, each with the score of the
+                                 validation at its step, if there was one
 out/checkpoints/damaged-STEP     those that could not be read, set aside
 """
 
@@ -36,7 +36,7 @@ from humangs_jax.training.state import TrainState
 
 logger = logging.getLogger("humangs_jax.training")
 UNSCORED = -1e9
-"""Score of a checkpoint that was saved before any validation: worse than every other."""
+"""Score of a checkpoint that was saved without a score or with NaN. It is lower than any other."""
 ADJUSTABLE = (
     "log_every",
     "validate_every",
@@ -54,6 +54,7 @@ class Checkpoints:
     with the highest score.
 
     read_only: nothing is written, deleted or set aside.
+    Raises: FileError if `read_only` is set and the score of a checkpoint cannot be read.
     """
 
     def __init__(self, folder: str | Path, keep: int = 2, read_only: bool = False):
@@ -87,11 +88,13 @@ class Checkpoints:
 
     @property
     def best_step(self) -> int | None:
-        """Step of the checkpoint with the highest score. None without checkpoints."""
+        """Step of the checkpoint with the highest score. None if there are no checkpoints."""
         return self._manager.best_step()
 
     def score(self, step: int) -> float | None:
-        """Returns the score that a checkpoint was saved with. None if it has no score, or NaN."""
+        """Returns the score that a checkpoint was saved with. None if it was saved without a score
+        or with NaN.
+        """
         metrics = self._manager.metrics(step)
         unscored = metrics is None or metrics["score"] == UNSCORED or math.isnan(metrics["score"])
         return None if unscored else metrics["score"]
@@ -135,10 +138,11 @@ class Checkpoints:
             ) from error
 
     def restore(self, like: TrainState, step: int | None = None) -> TrainState:
-        """Returns the state of a step, or for None the newest state that is not damaged. `like`: a
-        state of the same run, for structure, shapes and devices.
+        """Returns the state of a step. If `step` is None, it is the newest state that is not
+        damaged.
 
-        Newer checkpoints that are damaged are logged and set aside.
+        like: a state of the same run, for structure, shapes and devices. Checkpoints that are
+        newer and damaged are logged and set aside.
         Raises: FileNotFoundError if there is no such checkpoint; FileError (a ValueError) if all
         are damaged or of another model.
         """
@@ -263,7 +267,9 @@ def _weighted_sum(shard: Any, shape: tuple[int, ...]) -> int:
 
 
 def _without_score(folder: Path) -> list[Path]:
-    """Returns the checkpoints whose score cannot be read. Orbax would stop at the first of them."""
+    """Returns the folders of the checkpoints whose score cannot be read. Orbax would raise for the
+    first of them.
+    """
     found = []
     for step in sorted(
         path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir()
@@ -292,10 +298,10 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
     """Writes out/config.json, after a check against the file that is there. write: False only
     checks.
 
-    A finished run may get more steps. It then continues with the learning rate of the longer run.
+    The settings `ADJUSTABLE` may differ from the file. A finished run may get more steps. It then
+    continues with the learning rate of the longer run.
 
-    Raises: ValueError, which names a field, if the folder belongs to a run of another
-    configuration.
+    Raises: ValueError, which names a field, if another setting differs.
     """
     path = Path(out) / "config.json"
     if path.is_file():
@@ -330,7 +336,8 @@ def _placed_as(value: jax.Array, like: jax.Array) -> jax.Array:
     """Returns a restored array on the devices of `like`. It is copied through numpy, so that its
     buffers are XLA's own and may be donated.
 
-    An array is uncommitted if `like` is, so that nothing is compiled again.
+    The array is uncommitted if `like` is, so that nothing is compiled again. An array that is
+    partly on devices of other processes is returned without a copy.
     """
     if not value.is_fully_addressable:
         return value

@@ -58,19 +58,22 @@ class OptimizerConfig:
     warmup_steps: Annotated[int, Range(0, 100_000_000)] = 3000
     """Steps over which the learning rate rises from 0 to its peak."""
     betas: tuple[Decay, Decay] = (0.9, 0.95)
-    """The decays of the running means of gradients and of their squares."""
+    """The first two arguments of the optimizer in `optax` after the learning rate. For "adamw",
+    "nadamw" and "lamb" they are the decays of the running means of gradients and of their squares.
+    """
     weight_decay: Spread = 0.05
     """Weight decay of parameters with two or more axes (matrices, textures, the class token)."""
     clip_norm: Annotated[float, Range(0, 1e12)] = 1.0
-    """Gradients longer than this are scaled down to it."""
+    """Gradients whose norm is larger than this are scaled down to this norm."""
     skip_norm: Annotated[float, Range(0, 1e12)] = 100.0
-    """Steps whose gradient is longer than this are skipped."""
+    """Steps whose gradient has a larger norm than this are skipped."""
 
 
 @configuration
 class Phase:
-    """The settings that change at step `start` of a run, until the next stage. None keeps the run's
-    setting.
+    """A stage of a run: the settings that change at step `start`.
+
+    A setting holds until a later stage changes it. None: this stage does not change the setting.
     """
 
     start: Steps
@@ -98,7 +101,8 @@ STAGED = {
 class TrainConfig:
     """The configuration of one run. Photos enter at `model.conventions.image_size` pixels.
 
-    Raises: ValueError for stages that are not in order, or sizes that do not divide each other.
+    Raises: ValueError if `model.runtime.dtype` is float16, if stages are not in order or begin
+    after the run's last step, or if the sizes of a stage do not fit together.
     """
 
     model: HumanGSConfig = dataclasses.field(default_factory=presets.small)
@@ -112,13 +116,13 @@ class TrainConfig:
     optimizer: OptimizerConfig = OptimizerConfig()
     """The optimizer and its learning rate."""
     splat: SplatConfig = SplatConfig()
-    """How targets are drawn. Without `max_pairs`, the buffers have room for twice what the first
-    targets need, where that is worth measuring (`training.room`).
+    """How targets are drawn. Without `max_pairs`, a run on one device measures what the first
+    targets of a stage need. Its buffers then have room for twice that, see `training.room`.
     """
     target_size: Side = 128
     """Side of the targets, pixels."""
     steps: Steps = 20_000
-    """Steps of the whole run. The learning rate ends with them."""
+    """Number of steps of the whole run. The learning rate falls to 0 at the last of them."""
     batch_size: Count = 1
     """Subjects per step."""
     microbatch_size: Count = knob(
@@ -132,8 +136,8 @@ class TrainConfig:
     subjects that all devices compute at once.
     """
     stages: tuple[Phase, ...] = ()
-    """The stages in the order of their starts, for instance larger photos for the last steps.
-    Before the first stage the fields here hold.
+    """The stages in the order of their starts, for instance one of larger photos for the last
+    steps. Before the first stage the other fields of this configuration hold.
     """
     ema_decay: Share | None = None
     """The decay of the averaged parameters. None: no averaged parameters."""
@@ -146,7 +150,7 @@ class TrainConfig:
     checkpoint_every: Steps = 1000
     """Steps between two checkpoints."""
     keep_checkpoints: Steps = 2
-    """Newest checkpoints to keep, besides the best."""
+    """Number of newest checkpoints to keep, besides the best one."""
 
     def __post_init__(self):
         if self.model.runtime.dtype == "float16":
@@ -177,8 +181,10 @@ class TrainConfig:
         return config
 
     def spans(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """Returns the ranges (first, end) of steps from `start` to `stop` in which the
-        configuration stays the same.
+        """Returns the ranges (first, end) of steps in which the configuration stays the same.
+
+        Together they are the steps from `start` up to `stop`, without `stop`. Each is without its
+        `end`.
         """
         inner = [stage.start for stage in self.stages if start < stage.start < stop]
         if start < stop:
@@ -191,8 +197,8 @@ class TrainConfig:
 
 
 def compiled_for(config: TrainConfig) -> TrainConfig:
-    """Returns the configuration without the settings that only the loop and the loader read. Runs
-    that share compiled programs have the same one.
+    """Returns the configuration with the values of `HOST_SETTINGS`. Runs whose results are equal
+    share their compiled programs.
     """
     return dataclasses.replace(config, **HOST_SETTINGS)
 
@@ -278,7 +284,8 @@ PRESETS = Presets({"published": published, "paper": paper, "small": small, "tiny
 def read_config(preset_or_path: str | Path) -> TrainConfig:
     """Returns the configuration of a preset, or of a JSON file such as the config.json of a run.
 
-    Raises: FileNotFoundError if the name is neither; ValueError, which names file and field.
+    Raises: FileNotFoundError if there is neither a preset nor a file of that name; ValueError,
+    which names file and field, if the file holds no such configuration.
     """
     if str(preset_or_path) in PRESETS:
         return PRESETS[str(preset_or_path)]()
@@ -291,7 +298,7 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
 
 
 def missing_networks(config: TrainConfig, networks: LossNetworks) -> list[str]:
-    """Returns the names of the losses of a run whose networks are missing."""
+    """Returns the names of the losses whose weight is not 0 and whose network is missing."""
     needing = ("perceptual", "vgg16", "lpips")
     return [
         name for name in needing if getattr(config.loss, name) and getattr(networks, name) is None

@@ -49,7 +49,7 @@ DEEPEST = 3
 
 @dataclasses.dataclass(frozen=True)
 class Leaf:
-    """Statistics of one array. All but `bad` and `first` are of its finite entries only."""
+    """Statistics of one array. All numbers but `bad` and `first` are of its finite entries only."""
 
     name: str
     """The path of the array in its pytree."""
@@ -58,11 +58,11 @@ class Leaf:
     first: tuple[int, ...]
     """Index of the first entry that is not finite; () if there is none."""
     smallest: float
-    """The smallest entry, +inf without any."""
+    """The smallest entry; +inf if no entry is finite."""
     largest: float
-    """The largest entry, -inf without any."""
+    """The largest entry; -inf if no entry is finite."""
     mean: float
-    """The mean magnitude, 0 without entries."""
+    """The mean magnitude; 0 if no entry is finite."""
     norm: float
     """The Euclidean norm."""
 
@@ -143,7 +143,7 @@ class Fault:
     stage: str
     """The name of the stage."""
     leaf: Leaf
-    """The numbers of the array."""
+    """The statistics of the array."""
 
     def __str__(self) -> str:
         what = {
@@ -171,7 +171,7 @@ class Diagnosis:
     loss: float
     """The loss of the subject."""
     skip_norm: float
-    """Steps whose gradient is longer than this are skipped."""
+    """Steps whose gradient has a larger norm than this are skipped."""
     stored: tuple[StageReport, ...]
     """Reports of what the step began with: state and batch."""
     stages: tuple[StageReport, ...]
@@ -278,8 +278,9 @@ class Recorder:
     """An interceptor for `nn.intercept_methods` that records the stages of one traced computation,
     in the order in which they end.
 
-    `given` holds what each stage returned, by stage. probes: by stage, the zeros that are added to
-    what the stage takes and to what it returns. None in a first run, which finds their `shapes`.
+    `given` holds what each stage returned, by stage. probes: for each stage, the zeros that are
+    added to what the stage takes and the zeros that are added to what it returns. None: nothing is
+    added, and `shapes` gets the shapes of the zeros.
     """
 
     def __init__(self, probes: dict[str, tuple[Named, Named]] | None = None):
@@ -420,12 +421,12 @@ def diagnose_run(
     networks: LossNetworks = NO_NETWORKS,
     variables: Variables | None = None,
 ) -> Diagnosis:
-    """Repeats the first step of a run that its log calls skipped or not finite, from the newest
-    checkpoint before that step, and returns its diagnosis.
+    """Returns the diagnosis of the first step of a run that its log calls skipped or not finite.
 
-    If the log has no such step, the step that would come next is diagnosed. body, training,
-    networks, variables: as the run had them. Batches are functions of seed and step, so the step is
-    repeated bit for bit on the device that the run had.
+    The run is repeated from the newest checkpoint before that step, or from its start. If the log
+    has no such step, the step after the newest checkpoint is diagnosed. body, training, networks,
+    variables: as the run had them. Batches are functions of seed and step, so the step is repeated
+    bit for bit on the device that the run had.
     Raises: FileNotFoundError if `out` holds no run.
     """
     config = load_config(out)

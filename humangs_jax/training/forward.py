@@ -1,8 +1,9 @@
-"""Runs the network on an example: photos -> canonical Gaussians -> posed as each target -> drawn.
+"""Runs the network on an example, and validates it.
 
-Validation: the same views of the same unseen people every time, with the running statistics, as
-numbers and as a sheet. Several processes share the people; every process ends up with the means
-over all of them.
+The network makes canonical Gaussians of the input photos. They are posed and drawn for each target.
+A validation draws the same views of the same unseen people every time, and normalizes with the
+running statistics. It gives metrics and images for a sheet. Several processes share the people, and
+every process gets the means over all people.
 """
 
 import dataclasses
@@ -164,8 +165,8 @@ def validation_examples(
 def as_validated(config: TrainConfig) -> TrainConfig:
     """Returns the configuration with the views of validations.
 
-    Inputs are evenly spaced and of one pose, as many as the middle one of the training's counts.
-    Targets are as large as the inputs.
+    Inputs are evenly spaced and of one pose. Their number is the middle one of the training's
+    counts. Targets are as large as the inputs.
     """
     counts = sorted(config.views.input_counts)
     views = ViewSampling(
@@ -185,7 +186,9 @@ def as_validated(config: TrainConfig) -> TrainConfig:
 
 def compared_as(base: TrainConfig, make_source: SourceFactory) -> SourceFactory:
     """Returns a source of the people with the photos and targets that `base` is validated on.
-    Variants of the run use it: they change only the size of the photos that the network sees.
+
+    It is for variants of the run `base`. A variant changes only the size of the photos that the
+    network sees.
     """
     own = as_validated(base.at(base.steps - 1))
 
@@ -261,7 +264,9 @@ def validate(
 
 
 def _means(names: Sequence[str], rows: list[dict[str, float]]) -> dict[str, float]:
-    """Returns the means of the metrics over all processes. Some processes may have no rows."""
+    """Returns the means of the metrics over the rows of all processes. Some processes may have no
+    rows. If no process has any, the means are NaN.
+    """
     own = np.asarray([[row[name] for name in names] for row in rows]).reshape(-1, len(names))
     totals = np.append(own.sum(axis=0), len(own))
     if jax.process_count() > 1:

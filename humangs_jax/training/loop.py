@@ -6,12 +6,13 @@ out/log.jsonl                        one object per line; {"step", "loss", ...} 
                                      ...} where something happened
 out/tensorboard/                     the same numbers and the validation images, if tensorboardX is
                                      installed
-out/sheets/STEP.png                  what the network shows of people it was not trained on
+out/sheets/STEP.png                  images of the people of the validation
 out/weights.safetensors              the newest weights (float16), averaged ones where `ema_decay`
                                      is set
-out/best.safetensors                 those of the best validation
+out/best.safetensors                 the weights of the validation with the highest psnr
 
-Of several processes all must see the same folder `out`; one of them writes all but the checkpoints.
+If there are several processes, all must see the same folder `out`. One of them writes everything
+but the checkpoints, which all write.
 """
 
 import contextlib
@@ -69,7 +70,7 @@ NO_ROOM = "(splat, tile) pairs of a step had no room and were not drawn"
 
 class RunLog:
     """Writes the log of a run that continues after `step`, and shows its progress. Records of later
-    steps, which a killed run left, are dropped.
+    steps, which a killed run may have left, are dropped.
 
     recording: whether this process writes and shows anything. It is True in one process only.
     """
@@ -105,10 +106,10 @@ class RunLog:
     def steps(
         self, done: int, metrics: dict[str, Any], subjects: int, waiting: Waiting, broken: int
     ) -> None:
-        """Logs the metrics of the last step done, with times and rates since the last such line.
+        """Logs the metrics of the last step done, with times and rates since the call before.
 
-        subjects: number of subjects in a step. waiting: time that the loop has waited for data,
-        seconds. broken: number of capture folders that could not be used.
+        done: number of steps done. subjects: number of subjects in a step. waiting: time that the
+        loop has waited for data, seconds. broken: number of capture folders that could not be used.
         """
         numbers = {name: float(value) for name, value in metrics.items()}
         before, began, waited = self._previous
@@ -169,7 +170,7 @@ class Watch:
 
     def __init__(self, log: RunLog, state: TrainState):
         self.overflowed = False
-        """Whether the last step that was looked at had no room for some (splat, tile) pairs."""
+        """Whether the step that was read last had no room for some (splat, tile) pairs."""
         self._log, self._pending = log, None
         self._told_of_overflow = False
         self._counts = int(state.opt_state.skipped), int(state.opt_state.nonfinite)
@@ -231,11 +232,11 @@ class Watch:
 
 
 def forget_after(path: Path, step: int) -> None:
-    """Drops the lines of later steps from a log, and a last line that is incomplete. The file
-    changes whole or not at all.
+    """Drops the lines of later steps from a log, and a last line that is incomplete. If writing
+    fails, the log is as before. Without a file at `path`, nothing is done.
 
-    Raises: FileError if the file is no log: no text, too large, or with a line other than the last
-    that is no record.
+    Raises: FileError if the file is no text, is too large, or has a line other than the last that
+    is no record.
     """
     if not path.is_file():
         return
@@ -289,8 +290,8 @@ DROPPED = {
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """`train` was asked to stop before its end, by Ctrl-C, SIGTERM or the loss of a machine. All is
-    saved, and the same call continues the run.
+    """The error of `train` when Ctrl-C, SIGTERM or the loss of a machine asks it to stop. The state
+    is saved, and the same call continues the run.
 
     It is a KeyboardInterrupt, so that a loop of several runs stops, too. state: the saved state.
     """
@@ -317,33 +318,37 @@ def train(
     stop_at: int | None = None,
     progress: bool = True,
 ) -> TrainState:
-    """Train until `config.steps`, on all devices of all processes. If `out` holds a checkpoint,
-    training continues from the newest one.
+    """Trains a network for `config.steps` steps, on all devices of all processes. If `out` holds a
+    checkpoint, training continues from the newest one.
 
-    Ctrl-C and SIGTERM finish the step, save and raise `TrainingInterrupted`; a second Ctrl-C
-    interrupts at once.
+    After Ctrl-C or SIGTERM the current step is finished, the state is saved, and
+    `TrainingInterrupted` is raised. A second Ctrl-C interrupts at once.
 
     Args:
-        config: the run.
-        body: the model that the captures' parameters belong to; made into the model's
-            `gaussian_body` here.
-        training: capture folders, or what makes another source of examples (`sources`).
+        config: configuration of the run.
+        body: body that the captures' parameters belong to. The Gaussians are on the
+            `gaussian_body` that is made from it.
+        training: people to train on: capture folders, or a function that makes another source of
+            examples (see `training.sources`).
         out: folder of checkpoints, logs, sheets and weights.
-        validation: the same of other people; no validation without.
-        validated: how many of these are looked at, the first ones.
-        variables: where to start a new run, for instance shipped weights; None for fresh ones.
-        networks: of the losses that need them.
-        fsdp: how many devices share one copy of the state, see `sharding.training_mesh`.
-        stop_at: end after this step as if interrupted.
-        progress: show a progress bar.
+        validation: other people, in the same two forms. Empty: there are no validations.
+        validated: number of people of `validation` that a validation looks at, from the first on.
+        variables: variables that a new run starts from, for instance shipped weights. None: random
+            variables of `config.seed`.
+        networks: networks of the losses that need them.
+        fsdp: number of devices that share one copy of the state, see `sharding.training_mesh`.
+        stop_at: number of steps of the run after which the call saves the state and returns. A
+            later call continues the run. None: `config.steps`.
+        progress: whether a progress bar is shown.
 
     Returns:
-        The last state.
+        The state after the last step.
 
     Raises:
-        TrainingInterrupted: a KeyboardInterrupt, see above.
+        TrainingInterrupted: after Ctrl-C or SIGTERM.
         ValueError: if `out` belongs to a run of another configuration, no capture can be used,
-            devices and batch do not divide each other, or the sizes of a later stage do not fit.
+            devices, batch and microbatch do not divide each other, the network of a loss is
+            missing, or the sizes of a later stage do not fit.
         OSError: if another process trains into `out`.
 
     Examples:
@@ -506,13 +511,13 @@ def _report(
 
 @contextlib.contextmanager
 def stop_requested() -> Generator[Callable[[int], bool], None, None]:
-    """Yields a function that takes the number of steps done and says whether to stop after them,
-    because of Ctrl-C or SIGTERM, or because the machine is taken away.
+    """Yields a function that takes the number of steps done, and returns whether to stop after
+    them, because of Ctrl-C or SIGTERM, or because the machine is taken away.
 
-    All processes must call the function after every step. A single process checks its own signals;
-    a second signal has its usual effect. Several processes may receive a signal at different steps,
-    so jax's coordination service agrees on a step
-    (https://docs.jax.dev/en/latest/_autosummary/jax.experimental.multihost_utils.html).
+    All processes must call the function after every step. A single process checks its own signals,
+    and a second signal has its usual effect. It receives signals in its main thread only. Several
+    processes may receive a signal at different steps, so jax's coordination service agrees on a
+    step (https://docs.jax.dev/en/latest/_autosummary/jax.experimental.multihost_utils.html).
     """
     if jax.process_count() > 1:
         from jax.experimental import multihost_utils

@@ -51,7 +51,8 @@ def with_measured_room(
     """Returns the configuration of a stage with room for `MARGIN` times what the targets of a batch
     need.
 
-    It is returned unchanged if it sets `max_pairs`, or if measuring saves nothing.
+    The configuration is returned unchanged if it sets `max_pairs`, if `usual_room` is below
+    `WORTH`, or if the measured room is no smaller than `usual_room`.
     """
     usual = usual_room(config, body)
     if config.splat.max_pairs is not None or usual < WORTH:
@@ -68,8 +69,8 @@ def with_measured_room(
 
 
 def with_twice_the_room(config: TrainConfig, body: BodyModel) -> TrainConfig:
-    """Returns the configuration of a stage with twice the room, but never more than
-    `usual_room`.
+    """Returns the configuration of a stage with twice the room. If that is `usual_room` or more,
+    `max_pairs` becomes None.
     """
     splat = config.splat
     pairs = 2 * (splat.max_pairs or 0)

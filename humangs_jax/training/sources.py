@@ -37,7 +37,9 @@ logger = logging.getLogger(__name__)
 SYNTHETIC = "humangs_jax.synthetic"
 """Package of synthetic people, which a run without them does not import."""
 SourceFactory = Callable[[TrainConfig], Source]
-"""Function from the configuration of a stage to a source of examples of its sizes."""
+"""Function that takes the configuration of a stage, and returns a source of examples of its
+sizes.
+"""
 
 
 def stage_loader(
@@ -122,8 +124,9 @@ def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> S
     """Returns a source of the people in a folder of captures, a scene list or a data set
     (docs/datasets.md), whose body is `body`.
 
-    split: which part of synthetic captures to take, see `synthetic.writer.find_people`.
-    Raises: ValueError if the folder holds none of these.
+    split: the split that all people of a synthetic set must belong to, see
+    `synthetic.writer.find_people`. None: any.
+    Raises: ValueError if the folder holds none of these, or people of another split.
     """
     if (data / "capture.json").is_file() or any(data.glob("*/capture.json")):
         folders = find_captures(data)

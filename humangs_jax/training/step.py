@@ -224,8 +224,8 @@ def train_step(
     networks: LossNetworks = NO_NETWORKS,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """Returns the state after one more step, and metrics: `update`, compiled. The state is
-    donated.
+    """Returns the state after one more step, and metrics. It calls `update`, compiled. The state
+    is donated.
     """
     return compiled_update()(
         state, batch, body, networks, seed_numbers(config.seed), compiled_for(config), mesh
@@ -263,7 +263,8 @@ def update(
     Arguments: batch: an `Example` with a leading axis of subjects. body: decimated already.
     networks: those of the losses that need them. seed: from `seed_numbers`. config: static, of one
     stage. mesh: static; with a mesh, state, batch, body and networks lie on it, see `sharding`.
-    Raises: ValueError for parameters of fewer than 32 bits.
+    Raises: ValueError if parameters have fewer than 32 bits, if the subjects of a device cannot be
+    divided into microbatches, or if the network of a loss is missing.
     """
     for name, leaf in inexact_leaves(state.params):
         if jnp.finfo(leaf.dtype).bits < 32:
