@@ -386,13 +386,20 @@ def measure(model, people, name: str, smoothness: float) -> dict:
     errors = 1000 * np.linalg.norm(np.asarray(fit.joints) - truth, axis=-1).mean(-1)
     bad = np.isin(np.arange(FRAMES), spoilt)
     wild = 1000 * np.linalg.norm(np.diff(np.asarray(fit.joints) - truth, 2, axis=1), axis=-1)
-    return {
+    found = {
         "others_mm": float(errors[:, ~bad].mean()),
-        "spoilt_mm": float(errors[:, bad].mean()) if bad.any() else None,
+        "spoilt_mm": None,
         "worst_frame_mm": float(errors[:, ~bad].max()),
-        "tremble_mm": None if bad.any() else float(wild.mean()),
-        "held_to": [float(x) for x in fit.smoothness] if smoothness else None,
+        "tremble_mm": None,
+        "held_to": None,
     }
+    if bad.any():
+        found["spoilt_mm"] = float(errors[:, bad].mean())
+    else:
+        found["tremble_mm"] = float(wild.mean())
+    if smoothness:
+        found["held_to"] = [float(x) for x in fit.smoothness]
+    return found
 
 
 def spoiled(model, people, name: str):

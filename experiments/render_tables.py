@@ -161,16 +161,15 @@ def _protocols() -> Table:
         *("`--protocol`", "background", "PSNR and SSIM see", "LPIPS sees"),
         *("prediction cut out by the true mask", "LPIPS", "SSIM window", "published at, px"),
     )
-    return header, [
-        (
-            *(name, "the photos'" if each.background == "dataset" else each.background),
-            *(seen(each.crops[0]), seen(each.crops[-1])),
-            "yes: hides errors of the silhouette" if each.masked else "no",
-            *(", ".join(each.lpips), windows[each.ssim]),
-            "" if each.published_side is None else str(each.published_side),
-        )
-        for name, each in scores.PROTOCOLS.items()
-    ]
+    rows = []
+    for name, each in scores.PROTOCOLS.items():
+        background = "the photos'" if each.background == "dataset" else each.background
+        cut_out = "yes: hides errors of the silhouette" if each.masked else "no"
+        side = "" if each.published_side is None else str(each.published_side)
+        crops = seen(each.crops[0]), seen(each.crops[-1])
+        lpips = ", ".join(each.lpips)
+        rows.append((name, background, *crops, cut_out, lpips, windows[each.ssim], side))
+    return header, rows
 
 
 def _rooms() -> Table:
@@ -214,14 +213,11 @@ def _videos() -> Table:
     from humangs_jax.avatar.export import VIDEOS
     from humangs_jax.core.registry import FOLDER
 
-    return ("name ends in", "what", "transparent"), [
-        (
-            "none: a folder" if FOLDER in each.suffixes else f"`{each.suffixes[0]}`",
-            each.about,
-            "yes" if each.transparent else "no",
-        )
-        for each in VIDEOS.values()
-    ]
+    rows = []
+    for each in VIDEOS.values():
+        ending = "none: a folder" if FOLDER in each.suffixes else f"`{each.suffixes[0]}`"
+        rows.append((ending, each.about, "yes" if each.transparent else "no"))
+    return ("name ends in", "what", "transparent"), rows
 
 
 def _systems() -> Table:

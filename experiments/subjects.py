@@ -86,12 +86,17 @@ class People:
                 "--subjects, --held-out and --pose-views must be at least 1, --first and --poses at"
                 " least 0"
             )
+        # LPIPS is left out where its weights are not installed
         backbone = installed_lpips().get(self.lpips_net)
-        lpips = load_lpips(self.lpips_net) if backbone else None
+        lpips, lpips_net, lpips_weights = None, None, None
+        if backbone:
+            lpips = load_lpips(self.lpips_net)
+            lpips_net, lpips_weights = self.lpips_net, file_digest(backbone)
+        weights = file_digest(self.weights) if self.weights else shipped_digest(SHIPPED)
         body, (variables, config) = load_body(), load_weights(self.weights)
         seeds = list(seeds_of(self.split, self.first, self.subjects))
         settings = {
-            "weights": file_digest(self.weights) if self.weights else shipped_digest(SHIPPED),
+            "weights": weights,
             "tokens": config.tokens,
             "split": self.split,
             "image_size": self.size,
@@ -100,8 +105,8 @@ class People:
             "pose_views": self.pose_views,
             "ring": RING,
             "generator": GENERATOR_VERSION,
-            "lpips_net": self.lpips_net if lpips else None,
-            "lpips_weights": file_digest(backbone) if backbone else None,
+            "lpips_net": lpips_net,
+            "lpips_weights": lpips_weights,
         }
         held_out = HeldOut(self.held_out, self.poses, self.pose_views)
         return Start(body, variables, config, seeds, held_out, self.size, lpips, settings)

@@ -282,11 +282,18 @@ def scores(row: Row) -> list[str]:
 
 SIZES = {"memory_mb": ("MiB", 0), "file_mb": ("file, MiB", 2), "gaussians": ("Gaussians", 0)}
 MEASURES = ["reconstruction", "frame", *(heading for heading, _ in SIZES.values())]
-HEADINGS = [
-    f"{name}: {heading}" if i == 0 else heading
-    for name in TASKS.values()
-    for i, (heading, _) in enumerate(SCORES.values())
-]
+
+
+def _headings() -> list[str]:
+    """Returns the headings of the scores. The first one of each task names the task."""
+    found = []
+    for task in TASKS.values():
+        first, *others = (heading for heading, _ in SCORES.values())
+        found += [f"{task}: {first}", *others]
+    return found
+
+
+HEADINGS = _headings()
 
 
 def point_table(rows: list[Row], result: dict[str, Any]) -> str:
@@ -354,7 +361,8 @@ def draw(rows: list[Row], key: str, path: Path) -> None:
                 axis.annotate(
                     row["name"], at, place, fontsize=8, textcoords="offset points", arrowprops=line
                 )
-            label = f"{'reconstruction' if key == 'reconstruct' else 'frame'} time / default"
+            what = "reconstruction" if key == "reconstruct" else "frame"
+            label = f"{what} time / default"
             axis.set(xscale="log", title=title, ylabel="PSNR, dB", xlabel=label)
             axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axis.xaxis.set_major_formatter("{x:g}")

@@ -438,7 +438,8 @@ def first_variables(sample: Sample, start: str | None) -> Any:
         return variables
 
     # weights to start from may have fewer layers than a `Refiner` has now
-    given = (load_refiner() if start == "shipped" else read_refiner(start))["params"]
+    loaded = load_refiner() if start == "shipped" else read_refiner(start)
+    given = loaded["params"]
     new = variables["params"]
     for layer, own in given.items():
         if layer not in new or jax.tree.map(jnp.shape, new[layer]) != jax.tree.map(jnp.shape, own):

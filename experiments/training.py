@@ -166,7 +166,8 @@ def step_numbers(name: str, repeats: int) -> dict[str, Any]:
     """Returns time, arithmetic and memory of a training step of a case."""
     jax.config.update("jax_enable_compilation_cache", False)
     config, body = settings(*CASES[name]), load_body()
-    config = with_model(config, dtype="float32" if jax.default_backend() == "cpu" else "bfloat16")
+    dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
+    config = with_model(config, dtype=dtype)
     networks, carrier = random_networks(config), gaussian_body(body, config.model)
     size = config.model.conventions.image_size
     # a batch, as the loader of a run makes it
@@ -204,7 +205,9 @@ def step_numbers(name: str, repeats: int) -> dict[str, Any]:
     (wall, cpu), model = map(float, times["step"]), config.model
     floor = costs.flops / product_flops * times["matmul"]
     side = model.conventions.image_size // model.architecture.encoder.patch_size
-    patches = config.views.input_counts[0] * side**2
+    tokens = config.views.input_counts[0] * side**2
+    if model.tokens == "foreground":
+        tokens = model.runtime.token_capacity
     return {
         "ms": wall,
         "cpu_ms": cpu,
@@ -214,7 +217,7 @@ def step_numbers(name: str, repeats: int) -> dict[str, Any]:
         "temporary_mb": temporary_mb(program),
         "peak_rss_mb": memory_status("VmHWM"),
         "compile_cpu_s": compile_s,
-        "tokens": model.runtime.token_capacity if model.tokens == "foreground" else patches,
+        "tokens": tokens,
         "gaussians": len(carrier.template) * model.architecture.decoder.gaussians_per_vertex,
         "losses": metrics,
         "dtype": model.runtime.dtype,

@@ -74,8 +74,10 @@ def versions(
     for name, numbers in rows.items():
         cells = [f"{numbers['render_ms']:.1f}", f"{numbers['gradient_ms']:.1f}"]
         cells.append(f"{numbers['refine_ms'] / 1e3:.1f}")
-        cells.append(f"{numbers['step_ms'] / 1e3:.1f}" if "step_ms" in numbers else "-")
-        table.append([name, *cells])
+        step = "-"
+        if "step_ms" in numbers:
+            step = f"{numbers['step_ms'] / 1e3:.1f}"
+        table.append([name, *cells, step])
     run.show(markdown_table(["", *MEASURED.values()], table), rows)
 
 

@@ -79,11 +79,11 @@ def load_arrays(path: Path) -> dict[str, Any]:
         if name not in arrays:
             raise ValueError(f"{path}: array {name!r} is missing")
         shape, axes = arrays[name].shape, axes.split()
-        wanted = tuple(
-            int(a) if a.isdigit() else sizes.setdefault(a, n)
-            for a, n in zip(axes, shape, strict=False)
-        )
-        if len(shape) != len(axes) or shape != wanted or 0 in shape:
+        # an axis is a number, or a letter that has the same size in all arrays
+        wanted = []
+        for axis, length in zip(axes, shape, strict=False):
+            wanted.append(int(axis) if axis.isdigit() else sizes.setdefault(axis, length))
+        if len(shape) != len(axes) or list(shape) != wanted or 0 in shape:
             raise ValueError(
                 f"{path}: {name} has shape {shape}, expected ({', '.join(axes)}) with {sizes}"
             )
@@ -162,7 +162,9 @@ def complete_config(
         decoder = decoder.clone(tight=tight, free=free)
     pool = "visible" if release.get("transformer.project_all_vertices") is False else "all"
     config = config.with_parts(decoder=decoder).with_conventions(image_size=image_size, pool=pool)
-    return config.with_runtime(dtype="bfloat16" if dtype == "bfloat16" else "float32")
+    # float64 comes from the inputs
+    runtime_dtype = "bfloat16" if dtype == "bfloat16" else "float32"
+    return config.with_runtime(dtype=runtime_dtype)
 
 
 def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:

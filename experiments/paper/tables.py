@@ -191,12 +191,12 @@ def settings_of(options: Compared, given: Collection[str]) -> dict[str, Any]:
     for text in given:
         name, _, file = text.partition("=")
         weights[name] = file_digest(Path(file))
-    return {
-        "weights": weights,
-        "runs": file_digest(options.runs / "results.json") if options.runs else None,
-        "indices": file_digest(options.indices) if options.indices else None,
-        "people": names,
-    }
+    runs, indices = None, None
+    if options.runs:
+        runs = file_digest(options.runs / "results.json")
+    if options.indices:
+        indices = file_digest(options.indices)
+    return {"weights": weights, "runs": runs, "indices": indices, "people": names}
 
 
 def shown(value: Any) -> Any:

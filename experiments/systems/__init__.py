@@ -43,8 +43,8 @@ BENCH = {"image_size": 32, "body_vertices": 800, "max_edge_length": None}
 
 
 def humangs(size: Size = "published") -> HumanGSConfig:
-    """The paper's network; on the bench narrower and of four layers, for smaller photos of a
-    coarser body, and nothing else.
+    """The paper's network. On the bench it is narrower and has four layers, for smaller photos of a
+    coarser body. Nothing else differs.
     """
     config = presets.paper()
     if size == "published":
@@ -60,8 +60,8 @@ def humangs(size: Size = "published") -> HumanGSConfig:
 
 
 def ours(size: Size = "published") -> HumanGSConfig:
-    """The network that we ship, with our additions: shells, photo colors, Gaussians in the frame of
-    the normals, the person's tokens alone; 1 + 2 Gaussians and no upsampler.
+    """The shipped network with our additions: shells, photo colors, Gaussians in the frame of the
+    normals, and tokens of the person alone. It has 1 + 2 Gaussians a vertex and no upsampler.
     """
     config = presets.small()
     if size == "published":
@@ -91,9 +91,9 @@ def _sized(size: Size, conventions: Conventions, *parts: Any) -> HumanGSConfig:
 
 
 def lvsm(size: Size = "published") -> HumanGSConfig:
-    """LVSM-style (`pixel_queries`), decoder-only, 24 layers.
+    """LVSM-style (`pixel_queries`): a decoder alone, with 24 layers.
 
-    Novel views only: it cannot be animated.
+    It shows novel views only, and cannot be animated.
     """
     parts = PlainPhotos(patch_size=8), NoReader(), PhotoDecoder()
     if size == "bench":
@@ -104,9 +104,9 @@ def lvsm(size: Size = "published") -> HumanGSConfig:
 
 
 def lvsm_latents(size: Size = "published") -> HumanGSConfig:
-    """LVSM's encoder-decoder: photos become latents once, and a target attends to these.
+    """LVSM's encoder-decoder: photos become latents once, and a target attends to the latents.
 
-    12 + 12 layers, 3,072 latents.
+    It has 12 + 12 layers and 3,072 latents.
     """
     if size == "published":
         driver = QueryDriver(TransformerConfig(layers=12, class_token=False), latents=3072)
@@ -151,8 +151,8 @@ def giga(size: Size = "published") -> HumanGSConfig:
 
 def animatable(size: Size = "published") -> HumanGSConfig:
     """Animatable-Gaussians-style (`surface_gaussians`): maps of front and back, fitted to ONE
-    person: train it on that person's photos alone, and anew for the next. Photos that
-    reconstruction or evaluation give are ignored.
+    person. It is trained on that person's photos alone, and anew for the next person. Photos of
+    reconstruction or evaluation are ignored.
     """
     if size == "published":
         driver, surface = PoseMapDriver(), SurfaceMap("front_back", 1024)
@@ -177,8 +177,8 @@ def lca(size: Size = "published") -> HumanGSConfig:
 
 
 def back_projection(size: Size = "published") -> HumanGSConfig:
-    """The paper's network without its upsampler: the partner of `cross_attention`, from which it
-    differs in the reader alone.
+    """The paper's network without its upsampler. It differs from `cross_attention` in the reader
+    alone.
     """
     config = humangs(size)
     encoder, reader, _ = paper_parts(config.architecture)
@@ -188,8 +188,8 @@ def back_projection(size: Size = "published") -> HumanGSConfig:
 
 
 def cross_attention(size: Size = "published") -> HumanGSConfig:
-    """The same with vertices that attend to all image tokens: what the paper's second claim is
-    about.
+    """The network of `back_projection` with vertices that attend to all image tokens, which the
+    paper's second claim is about.
     """
     reader = CrossAttentionReader()
     if size == "bench":
@@ -198,10 +198,10 @@ def cross_attention(size: Size = "published") -> HumanGSConfig:
 
 
 def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) -> HumanGSConfig:
-    """LHM-style (`two_stream`), LHM-500M's sizes: one photo without its camera and pose.
+    """LHM-style (`two_stream`) with the sizes of LHM-500M: one photo without its camera and pose.
 
-    Tokens have 16 pixels a side as those of Sapiens. A Gaussian a vertex; edges of 1.28 cm give the
-    default body about as many as their 40,000 points.
+    Tokens have 16 pixels a side, as those of Sapiens. Each vertex has a Gaussian. With edges of
+    1.28 cm the default body has about as many vertices as LHM has points, 40,000.
     """
     if size == "published":
         encoder = _photo_encoder(TransformerConfig(width=1024, class_token=False), patch_size=16)
@@ -224,13 +224,13 @@ def lhm_views(size: Size = "published") -> HumanGSConfig:
 
 
 def lhm_plus(size: Size = "published") -> HumanGSConfig:
-    """LHM++-style: any number of photos, tokens meet points that four vertices share."""
+    """LHM++-style: any number of photos, whose tokens meet points that four vertices share."""
     return lhm(size, most_views=None, pooling=4)
 
 
 def gst(size: Size = "published") -> HumanGSConfig:
-    """GST-style (`grouped`): one photo of 256 pixels; HMR2's ViT-H in size (1280 wide, 32 layers,
-    patches of 16).
+    """GST-style (`grouped`): one photo of 256 pixels, with an encoder of the size of HMR2's ViT-H
+    (1280 wide, 32 layers, patches of 16).
     """
     if size == "published":
         encoder = _photo_encoder(
@@ -245,7 +245,7 @@ def gst(size: Size = "published") -> HumanGSConfig:
 
 
 def ghg(size: Size = "published") -> HumanGSConfig:
-    """GHG-style (`shell_textures`): copied colors on five shells; no transformer."""
+    """GHG-style (`shell_textures`): colors copied to five shells, without a transformer."""
     if size == "published":
         reader, decoder = ShellTextureReader(SurfaceMap("atlas", 1024)), ShellDecoder()
     else:
@@ -256,9 +256,9 @@ def ghg(size: Size = "published") -> HumanGSConfig:
 
 
 def gps(size: Size = "published") -> HumanGSConfig:
-    """GPS-Gaussian-style (`stereo`): a Gaussian for every pixel of the two nearest of the photos.
+    """GPS-Gaussian-style (`stereo`): a Gaussian for every pixel of the two nearest photos.
 
-    Novel views only.
+    It shows novel views only.
     """
     decoder = StereoDecoder() if size == "published" else StereoDecoder((16, 32, 64), planes=24)
     parts = PlainPhotos(patch_size=8), NoReader(), decoder, NearestPairDriver()
