@@ -1,4 +1,4 @@
-"""How an image is compared with a photo in which the person has moved by pixels, and the rule by
+"""Compares an image with a photo in which the person has moved by pixels. Also has the rule by
 which photos decide whether something new is better.
 
 A body whose pose is off by centimetres draws everything a few pixels beside where the photo shows
@@ -9,8 +9,11 @@ at most `REACH`:
     e(p) = |I(p + d(p)) - P(p)|^2,   d(p) = argmin over |d| <= r of
            mean over q in W(p) of |I(q + d) - P(q)|^2 + `RELUCTANCE` |d|^2 / r^2.
 
-The same moves, made smooth, bring a photo to where the image has the person (`smooth_moves`,
-`moved_photo`). Images are on the host, colors and alpha side by side.
+Each square is a mean over the channels. The mean of I - P in the window, squared, is subtracted
+from the cost, so that a difference in brightness does not count there.
+
+The same moves, made smooth, bring a photo to where the image shows the person (`smooth_moves`,
+`moved_photo`). Images are on the host. They have colors and alpha side by side.
 """
 
 from collections.abc import Iterable
@@ -22,11 +25,13 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.losses.losses import LARGEST_PSNR
 
 REACH = 0.02
-"""Largest move, as a share of the person's height in the photo: 3.5 cm of a grown-up."""
+"""Largest move, as a share of the person's height in the photo. It is 3.5 cm for a grown-up."""
 WINDOW = 0.08
-"""Side of a window, as a share of the person's height: a hand's. Smaller ones fit too much."""
+"""Side of a window, as a share of the person's height. It is about a hand's. Smaller windows fit
+too much.
+"""
 RELUCTANCE = 2e-4
-"""Squared error that the largest move has to win, so that windows without detail stay."""
+"""Squared error by which the largest move has to be better, so that windows without detail stay."""
 SMOOTHNESS = 0.04
 """Standard deviation of the weights that make moves smooth, as a share of the person's height."""
 LARGEST = 128
@@ -38,14 +43,14 @@ NOBODY = 1e-3
 ASKED = 3
 """Largest number of photos that are compared. Two that agree are enough."""
 CLEAR = 1.0
-"""Gain beyond the needed one at which a single photo is enough, decibels."""
+"""Gain beyond the needed gain at which a single photo is enough, decibels."""
 
 
 def _aligned_errors(
     image: Float[np.ndarray, "h w c"], photo: Float[np.ndarray, "h w c"], reach: int, window: int
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 2"]]:
-    """Returns the squared errors e (means over the channels), and the moves d in pixels (y, x), see
-    above.
+    """Returns the squared errors e, (h, w), which are means over the channels, and the moves d in
+    pixels (y, x), (h, w, 2). See the head of this module.
 
     Args:
         image: what was drawn.
@@ -78,8 +83,8 @@ def aligned_psnr(
     photo: Float[np.ndarray, "h w 4"],
     counted: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """Returns the PSNR in dB of colors and alpha against a photo and its mask after moves of
-    windows.
+    """Returns the PSNR of colors and alpha against a photo and its mask, after moves of windows,
+    dB.
 
     Args:
         image: colors on white, and alpha.
@@ -107,8 +112,8 @@ def aligned_psnr(
 def smooth_moves(
     image: Float[np.ndarray, "h w 4"], photo: Float[np.ndarray, "h w 4"]
 ) -> Float[np.ndarray, "h w 2"]:
-    """Returns the moves in pixels (y, x), (h, w, 2), that bring the photo's person to where the
-    image has the person.
+    """Returns the moves in pixels (y, x), (h, w, 2), that bring the person of the photo to where
+    the image shows the person.
 
     They are means of the moves around each pixel, weighted by distance and by whether a pixel shows
     the person.
@@ -128,8 +133,8 @@ def smooth_moves(
 
 
 def misplaced(image: Float[np.ndarray, "h w 4"], photo: Float[np.ndarray, "h w 4"]) -> float:
-    """Returns the mean length of the smooth moves over the person, as a share of the person's
-    height.
+    """Returns the mean length of the smooth moves over the person in the photo, as a share of the
+    person's height. It is 0 if the photo shows nobody.
     """
     person = photo[..., 3] > 0.5
     if not person.any():
@@ -156,8 +161,8 @@ def _sampled(
 
 
 def _person_height(mask: Float[np.ndarray, "h w"]) -> int:
-    """Returns the number of rows from the first to the last of a mask, or of the whole image if the
-    mask is empty.
+    """Returns the number of rows from the first to the last row in which a mask exceeds 0.5. If it
+    nowhere does, returns the number of all rows.
     """
     rows = np.flatnonzero((mask > 0.5).any(axis=1))
     if len(rows):
@@ -166,15 +171,15 @@ def _person_height(mask: Float[np.ndarray, "h w"]) -> int:
 
 
 def sizes(height: float) -> tuple[int, int]:
-    """Returns the largest move and the side of the windows, pixels, for a person of a height in
+    """Returns the largest move and the side of the windows, pixels. height: of the person,
     pixels.
     """
     return max(1, round(REACH * height)), max(3, round(WINDOW * height))
 
 
 def reduced(image: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray, "rows columns c"]:
-    """Returns an image averaged over squares of `factor` pixels a side. Rows and columns left over
-    at the far edges are cut.
+    """Returns an image averaged over squares of `factor` pixels a side. Rows and columns that are
+    left over at the bottom and the right are cut off.
     """
     rows, columns = (size // factor for size in image.shape[:2])
     squares = image[: rows * factor, : columns * factor]
@@ -183,17 +188,17 @@ def reduced(image: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray,
 
 
 def photos_agree(gains: Iterable[float], least: float) -> bool:
-    """Says whether photos say that something new is to be kept: most of those that are asked gain
-    at least `least`.
+    """Returns whether something new is kept: whether most of the photos that are asked gain at
+    least `least`.
 
-    A photo whose pose is off loses by what is right, so that no photo alone can say no; two of
-    three can. But no photo gains a lot by what is wrong: one that gains `CLEAR` more is enough.
-    Without any gain: no.
+    A photo whose pose is off loses by what is right, so it takes two of `ASKED` photos to say no.
+    But no photo gains a lot by what is wrong, so a single photo that gains `CLEAR` more than
+    `least` is enough. Without any gains the result is False.
 
     Args:
-        gains: decibels, new score minus old one, of one photo after the other. They are computed
-            when they are asked for.
-        least: what a photo has to gain, decibels; negative where it may lose.
+        gains: the new score minus the old score of one photo after the other, decibels. They are
+            read only until the result is certain.
+        least: the gain that a photo needs, decibels. It is negative if the photo may lose.
     """
     yes = no = 0
     for gain in gains:

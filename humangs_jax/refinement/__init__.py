@@ -1,3 +1,4 @@
-"""`refine` is the loop, `steps` the pure state and step, `search` what a run tries, `head` its last
-steps, and `learned` the learned optimizer.
+"""Fits avatars to photos. `refine` has the API, `search` decides what a run tries, `learned` has
+the iterations of the learned optimizer, `steps` has the steps of Adam, and `head` has the last
+steps, on the head alone.
 """

@@ -23,7 +23,7 @@ from humangs_jax.core.configuration import (
 MEASURED = "refinement.md"
 ITERATIONS = 4
 """The number of iterations with which the learned update was trained. docs/tradeoff.md says what
-each gains.
+each iteration gains.
 """
 
 HEAD = ("head", "jaw", "eye")
@@ -34,12 +34,13 @@ HEAD_STEPS = 500
 
 @configuration
 class LearningRates:
-    """Change of each parameter in a step of Adam, in the space in which it is optimised; `refine`
-    lowers all by a cosine and, after iterations, in long runs (`RefineConfig.full_steps`).
+    """How far a step of Adam moves each parameter, in the space in which the parameter is
+    optimised. `refine` lowers all rates by a cosine during a run, and in long runs after iterations
+    (`RefineConfig.full_steps`).
     """
 
     means: Spread = 2e-4
-    """The rate of the places in the T-pose, metres."""
+    """The rate of the Gaussians' centres in the T-pose, metres."""
     quats: Spread = 2e-3
     """The rate of quaternions that start at unit length."""
     log_scales: Spread = 1e-2
@@ -66,54 +67,62 @@ class RefineConfig:
     )
     """Limit of the optimizer's steps. None: no limit.
 
-    0: iterations alone, which are always finished.
+    0: iterations, and steps on the head alone. Both are always finished.
     """
     seconds: Annotated[float, Range(1e-6, 1e6)] | None = knob(
         5.0, cost="blur at few", gain="time", measured=MEASURED
     )
-    """Limit of the run without compilation; with `steps`, what ends earlier counts. None: no limit.
-    It becomes a number of steps before the first step, by the time that a few take; that number,
-    `Refinement.planned`, repeats the run exactly."""
+    """Limit of the run's seconds, without compilation. With `steps`, the lower limit counts. None:
+    no limit. Before the first step, the seconds become a number of steps, by the time that a few
+    steps take. This number is `Refinement.planned`, which repeats the run.
+    """
     head_steps: RefineSteps = knob(
         HEAD_STEPS,
         cost="time in proportion",
         gain="detail of faces",
         measured="benchmarks/quality.md",
     )
-    """Steps on the head alone afterwards, where photos have 512 pixels or more, and calibrated
-    cameras or a pose each, and `seconds` is None or `steps` 0; 0: none. They move the Gaussians of
+    """Number of steps on the head alone, after all others. They are made if the longer side of the
+    photos, at most `image_size`, has 512 pixels or more, if cameras are calibrated or each of
+    several photos has a pose, and if `seconds` is None or `steps` is 0. They move the Gaussians of
     the head by crops of the photos around it, and hold back what grows beyond the masks (see
-    `head.py`)."""
+    `head.py`).
+    """
     region: tuple[str, ...] = HEAD
-    """The region of interest of `head_steps`: parts of the names of its joints; `("left_wrist",
+    """Parts of the names of the joints whose Gaussians the `head_steps` move. `("left_wrist",
     "left_index")` is a hand.
     """
     image_size: PhotoSide | None = knob(
         None, cost="detail of the photos", gain="time of a step", measured=MEASURED
     )
-    """Photos whose longer side is larger are reduced to it, pixels. None: photos as they are."""
+    """Largest longer side of the photos, pixels. Larger photos are reduced to it, except for the
+    crops of `head_steps`. None: no photo is reduced.
+    """
     structural: Weight = 0.2
     """Weight of the structural dissimilarity beside the L1 distance of colors."""
     silhouette: Weight = 0.1
     """Weight of |alpha - mask| beside the L1 distance of colors."""
     optimizer: Literal["adam", "adabelief", "lion", "rmsprop", "sgd"] = "adam"
-    """What scales the gradients, by its name in optax. The rates suit the steps of Adam."""
+    """Name of the method of optax that scales the gradients. The rates suit the steps of Adam."""
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     """How far a step moves each parameter."""
     full_steps: Steps = 100
-    """After iterations, a run of more steps than this takes smaller ones in proportion: Gaussians
-    that move further overfit to the photos."""
+    """After iterations, a run of more steps than this takes smaller steps in proportion, because
+    Gaussians that move further overfit to the photos.
+    """
     visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
-    """A Gaussian whose largest weight on a pixel of the photos is at least this moves at the full
-    rate, others more slowly; what no photo shows stays."""
+    """Weight on a pixel of a photo from which on steps move a Gaussian at the full rate. Gaussians
+    with a smaller largest weight move more slowly, and those that no photo shows stay.
+    """
     held_out: Share = 0.05
-    """With fewer photos than `search.HELD_OUT_PHOTOS` the share of the pixels, in square blocks,
-    that no iteration and no step sees: the state with the highest PSNR on them is returned. With as
-    many or more, any share above 0 holds one whole photo out of a trial, a third of the steps,
-    which decides by its PSNR whether the iterations and how many of the steps are kept; then all
-    photos are fitted. 0: nothing is held out, and the last state is returned."""
+    """Share of the pixels that no iteration and no step sees, in square blocks, with fewer photos
+    than `search.HELD_OUT_PHOTOS`. The state with the highest PSNR on these pixels is kept. With as
+    many photos or more, any share above 0 means that trials leave out one whole photo each. Its
+    PSNR decides whether the iterations and how many of the steps are kept; then all photos are
+    fitted. Trials take a third of the steps. 0: nothing is held out, and the last state is kept.
+    """
     checks: Count = 5
-    """How often the PSNR is measured."""
+    """How many times the PSNR is measured during a run of steps."""
     seed: Seed = 0
     """The seed of the order of the photos and of the blocks."""
 
@@ -135,4 +144,6 @@ class RefineConfig:
 
 
 ITERATIONS_ALONE = RefineConfig(steps=0, seconds=None, image_size=512)
-"""Refinement where nothing is asked for: some seconds, however large the photos."""
+"""The refinement that commands make by default: iterations and steps on the head, on photos of at
+most 512 pixels. It takes some seconds.
+"""

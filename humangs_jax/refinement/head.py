@@ -1,9 +1,9 @@
 """Refines the head, or another region, alone, by steps on crops of the photos around it: people
 look there for detail.
 
-Only Gaussians of the head move; those around it are drawn. Colors are compared inside of the masks,
-and alpha beyond a mask costs more than in steps on the whole person, so that little coverage grows
-at the silhouette.
+Only Gaussians of the head move. Gaussians around it are drawn, but stay. Colors are compared inside
+of the masks, and alpha beyond a mask costs more than in steps on the whole person, so that little
+coverage grows at the silhouette.
 """
 
 import dataclasses
@@ -39,11 +39,13 @@ from humangs_jax.refinement.steps import RefineState, started, update
 from humangs_jax.rendering.splat_config import SplatConfig
 
 LEAST_SIDE = 512
-"""The least longer side of photos for steps on the head, pixels. From it on heads show more detail
-than the iterations reach.
+"""The least longer side of photos for steps on the head, pixels. In such photos heads show more
+detail than the iterations reach.
 """
 LARGEST_HEAD = 112
-"""The largest side of a head in pixels. Photos are reduced until heads are no larger."""
+"""The side that the largest head should have, pixels. Photos are reduced until it is about as
+small.
+"""
 LOOK = 1024
 """The largest longer side of the photos in which heads are looked for, pixels. Crops are made of
 photos of at most twice this side.
@@ -59,7 +61,7 @@ EXCESS = 1.0
 OPAQUE = 0.1
 """Gaussians of the head with more opacity than this have to lie in the crops."""
 OUTLIERS = 1.0
-"""Percent of these Gaussians, at each side, that may lie outside of the crops."""
+"""Percent of these Gaussians that may lie outside of the crops, at each side."""
 FAR = 1e4
 """Bound of the coordinates of points outside of photos, pixels."""
 PARTS = 10
@@ -82,7 +84,8 @@ class Crops(NamedTuple):
 
 
 def shows_heads(capture: Capture, config: RefineConfig) -> bool:
-    """Returns whether photos are large enough for steps on the head, and heads are in their places.
+    """Returns whether the photos are large enough for steps on the head, and show heads where the
+    poses and cameras have them.
 
     If the cameras were found from the person and all photos share one pose, heads are centimetres
     off. That blurs a face, and the steps would fit the blur. A pose for each photo avoids this.
@@ -140,7 +143,7 @@ def _advanced(
     settings: RefineConfig,
     clock: Clock,
 ) -> RefineState:
-    """Returns the state at step `stop`, with buffers that have room for everything."""
+    """Returns the state at step `stop`. Its buffers have room for everything."""
 
     def advanced(splat: SplatConfig) -> tuple[RefineState, Array]:
         begin = replace(state, splat=splat, overflow=from_host(0, np.int32))
@@ -170,8 +173,8 @@ def _steps(
 
 
 def head_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
-    """Returns `image_loss` of the colors inside the mask, plus the weighted mean of what alpha
-    exceeds the mask by.
+    """Returns `image_loss` of the colors inside the mask, plus `EXCESS` times the mean excess of
+    alpha over the mask.
     """
     rgb = photo.image + photo.mask[..., None] * (image[0] - photo.image)
     return image_loss((rgb, image[1]), photo, config) + EXCESS * jnp.mean(
@@ -231,15 +234,15 @@ def head_crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) ->
 
 
 def _power(number: int) -> int:
-    """Returns the least power of two that is not below a number. Fewer different numbers need fewer
-    programs.
+    """Returns the smallest power of two that is not below `number`. Fewer different numbers need
+    fewer programs.
     """
     return 1 << max(0, number - 1).bit_length()
 
 
 def _pixels(avatar: Avatar, views: SubjectViews) -> Float[np.ndarray, "v g 2"]:
-    """Returns the pixels at which the views show the centres of the Gaussians; infinity for those
-    behind a camera.
+    """Returns the positions (x, y) at which the views show the centres of the Gaussians, (v, g, 2),
+    pixels. They are infinite for Gaussians behind a camera.
     """
     found = []
     for rotations, translation, camera in zip(
@@ -256,8 +259,11 @@ _projected = jax.jit(project)
 def _squares(
     pixels: Float[np.ndarray, "v g 2"], views: SubjectViews
 ) -> tuple[Int[np.ndarray, " s"], Float[np.ndarray, "v 2"], int]:
-    """Returns the views that show most of the points, the middles (y, x) of the squares that the
-    points fill in each view, and the largest side of these squares; pixels.
+    """Returns the views that show the points, (s,), the middle (y, x) of the points in each view,
+    (v, 2), pixels, and the side of the largest square that the points fill in these views, pixels.
+
+    A view shows the points if their middle lies in the image and their square is no larger than the
+    image. `OUTLIERS` percent of the points at each side are ignored.
     """
     low, high = np.percentile(np.clip(pixels, -FAR, FAR), (OUTLIERS, 100 - OUTLIERS), axis=1)[
         ..., ::-1

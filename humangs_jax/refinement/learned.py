@@ -1,16 +1,17 @@
-"""Learned refinement: in a few iterations a small recurrent network reads the photos' errors at
-every Gaussian and moves it.
+"""Refines by a learned optimizer: in a few iterations, a small recurrent network reads the photos'
+errors at every Gaussian and moves it.
 
-After ReSplat (https://arxiv.org/abs/2510.08575): the input views are drawn, their errors are
-gathered at the Gaussians, and a network that knows the neighbours adds to their parameters; one set
-of weights for all iterations, no gradient through the errors.
-Ours: the errors arrive as the gradient of the squared error with respect to each Gaussian's
-parameters, in place of features of a frozen network, and the neighbours are those in the T-pose, at
-two levels: of Gaussians, and of clusters of them. Between two photos, the nearest silhouette that a
-photo shows can be 20 cm away. Messages between Gaussians reach 5 cm; clusters carry them on.
+As in ReSplat (https://arxiv.org/abs/2510.08575), the input views are drawn, their errors are
+gathered at the Gaussians, and a network that knows the neighbours adds to their parameters. All
+iterations have the same weights, and no gradient passes through the errors. Two points differ. The
+errors arrive as the gradient of the squared error with respect to each Gaussian's parameters, and
+not as features of a frozen network. The neighbours are those in the T-pose, at two levels:
+Gaussians, and clusters of Gaussians. Between two photos, the nearest silhouette that a photo shows
+can be 20 cm away. Messages between Gaussians reach 5 cm; clusters carry them on.
 
-Trained (`python -m experiments train_refiner`) on views that are not among the photos. Parts that
-no photo shows move with their neighbours. Gradient descent on the photos cannot do that.
+The network was trained (`python -m experiments train_refiner`) on views that are not among the
+photos. Parts that no photo shows move with their neighbours. Gradient descent on the photos cannot
+do that.
 """
 
 import functools
@@ -43,8 +44,8 @@ FIELDS = ("means", "quats", "log_scales", "opacity_logits", "color_logits")
 COLUMNS = 14
 """The number of parameters of a Gaussian, all `FIELDS` side by side."""
 LARGEST_MOVES = np.asarray([0.01] * 3 + [0.1] * 4 + [0.2] * 3 + [0.5] * 4, np.float32)
-"""How far an output of 1 moves each parameter: metres, quaternion components, log scales, logits of
-opacity and colors.
+"""How far an output of 1 moves each parameter, (14,): metres, quaternion components, log scales,
+logits of opacity and colors.
 """
 NEIGHBORS = 8
 CLUSTER_LEVELS = 9
@@ -58,28 +59,30 @@ PERSON = 8000.0
 to it, so that the size of the photos does not matter.
 """
 SEEN = 0.02
-"""A Gaussian counts as seen in a photo if its largest weight on a pixel is at least this."""
+"""Largest weight on a pixel from which on a Gaussian counts fully as seen in a photo. A smaller
+weight counts in proportion.
+"""
 TYPICAL_LOG_SCALE = -4.5
 MOST_PHOTOS = 6
-"""The most photos that an iteration reads, as in training. The network does not know sums over more
-photos, and these take longer.
+"""The largest number of photos that an iteration reads, as in training. The network does not know
+sums over more photos, and more photos take longer.
 """
 
 
 @pytree_dataclass
 class Signals:
-    """What photos show about g Gaussians. Without the axis v, the signals are those of one
-    photo.
+    """The signals of v photos about g Gaussians, or of one photo without the axis v. Sums over
+    pixels are scaled to a person of `PERSON` pixels.
     """
 
     gradients: Float[Array, "*v g 14"]
     """Gradients of the sum of squared errors of colors and coverage, (v, g, 14). For the colors of
-    Gaussians only errors in the foreground count.
+    Gaussians, the errors of a pixel are weighted by the mask.
     """
     visibility: Float[Array, "*v g"]
-    """The largest weight of each Gaussian on a pixel, (v, g)."""
+    """The largest weight of each Gaussian on any pixel of the rendering, (v, g)."""
     pixels: Float[Array, "*v g"]
-    """The sum of each Gaussian's weights over the pixels, (v, g)."""
+    """The sum of each Gaussian's weights over all pixels of the rendering, (v, g)."""
 
 
 @pytree_dataclass
@@ -89,12 +92,14 @@ class Neighbors:
     index: Int[Array, "g k"]
     """The neighbours of each point, (g, k). Unused places hold the point itself."""
     share: Float[Array, "g k"]
-    """1 / the number of a point's neighbours where `index` holds a neighbour, else 0, (g, k)."""
+    """1 / the number of a point's neighbours where `index` holds a neighbour, and 0 elsewhere, (g,
+    k).
+    """
 
 
 @pytree_dataclass
 class Graph:
-    """The graph of g Gaussians, and that of the clusters that they form."""
+    """The graph of g Gaussians, and the graph of the clusters that they form."""
 
     gaussians: Neighbors
     """The neighbours of each Gaussian."""
@@ -122,7 +127,7 @@ def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
 
 
 def graph_like(g: int) -> Graph:
-    """Returns an empty graph, whose arrays have the shapes of the graph of g Gaussians."""
+    """Returns a graph of zeros, whose arrays have the shapes of the graph of g Gaussians."""
 
     def neighbors(count: int) -> Neighbors:
         index = np.zeros((count, NEIGHBORS))
@@ -135,8 +140,9 @@ def graph_like(g: int) -> Graph:
 
 
 def clusters_of(means: Float[np.ndarray, "g 3"]) -> Int[np.ndarray, "c m"]:
-    """Returns the indices of the Gaussians in each of 2**CLUSTER_LEVELS clusters of equal size.
-    Clusters are halved along their longest side, again and again.
+    """Returns the indices of the Gaussians in each of 2**CLUSTER_LEVELS clusters of equal size. All
+    Gaussians are one cluster at first, and clusters are halved along their longest side
+    `CLUSTER_LEVELS` times.
 
     Some Gaussians occur more than once if their number is not a multiple of the number of clusters.
     """
@@ -171,7 +177,8 @@ def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Nei
 
 @jax.custom_vjp
 def neighbor_mean(values: Float[Array, "g c"], neighbors: Neighbors) -> Float[Array, "g c"]:
-    """Returns the mean of the values of each point's neighbours.
+    """Returns the mean of the values of each point's neighbours, (g, c). It is 0 for a point
+    without neighbours.
 
     Since the graph is symmetric, the gradient gathers as well; scattering is slow on a CPU.
     """
@@ -216,8 +223,8 @@ class Refiner(nn.Module):
         """Returns the values and the hidden features after an iteration.
 
         values: the parameters side by side. start: the parameters before the first iteration.
-        hidden: the features of the iteration before. center: the mean of the joints at rest,
-        metres.
+        hidden: the features of the iteration before, 0 at first. center: the mean of the joints at
+        rest, metres.
         """
 
         def dense(name, width):
@@ -265,8 +272,8 @@ class Refiner(nn.Module):
         return values + moves * LARGEST_MOVES, features
 
     def from_clusters(self, features: Float[Array, "g w"], graph: Graph) -> Float[Array, "g w"]:
-        """Returns for each Gaussian the features of the clusters around it, after these have
-        exchanged messages with their neighbours and with the mean of all clusters.
+        """Returns the features of the clusters around each Gaussian, (g, w). Before, the clusters
+        have exchanged messages with their neighbours and with the mean of all clusters.
         """
 
         def dense(name):
@@ -291,9 +298,9 @@ class Refiner(nn.Module):
 
 
 def _relative_errors(values: Float[Array, "g 14"], signals: Signals) -> Float[Array, "v g 14"]:
-    """Returns gradients that are relative to a Gaussian's weight on the pixels, squashed into (-3,
-    3). Lengths are relative to the Gaussian's longest axis. Gradients of color logits become
-    gradients of colors.
+    """Returns the gradients relative to a Gaussian's weight on the pixels, squashed into (-3, 3).
+    Lengths are relative to the Gaussian's longest axis. Gradients of color logits become gradients
+    of colors.
     """
     colors = nn.sigmoid(values[:, 11:])
     longest = jnp.exp(jnp.max(values[:, 7:10], axis=-1, keepdims=True))
@@ -337,9 +344,9 @@ def learned_update(
     iterations: int,
     splat: SplatConfig,
 ) -> tuple[UnconstrainedGaussians, Int[Array, ""]]:
-    """Returns the parameters after some iterations of the learned update, and the (splat, tile)
-    pairs that the buffers had no room for. At most `MOST_PHOTOS` of the photos are used, evenly
-    spaced.
+    """Returns the parameters after `iterations` of the learned update, and the number of (splat,
+    tile) pairs that the buffers had no room for. splat: has `visibility=True`. At most
+    `MOST_PHOTOS` of the photos are used, evenly spaced.
     """
     start = values = side_by_side(parameters)
     hidden = from_host(np.zeros((len(values), Refiner.width), values.dtype))
@@ -361,7 +368,9 @@ def calls_of_update(
     graph: Graph,
     splat: SplatConfig,
 ) -> Iterator[Call]:
-    """Yields the long programs of `learned_update`, in the order of their use."""
+    """Yields the long programs of `learned_update` and their arguments, in the order of
+    their use.
+    """
     photo, used = photos[0], min(len(photos), MOST_PHOTOS)
     drawing = parameters, avatar, photo, splat
     yield drawn_photo, drawing
@@ -394,8 +403,8 @@ def _iteration_by(
     graph: Graph,
     avatar: Avatar,
 ) -> tuple[UnconstrainedGaussians, Float[Array, "g 14"], Float[Array, "g w"], Int[Array, ""]]:
-    """Makes an iteration with the `photo_signals` of each photo. Returns the parameters, the
-    values, the hidden features, and the overflow so far.
+    """Returns the parameters, the values, the hidden features, and the overflow so far, after an
+    iteration. each: the `photo_signals` of each photo.
     """
     signals, missing = jax.tree.map(lambda *x: jnp.stack(x), *each)
     values, hidden = refiner_iteration(variables, values, start, hidden, signals, graph, avatar)
@@ -405,8 +414,9 @@ def _iteration_by(
 def photo_signals(
     parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo, splat: SplatConfig
 ) -> tuple[Signals, Int[Array, ""]]:
-    """Returns the signals of one photo (without the axis v) from the pixels that count, and the
-    overflow of its rendering. splat: a configuration with `visibility`.
+    """Returns the signals of one photo, and the number of (splat, tile) pairs that the buffers had
+    no room for. The signals have no axis v. Their gradients are of the pixels that count,
+    `visibility` and `pixels` of all pixels. splat: has `visibility=True`.
     """
     image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat)
     gradient, _ = pulled(pull_back, _squared_errors(image, photo))
@@ -417,15 +427,17 @@ def photo_signals(
 
 @compiled
 def _squared_errors(image: Image, photo: Photo) -> Image:
-    """Returns the gradient of the sum of squared errors with respect to the image."""
+    """Returns the gradient of the sum of squared errors of colors and alpha, over the pixels that
+    count, with respect to the image.
+    """
     rgb = jnp.where(photo.counted[..., None], image[0] - photo.image, 0)
     return 2 * rgb, 2 * jnp.where(photo.counted, image[1] - photo.mask, 0)
 
 
 @compiled
 def _foreground_errors(image: Image, photo: Photo) -> Image:
-    """Returns the gradient of the squared color errors in the foreground with respect to the image.
-    A Gaussian in front of the background should fade and not take the background's color.
+    """Returns the gradient of the squared color errors, weighted by the mask, with respect to the
+    image. A Gaussian in front of the background should fade and not take the background's color.
     """
     rgb, alpha = _squared_errors(image, photo)
     return rgb * photo.mask[..., None], jnp.zeros_like(alpha)
@@ -472,7 +484,9 @@ def refiner_iteration(
 
 
 def save_refiner(path: str | os.PathLike[str], variables: PyTree) -> None:
-    """Write the variables of a `Refiner`; the file appears whole or not at all."""
+    """Writes the variables of a `Refiner` as a safetensors file. If writing fails, no file
+    appears.
+    """
     from safetensors.numpy import save
 
     tensors = {
@@ -484,7 +498,7 @@ def save_refiner(path: str | os.PathLike[str], variables: PyTree) -> None:
 
 
 def read_refiner(path: str | os.PathLike[str]) -> PyTree:
-    """Read the variables that `save_refiner` wrote.
+    """Returns the variables that `save_refiner` wrote.
 
     Raises: FileNotFoundError; FileError if it is no safetensors file.
     """

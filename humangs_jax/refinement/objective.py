@@ -1,9 +1,9 @@
-"""The parameters that refinement moves and the loss that it minimises: unconstrained Gaussians, and
-the difference of their renderings from the photos.
+"""Defines the parameters that refinement moves, and the loss that it minimises. The parameters are
+unconstrained Gaussians. The loss is the difference of their renderings from the photos.
 
 The Gaussians are skinned to the pose of each photo, so the photos may show different poses. All
-functions are of one photo, pure, and pieces of few programs: a run on the host compiles one
-renderer and its transpose for steps, iterations and comparisons.
+functions are pure and take one photo. Together they are few programs: a run on the host compiles
+one renderer and its transpose for steps, iterations and comparisons.
 """
 
 import dataclasses
@@ -40,9 +40,8 @@ from humangs_jax.rendering.splatting import Rendering, render
 Image = tuple[Float[Array, "h w 3"], Float[Array, "h w"]]
 """Colors and alpha."""
 FASTER_COMPILATION = {"xla_backend_optimization_level": 1}
-"""On a CPU: compiles in 0.8 to 0.9 of the time of level 3, and the programs take the same time.
-
-Level 0: eight times.
+"""Options of the compiler on a CPU. Programs compile in 0.8 to 0.9 of the time of level 3, and run
+in the same time. At level 0 they take eight times as long.
 """
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -119,10 +118,10 @@ parameters and to the brightness of each Gaussian.
 
 
 def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """Returns the parameters that refinement moves. It is the inverse of `gaussians_of`, as far as
-    `unconstrain` has an inverse.
+    """Returns the parameters that refinement moves. The low-pass is taken out of their scales.
+    `gaussians_of` makes the Gaussians again, with the limits of `unconstrain`.
 
-    Raises: ValueError for harmonics.
+    Raises: ValueError for harmonics or deformations.
     """
     if gaussians.harmonics is not None:
         raise ValueError(
@@ -138,7 +137,9 @@ def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
 def gaussians_of(
     parameters: UnconstrainedGaussians, pixel_footprint: Float[Array, " g"] | None
 ) -> Gaussians:
-    """Returns the Gaussians of some parameters, with a low-pass added to their scales."""
+    """Returns the Gaussians of some parameters. The low-pass of pixels of `pixel_footprint`, (g,),
+    metres, is added to their scales.
+    """
     gaussians = constrain(parameters)
     return replace(
         gaussians,
@@ -181,7 +182,7 @@ def drawn_photo(
 
 @compiled
 def pulled(pull_back: PullBack, image: Image) -> tuple[UnconstrainedGaussians, Float[Array, " g"]]:
-    """Returns the pull-back of an image, as a compiled program."""
+    """Returns `pull_back(image)`, as a compiled program."""
     return pull_back(image)
 
 
@@ -213,17 +214,19 @@ class Comparison:
     loss: Float[Array | np.ndarray, "*v"]
     """The loss, see `image_loss`."""
     squared: Float[Array | np.ndarray, "*v"]
-    """The sum of the squared errors over the pixels that count."""
+    """The sum over the pixels that count of the squared error, which is a mean over the three
+    colors.
+    """
     pixels: Float[Array | np.ndarray, "*v"]
-    """The number of these pixels."""
+    """The number of pixels that count."""
     visibility: Float[Array | np.ndarray, "*v g"]
-    """The largest weight of each Gaussian on any pixel, (g,)."""
+    """The largest weight of each Gaussian on any pixel of the rendering, (g,)."""
     overflow: Int[Array | np.ndarray, "*v"]
-    """The (splat, tile) pairs that the buffers had no room for."""
+    """The number of (splat, tile) pairs that the buffers had no room for."""
 
     def together(self) -> "Comparison":
-        """Returns one comparison with all photos: the mean loss, the sums of the errors, and the
-        largest visibility.
+        """Returns one comparison with all photos. It has the mean loss, the largest visibility, and
+        the sums of the other fields.
         """
         xp: Any = np if isinstance(self.loss, np.ndarray) else jnp
         sums = [xp.sum(x) for x in (self.squared, self.pixels)]
@@ -257,7 +260,9 @@ def compare(
 
 @compiled
 def compared(image: Image, rendering: Rendering, photo: Photo, config: RefineConfig) -> Comparison:
-    """Returns the comparison of an image with a photo. rendering: the rendering of this image."""
+    """Returns the comparison of an image with a photo. rendering: the rendering that `image` is
+    part of, with visibility.
+    """
     squared = jnp.mean(jnp.square(jnp.clip(image[0], 0, 1) - photo.image), axis=-1)
     assert rendering.visibility is not None
     errors = image_loss(image, photo, config), jnp.sum(squared * photo.counted)

@@ -1,4 +1,4 @@
-"""Prepares the photos that refinement compares with: they are cut to the person and reduced, and
+"""Prepares the photos that refinement compares with. They are cut to the person and reduced, and
 some pixels are held out.
 """
 
@@ -21,11 +21,13 @@ MARGIN = 8
 and Gaussians beyond the silhouette cost alpha there.
 """
 MULTIPLE = 16
-"""Sides of crops are multiples of this number of pixels, so that few sizes are compiled."""
+"""Sides of crops are multiples of this number of pixels, so that few sizes are compiled. Sides of
+smaller images are kept.
+"""
 COVERED = 0.02
-"""Coverage from which a pixel counts as the person's."""
+"""Value of a mask above which a pixel belongs to the person."""
 BLOCK = 8
-"""Side of the blocks of pixels that are held out."""
+"""Side of the blocks of pixels that are held out, pixels."""
 
 
 @pytree_dataclass
@@ -47,8 +49,8 @@ class Photo(Batchable):
 
 
 def photos_of(views: SubjectViews) -> Photo:
-    """Returns the views of a person as a batch of photos. Pixels count unless somebody may hide the
-    person there.
+    """Returns the views of a person as a batch of photos. Pixels count unless somebody or something
+    may hide the person there.
     """
     counted = from_host(np.ones(views.masks.shape, bool))
     if views.unknown is not None:
@@ -95,8 +97,9 @@ def windows(
     cameras: Camera,
     boxes: Sequence[Sequence[Sequence[int]]],
 ) -> tuple[Float[Array, "v rows columns 3"], Float[Array, "v rows columns"], Camera]:
-    """Returns windows of one size around the box of each view, for images and masks, and cameras
-    that see the windows. boxes: ((top, bottom), (left, right)) of each view, pixels.
+    """Returns the images, masks and cameras of windows of one size, one around the box of each
+    view. The largest box fits in, with `MARGIN` on all sides unless the image ends there. boxes:
+    ((top, bottom), (left, right)) of each view, pixels.
     """
     height, width = masks.shape[1:]
     rows, columns = (
@@ -123,8 +126,8 @@ def windows(
 
 
 def held_out_blocks(shape: tuple[int, ...], share: float, seed: int) -> Bool[np.ndarray, "v h w"]:
-    """Returns which pixels of masks of shape (v, h, w) are held out: random blocks, in all about
-    the share `share`.
+    """Returns which pixels of v photos are held out, (v, h, w). They are random blocks, which are
+    about the share `share` of all pixels. shape: (v, h, w).
     """
     v, height, width = shape
     blocks = (
@@ -134,8 +137,8 @@ def held_out_blocks(shape: tuple[int, ...], share: float, seed: int) -> Bool[np.
 
 
 def photo_order(views: Int[np.ndarray, " v"], steps: int, seed: int) -> Int[np.ndarray, " n"]:
-    """Returns the view of each of `steps` steps. All views are taken in a new random order, again
-    and again.
+    """Returns the view of each of `steps` steps, (steps,). All views are taken once in a random
+    order, then in a new random order, and so on.
     """
     rng = np.random.default_rng(seed)
     return np.concatenate(
@@ -144,8 +147,8 @@ def photo_order(views: Int[np.ndarray, " v"], steps: int, seed: int) -> Int[np.n
 
 
 def _bounds(mask: Float[np.ndarray, "h w"]) -> Sequence[Sequence[int]]:
-    """Returns ((top, bottom), (left, right)) of the person, pixels; those of the whole image if
-    nobody is in it.
+    """Returns ((top, bottom), (left, right)) of the person, pixels, or of the whole image if nobody
+    is in it.
     """
     box = person_box(mask > COVERED).tolist()
     if any(box[0]):

@@ -1,8 +1,7 @@
-"""Refinement fits the Gaussians of an avatar to its photos, by iterations of a learned update, then
-by Adam.
+"""Fits the Gaussians of an avatar to its photos, by iterations of a learned update, then by Adam.
 
-The learned update moves what no photo shows, too; Adam leaves it where it is. `refine` crops the
-photos, and keeps the best of what `search` finds until its time is over.
+The learned update also moves Gaussians that no photo shows, and Adam leaves them where they are.
+`refine` crops the photos, and keeps the best state that `search` finds until its time is over.
 """
 
 import dataclasses
@@ -39,35 +38,40 @@ class Refinement:
     """What `refine_with_report` returns."""
 
     avatar: Avatar
-    """The best state of the run."""
+    """The fitted avatar, or the one that was given if `kept` is False."""
     iterations: int
-    """Iterations of the learned update; 0 if they were not kept."""
+    """Iterations of the learned update in the best state of the search. 0 if it is better without
+    them.
+    """
     steps: int
     """Steps of the optimizer, including those of the trials."""
     seconds: float
-    """The time of the run without compilation."""
+    """The time of the run without compilation, seconds."""
     compile_seconds: float
     """The time of compilation, seconds."""
     loss: tuple[float, float]
-    """The loss of the avatar before, and of the one that is returned, over the photos that were
-    fitted."""
+    """The mean loss of the avatar before the run, and of the avatar that is returned, over the
+    photos that were fitted.
+    """
     psnr: tuple[float, float]
     """The PSNR of these two avatars over the crops, dB."""
     kept: bool
-    """Whether the avatar has become better by that loss; if not, it is unchanged."""
+    """Whether the loss has become smaller. If not, the avatar is unchanged."""
     interrupted: bool = False
     """Whether Ctrl-C ended the run."""
     planned: int | None = None
-    """`RefineConfig(steps=planned, seconds=None)` repeats the run exactly. None: the run was cut
-    short.
+    """Number of steps that were planned. The run's configuration with `steps=planned` and
+    `seconds=None` repeats the run exactly. If the run was limited by seconds, which excludes steps
+    on the head, set `head_steps=0`, too. None: the run was cut short.
     """
     left_out: tuple[str, ...] = ()
     """Names of photos that contradict the others, and were not fitted."""
     head_steps: int = 0
     """Steps of the optimizer on the head alone; 0 if they were not kept."""
     moved: bool = False
-    """Whether photos were moved by pixels, because the person or the pose is not the same in all of
-    them. Then `loss` and `psnr` compare with the moved photos."""
+    """Whether photos were moved by pixels, because the person or the pose is not the same in all
+    photos. Then `loss` and `psnr` compare with the moved photos.
+    """
 
     def summary(self) -> str:
         """Returns the report as one line of text."""
@@ -105,29 +109,30 @@ def refine(
     """Fits an avatar to the photos of a capture. Returns the fitted avatar, or the avatar itself if
     the fit is no better.
 
-    Learned-optimizer iterations, then Adam for as long as asked, or steps on the head alone where
-    photos have 512 px or more. Views whose mask does not show the person are left out, and exposure
-    is made equal as in `reconstruct`. Ctrl-C ends the run; the best state until then is returned.
-    `refine_with_report` also tells the steps, the seconds and the gain.
+    First come iterations of a learned optimizer, then steps of Adam. Without a limit in seconds,
+    steps on the head alone follow if photos have 512 pixels or more (`RefineConfig.head_steps`).
+    Views whose mask does not show the person are left out, and exposure is made equal as in
+    `reconstruct`. Ctrl-C ends the run; the best state until then is returned. `refine_with_report`
+    also returns the steps, the seconds and the gain.
 
     Args:
         avatar: of the person in the photos, on the body of the capture.
-        capture: photos with masks, in any poses; or what `prepare_capture` made of it.
-        config: how; None: `RefineConfig()`.
-        seconds: limit, instead of the configuration's; it becomes a number of steps before the
-            first one.
-        steps: the same in steps, which repeats a run exactly on the same machine; 0: iterations,
-            and the head, alone.
+        capture: photos with masks, in any poses, or the result of `prepare_capture`.
+        config: the settings. None: `RefineConfig()`.
+        seconds: limit in seconds. With `seconds` or `steps`, both replace the limits of the
+            configuration. The seconds become a number of steps before the first step.
+        steps: limit in steps, which repeats a run exactly on the same machine. 0: iterations and
+            steps on the head alone.
         progress: show a bar.
-        watch: gets the avatar so far after the iterations and at each of the checks; its time
-            counts.
+        watch: is called with the current avatar after the iterations and at each of the checks. Its
+            time counts.
 
     Returns:
         The refined avatar.
 
     Raises:
-        ValueError: if the capture has no view or no masks or no view that shows the person, or its
-            poses have another number of joints than the avatar.
+        ValueError: if the capture has no view, no masks, or no view that shows the person, if its
+            poses have another number of joints than the avatar, or if the avatar has harmonics.
 
     Examples:
         >>> sharp = hg.refine(avatar, capture, seconds=15)
@@ -148,11 +153,11 @@ def refine_with_report(
     progress: bool = False,
     watch: Callable[[Avatar], None] | None = None,
 ) -> Refinement:
-    """Does what `refine` does, and also returns the number of steps, the seconds and the gain.
+    """Fits an avatar as `refine` does, and returns it with the number of steps, the seconds and the
+    gain.
 
     Arguments and errors are those of `refine`. A run with a given number of steps can be repeated
-    exactly on the same machine. If the run was limited by seconds, `Refinement.planned` is the
-    number of steps that repeats it.
+    exactly on the same machine. If the run was limited by seconds, see `Refinement.planned`.
     """
     config = config or RefineConfig()
     if seconds is not None or steps is not None:
@@ -227,7 +232,7 @@ def calls_of_refine(
     avatar: Avatar, capture: Capture | PreparedCapture, config: RefineConfig
 ) -> Iterator[Call]:
     """Yields the long programs of a refinement, so that they can be compiled before it begins.
-    Yields none without iterations or masks.
+    Yields nothing without iterations or masks.
     """
     photos = prepare_capture(capture)
     if config.iterations and photos.capture.masks is not None:
@@ -235,7 +240,7 @@ def calls_of_refine(
 
 
 def _crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) -> Crops | None:
-    """Returns crops of the heads in the photos; None if no steps on the head are to be made."""
+    """Returns crops of the heads in the photos, or None if no steps on the head are made."""
     unlimited = config.seconds is None or config.steps == 0
     if not (config.head_steps and unlimited and shows_heads(photos.capture, config)):
         return None

@@ -1,14 +1,15 @@
-"""The search of `refine`: which photos are fitted, by how many iterations of the learned update and
-how many steps.
+"""Searches for the result of `refine`: decides which photos are fitted, by how many iterations of
+the learned update, and by how many steps.
 
-With `HELD_OUT_PHOTOS` photos or more, a search is made twice. Trials leave one photo out and ask it
-whether the iterations help, whether they help without the photo that fits least, and how many of
-the steps do. Then all photos are fitted as the trials say. Iterations alone are tried only if one
-photo fits much less than the others. Several photos are asked, see `photos_agree`, those first that
-the avatar explains best before it is refined: a photo that misleads is never the first.
+With `HELD_OUT_PHOTOS` photos or more, trials come first. A trial leaves one photo out. The PSNR on
+this photo then says whether the iterations help, whether they help without the photo that fits
+least, and how many of the steps help. Then all photos are fitted as the trials say. Iterations
+without steps are tried only if one photo fits much less than the others. Several photos are left
+out in turn, see `photos_agree`. The photos that the avatar explains best before it is refined come
+first, so that a photo that misleads is never the first.
 
-With fewer photos, blocks of pixels are held out instead, and one search is made. What is asked
-answers by its PSNR after small moves, see `losses.alignment`: photos are seldom of one moment.
+With fewer photos, blocks of pixels are held out instead, and there are no trials. PSNR is measured
+after small moves, see `losses.alignment`, because photos are seldom of one moment.
 """
 
 import contextlib
@@ -68,28 +69,33 @@ from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 T = TypeVar("T")
 
 HELD_OUT_PHOTOS = 4
-"""With this number of photos or more, a trial holds out a whole photo, a view that no step sees.
-With fewer, blocks of pixels are held out of each photo.
+"""With this number of photos or more, a trial holds out a whole photo, which no step of the trial
+sees. With fewer, blocks of pixels are held out of each photo.
 """
 TRIAL = 1 / 3
 """Share of all steps that are made in trials."""
 ALLOWED_LOSS = 0.5
-"""Decibels that steps may lose on a photo that is held out: it lacks what they learn from it when
-all photos are fitted. With six validation people they lose up to 0.4 there, and gain at least 0.1
-in other views of that pose by all photos."""
+"""Decibels that steps may lose on a photo that is held out. The loss is allowed because steps on
+all photos learn from this photo, too. With six validation people, steps lose up to 0.4 on it, and
+steps on all photos gain at least 0.1 in other views of that pose.
+"""
 ALLOWED_LOSS_OF_ITERATIONS = 1.0
 """Decibels that the learned update may lose on a photo that is held out. One of eight test people
-loses 0.2 there, and gains 2.1 by all photos.
+loses 0.2 on it, and gains 2.1 by iterations on all photos.
 """
 SUSPICIOUS = 1.5
-"""Loss of the photo that fits least over the median, before refinement, from which on iterations
-alone are tried first. With right poses and masks eight of nine people have 1.0 to 1.3, one 1.55.
-Half a mask makes 1.6, a body that is turned by 10 degrees 2.1."""
+"""Ratio of the largest loss of a photo to the median loss, before refinement, from which on
+iterations without steps need trials. With right poses and masks, the ratio is 1.0 to 1.3 for eight
+of nine people, and 1.55 for one. Half a mask makes 1.6, and a body that is turned by 10 degrees
+makes 2.1.
+"""
 STILL = 1.1e-3
-"""Median distance, as a share of the person's height, between a photo and what iterations on all of
-them draw, from which on photos are moved. Photos of one moment leave up to 0.0010 (ten synthetic
-people; loose clothes leave most). Bodies that are off by 1 cm in the mean leave 0.0002 to 0.0020,
-by 2 cm 0.0009 to 0.0037. Moved photos of one moment lose up to 2 dB (`experiments misaligned`)."""
+"""Distance from which on photos are moved, as a share of the person's height. It is the median over
+the photos of the distance (`misplaced`) between a photo and its image after iterations on all
+photos. Photos of one moment leave up to 0.0010 (ten synthetic people; loose clothes leave most).
+Bodies that are off by 1 cm in the mean leave 0.0002 to 0.0020, and by 2 cm 0.0009 to 0.0037. If
+photos of one moment are moved, they lose up to 2 dB (`experiments misaligned`).
+"""
 TIMED_STEPS = 3
 """Steps that are timed to plan how many a run has."""
 OVERRUN = 1.5
@@ -113,7 +119,7 @@ HOST_SETTINGS = {
     "checks": 1,
     "seed": 0,
 }
-"""Settings that no compiled program depends on, with the values that programs are compiled for."""
+"""Settings that no compiled program depends on, with the values for which programs are compiled."""
 
 
 class Clock:
@@ -148,7 +154,8 @@ class Clock:
             self.compile_seconds = before + time.perf_counter() - began
 
     def with_room(self, function: Callable[[SplatConfig], tuple[T, Any]], splat: SplatConfig) -> T:
-        """Call `function` with buffers that have room for everything, and return its first result.
+        """Calls `function` with buffers that have room for everything, and returns its first
+        result.
 
         function: takes a configuration with buffers; returns a result and the number of pairs that
         did not fit. The buffers are doubled until this number is 0.
@@ -163,8 +170,9 @@ class Clock:
         return result
 
     def plan(self, one_step: Callable[[], RefineState], ahead: float = 0.0) -> int:
-        """Returns the number of steps of the run: that of the configuration, or as many as fit into
-        its seconds. `TIMED_STEPS` calls of `one_step` measure the time of a step.
+        """Returns the number of steps of the run: the steps of the configuration, or as many as fit
+        into its seconds if these are fewer. `TIMED_STEPS` calls of `one_step` measure the time of a
+        step.
 
         The number is fixed before the first step, so the run can be repeated. ahead: seconds that
         other work will take.
@@ -185,7 +193,9 @@ class Clock:
         return self.planned
 
     def tick(self, shown: float) -> None:
-        """Count one finished step, and move the bar to `shown`, in [0, 1]."""
+        """Counts one finished step, moves the bar to `shown`, in [0, 1], and notes in `late`
+        whether the run has taken too long.
+        """
         self.done += 1
         self.show(shown)
         self.late = self.late or (
@@ -193,11 +203,11 @@ class Clock:
         )
 
     def show(self, shown: float) -> None:
-        """Move the bar to `shown`, in [0, 1]."""
+        """Moves the bar to `shown`, in [0, 1]."""
         self.bar.update(int(100 * shown) - self.bar.n)
 
     def stopped(self) -> float:
-        """Close the bar at the end of the run, and return `elapsed`."""
+        """Closes the bar at the end of the run, and returns `elapsed`, seconds."""
         self.bar.update(100 - self.bar.n)
         self.bar.close()
         return self.elapsed()
@@ -209,13 +219,14 @@ class Task(NamedTuple):
     avatar: Avatar
     """The avatar with the low-pass of the photos."""
     fresh: Avatar
-    """The avatar with the scales that the learned update was trained with: the low-pass that the
-    avatar came with is taken out.
+    """The avatar with the scales that the learned update was trained with. The low-pass that the
+    avatar came with is replaced by that of `Task.avatar`.
     """
     given: list[Photo]
     """The photos as they were given, with all their pixels. They say whether a state is better."""
     photos: list[Photo]
-    """The photos that are fitted: those given, or moved as `align` does, with all their pixels."""
+    """The photos that are fitted, with all their pixels. They are those given, or moved by `align`.
+    """
     seen: list[Photo]
     """The photos that are fitted, without the pixels that are held out."""
     graph: Graph | None
@@ -227,7 +238,7 @@ class Task(NamedTuple):
     clock: Clock
     """The time and the number of steps of the run."""
     first: tuple["Candidate", float] | None = None
-    """The result of iterations on all photos, and its loss on them; None where they are not known.
+    """The result of iterations on all photos, and its mean loss on them. None if it is not known.
     """
     moved: bool = False
     """Whether the photos were moved, see `align`."""
@@ -241,7 +252,7 @@ class Candidate(NamedTuple):
     iterations: int
     """How many iterations of the learned update the state has had."""
     used: Int[np.ndarray, " n"]
-    """The numbers of the photos to fit, (n,)."""
+    """The indices of the photos to fit, (n,)."""
     kept: bool = True
     """Whether the state is the best so far."""
 
@@ -291,7 +302,9 @@ def _fresh(avatar: Avatar, pixel_footprint: Float[Array, " g"] | None) -> Gaussi
 
 
 def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:
-    """Returns how the photos are drawn, with buffers that have room for each of them."""
+    """Returns the configuration with which the photos are drawn. Its buffers have room for each
+    photo, times `BUFFER_MARGIN`.
+    """
     poses = jax.vmap(BodyPose)(views.rotations, views.translations)
     configs = [
         plan_buffers(posed(avatar, pose), camera, SPLAT_PRESETS[avatar.rendering], BUFFER_MARGIN)
@@ -306,13 +319,14 @@ def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:
 
 
 def align(task: Task, start: Candidate, each: Comparison) -> tuple[Task, Comparison]:
-    """Moves the photos so that they show the person where the start does. Returns the task with
-    these photos, and the comparison of the start with each of them. Returns both arguments as they
-    are if the photos agree.
+    """Moves the photos so that they show the person where the start draws the person. Returns the
+    task with these photos, and the comparison of the start with each of them. If the photos agree,
+    or if there are fewer than `ITERATIONS` iterations, it moves nothing, and returns `each`
+    unchanged.
 
-    Iterations fit photos of one moment to a small part of a pixel. Where the person has moved from
-    photo to photo, or a pose or a camera is off, what they find lies between the photos. Then
-    smooth moves bring the photos to the start, so that detail is fitted instead of its mean.
+    Iterations fit photos of one moment to a small part of a pixel. If the person has moved from
+    photo to photo, or a pose or a camera is off, the result of iterations lies between the photos.
+    Then smooth moves bring the photos to the start, so that detail is fitted instead of its mean.
     """
     if task.config.iterations < ITERATIONS:  # fewer leave more than that
         return task, each
@@ -334,8 +348,8 @@ def align(task: Task, start: Candidate, each: Comparison) -> tuple[Task, Compari
 
 
 def compile_parts(task: Task, start: Candidate) -> Candidate:
-    """Make one iteration and one step, so that their programs are compiled. Returns the start, with
-    buffers that have room for the step.
+    """Makes one iteration and one step, if the run has any, so that their programs are compiled.
+    Returns the start, with buffers that have room for the step.
     """
     if task.config.iterations:
         updated(task, start, start.used, 1)
@@ -391,8 +405,8 @@ def _search_by_blocks(
 def _search_by_photo(
     task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
 ) -> Iterator[Candidate]:
-    """Yields the states of trials without one photo, then those of a fit of all photos that does
-    what helped in the trials. losses: the loss of the start on each photo.
+    """Yields the states of trials without one photo, then the states of a fit of all photos that
+    does what helped in the trials. losses: the loss of the start on each photo.
     """
     config, clock, everybody = task.config, task.clock, np.arange(len(losses))
     # iterations alone need no trial, unless one photo contradicts the others
@@ -445,8 +459,8 @@ def _trial_gains(
     asked: Sequence[int],
     tried: dict[int, Candidate],
 ) -> Iterator[float]:
-    """Yields for each photo in `asked` the decibels that it gains by iterations on the other photos
-    of `used`. The state after these iterations is stored in `tried` under the photo's number.
+    """Yields the decibels that each photo in `asked` gains by iterations on the other photos of
+    `used`. The state after these iterations is stored in `tried` under the photo's number.
     """
     for view in asked:
         photo = [task.given[view]]
@@ -463,9 +477,9 @@ def steps(
     end: int,
     shown: tuple[float, float],
 ) -> Iterator[Candidate]:
-    """Make the first `end` of `total` steps on some photos; yields the state at each check and at
-    the end. shown: where the progress bar would be after none and after all of the `total` steps,
-    in [0, 1].
+    """Makes the first `end` of `total` steps on some photos. Yields the state at each check and at
+    the end. shown: places of the progress bar before the first and after the last of the `total`
+    steps, in [0, 1].
     """
     config, clock = task.config, task.clock
     share = 1.0
@@ -549,11 +563,11 @@ def avatar_comparison(
 
 
 def psnr_of(task: Task, found: Candidate, photos: Sequence[Photo]) -> float:
-    """Returns the mean `aligned_psnr` of a state, dB, over the photos of which some pixels count;
-    `LARGEST_PSNR` if no pixel counts.
+    """Returns the mean `aligned_psnr` of a state, dB, over the photos of which some pixels count.
+    It is `LARGEST_PSNR` if no pixel counts.
 
-    photos: as they were given. Where photos are moved, each is first moved to what the state draws.
-    A photo that was moved to the start would favour the start.
+    photos: as they were given. If `align` has moved the photos, each is moved here to what the
+    state draws, because a photo that was moved to the start would favour the start.
     """
     scores = []
     for image, photo in zip(images_of(task, found, photos), photos, strict=True):
@@ -572,7 +586,7 @@ def psnr_of(task: Task, found: Candidate, photos: Sequence[Photo]) -> float:
 def images_of(
     task: Task, found: Candidate, photos: Sequence[Photo]
 ) -> list[Float[np.ndarray, "h w 4"]]:
-    """Draws a state from the cameras of some photos. Returns for each photo colors and alpha, (h,
+    """Returns the images of a state from the cameras of some photos. Each has colors and alpha, (h,
     w, 4).
     """
     parameters = found.state.parameters

@@ -1,7 +1,7 @@
-"""Adam's part of refinement: a state, and a step that makes the next state from a photo.
+"""Makes Adam's part of refinement: a state, and a step that makes the next state from a photo.
 
-Everything is a pure function for one person. On the host it is a few compiled programs, under
-`jax.jit` and `jax.vmap` a single one.
+All functions are pure and for one person. On the host they are a few compiled programs. Under
+`jax.jit` and `jax.vmap` they are part of a single program.
 """
 
 from collections.abc import Callable
@@ -57,11 +57,12 @@ class RefineState:
     start: UnconstrainedGaussians
     """The parameters before the first step, towards which those in `PULLED` are pulled."""
     trust: Float[Array, " g"]
-    """The share of the rates at which a Gaussian moves, (g,), in [0, 1]."""
+    """Factor of the rates for each Gaussian, (g,), in [0, 1]."""
     moments: PyTree
     """The optimizer's state."""
     overflow: Int[Array, ""]
-    """The (splat, tile) pairs that the last step had no room for."""
+    """The number of (splat, tile) pairs that did not fit, in the last step (in `head`, in several).
+    """
     splat: SplatConfig
     """How photos are drawn, with buffers."""
     done: Int[Array, ""] | int = 0
@@ -69,14 +70,14 @@ class RefineState:
     total: Int[Array, ""] | int = 1
     """The number of steps of the whole run."""
     share: Float[Array, ""] | float = 1.0
-    """The share of the learning rates in this run, see `RefineConfig.full_steps`."""
+    """Factor of all learning rates in this run, see `RefineConfig.full_steps`."""
 
 
 def init_state(
     parameters: UnconstrainedGaussians, found: Comparison, config: RefineConfig, splat: SplatConfig
 ) -> RefineState:
-    """Returns the state before the first step. found: the comparison of the parameters with the
-    photos; Gaussians that no photo shows get no trust.
+    """Returns the state before the first step. found: the comparison of the parameters with all
+    photos together. Gaussians that no photo shows get trust 0.
     """
     return started(parameters, _trust(from_host(found.visibility), config), config, splat)
 
@@ -140,13 +141,13 @@ def update(
 def refine_views(
     avatar: Avatar, views: SubjectViews, config: RefineConfig, splat: SplatConfig, steps: int
 ) -> tuple[Avatar, Int[Array, ""]]:
-    """Make `steps` steps of one photo each, in turns, on all pixels. This is `refine` without its
-    decisions, for `jax.jit` and `jax.vmap`.
+    """Makes `steps` steps of one photo each, in turns, on all pixels that count. Returns the avatar
+    and the number of (splat, tile) pairs that did not fit. This is `refine` without its decisions,
+    for `jax.jit` and `jax.vmap`.
 
-    Static: config (its limits, iterations, `full_steps` and held-out pixels are not used), splat
-    (with `max_pairs`, see `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs
-    that did not fit. Batch over people whose arrays have the same shapes with `jax.vmap(...,
-    in_axes=(0, 0, None, None, None))`.
+    Static arguments: config, of which only the loss, the optimizer, the rates and `visible` are
+    used; splat, with `max_pairs` (see `plan_buffers`); steps. Batch over people whose arrays have
+    the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
     """
     avatar, photos = with_pixel_footprint_of(avatar, views), photos_of(views)
     parameters = parameters_of(avatar.gaussians)
