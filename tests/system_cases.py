@@ -2,6 +2,9 @@
 
 import dataclasses
 
+import jax
+import numpy as np
+
 from experiments.systems import SYSTEMS
 from experiments.systems.surface_map import SurfaceMap
 from humangs_jax.network.config import HumanGSConfig
@@ -23,6 +26,12 @@ SMALL = {
     "surface_map": SurfaceMap("atlas", 8),
 }
 """Values that fields of parts get, where a part has the field."""
+
+
+def close(a, b, bound=2e-5):
+    """Compares two pytrees of one structure; `bound` is the largest absolute difference."""
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, atol=bound)
 
 
 def small_system(name: str) -> HumanGSConfig:

@@ -232,17 +232,16 @@ def test_readers_that_know_no_skins_see_the_same_person_with_the_feet_on_0(tmp_p
     np.testing.assert_allclose(normals, turned, atol=1e-6)
 
 
+def matrices(motion):
+    """Returns the rotation matrices (m, 55, 3, 3) of a motion."""
+    vectors = np.asarray(motion.rotations)
+    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
+
+
 def test_a_motion_that_was_exported_is_read_again(tmp_path):
     one, motion = avatar(), dance(4)
     write_mesh_glb(tmp_path / "a.glb", one, mesh(), motion)
     back = load_motion(tmp_path / "a.glb", rest_joints=one.rest_joints)
-
-    def matrices(m):
-        return (
-            Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3))
-            .as_matrix()
-            .reshape(4, 55, 3, 3)
-        )
 
     np.testing.assert_allclose(matrices(back), matrices(motion), atol=1e-4)
     moved = np.asarray(back.translations - motion.translations)
@@ -390,13 +389,6 @@ def test_blender_shows_our_frames_and_we_read_its_files(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     shown = np.load(tmp_path / "frame.npy") @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # z up to y up
     np.testing.assert_allclose(shown, skinned(tmp_path / "ours.glb", 2), atol=1e-4)
-
-    def matrices(m):
-        return (
-            Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3))
-            .as_matrix()
-            .reshape(4, 55, 3, 3)
-        )
 
     for name in ("theirs.glb", "theirs.bvh"):
         back = grounded(load_motion(tmp_path / name, rest_joints=one.rest_joints), rest, PARENTS)

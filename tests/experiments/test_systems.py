@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from network_cases import random_inputs, random_variables
-from system_cases import WIDTH, small_system
+from system_cases import WIDTH, close, small_system
 
 from experiments.systems import ONE_PHOTO, SYSTEMS
 from experiments.systems.cross_attention import CrossAttentionReader
@@ -59,11 +59,6 @@ def outputs_of(name, inputs, config=None):
     return jax.jit(lambda v, x: apply_humangs(v, x, config)[0].gaussians)(
         random_variables(config), inputs
     )
-
-
-def close(a, b, bound=2e-5):
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(x, y, atol=bound)
 
 
 @pytest.mark.parametrize("name", ["lhm_plus", "gst", "ghg"])

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from network_cases import random_inputs, random_variables
+from system_cases import close
 from target_cases import BLOCKS, DRIVEN, PATCH, PIXELS, SIZE, mapped_tube, small, views
 from training_cases import tube
 
@@ -95,11 +96,6 @@ def driven(name, inputs=None, at=None, variables=None):
     return driving(name)(
         variables, inputs_of(name) if inputs is None else inputs, pose() if at is None else at
     )
-
-
-def close(a, b, bound=2e-5):
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(x, y, atol=bound)
 
 
 @pytest.mark.slow

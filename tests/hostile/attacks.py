@@ -39,6 +39,7 @@ import numpy as np
 from changes import edit_bytes
 from network.torch_writer import FakeTensor, write_checkpoint
 from PIL import Image
+from png_files import chunk
 from readers import (
     FORMATS,
     PARAMETERS,
@@ -414,10 +415,6 @@ attack("one flipped bit in a tensor", "weights", FLIPPED)
 
 # Photos
 # --------------------------------------------------------------------------------------------------
-
-
-def chunk(name, data):
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
 def png(width, height, depth=8, color=2, data=b"", extra=b""):

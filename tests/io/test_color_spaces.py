@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image, ImageCms
+from png_files import chunk
 
 from humangs_jax.io.color_spaces import (
     cube,
@@ -117,10 +118,6 @@ def test_greys_have_profiles_of_greys_and_of_colors(mode, tmp_path):
         np.testing.assert_allclose(
             read_image(tmp_path / "a.png")[0], np.stack([expected] * 3, -1), atol=1e-3
         )
-
-
-def chunk(name, data):
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
 def png(pixels, *chunks, depth=8):

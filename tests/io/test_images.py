@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from png_files import chunk
 
 from humangs_jax.io.images import (
     FORMATS,
@@ -347,11 +348,6 @@ def test_pixels_are_turned_as_pillow_turns_them(flag, tmp_path):
 
 
 def deep_png(pixels, color_type):
-    def chunk(name, data):
-        return (
-            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-        )
-
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
     header = struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], 16, color_type, 0, 0, 0)
     return (

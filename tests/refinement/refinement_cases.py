@@ -74,6 +74,12 @@ def toy_capture(body, avatar, views=3, moving=False, distance=3.6):
     )
 
 
+def squared_error(avatar, capture):
+    """Returns the mean squared error of the drawn avatar in the photos."""
+    drawn = [np.asarray(r.rgb) for r in capture_renderings(avatar, capture)[1]]
+    return float(np.mean(np.square(np.clip(drawn, 0, 1) - capture.images)))
+
+
 FEW = 0.03
 """Largest share of numbers that differ: Adam makes whole steps of gradients that are rounding."""
 

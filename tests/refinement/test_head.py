@@ -5,10 +5,9 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refinement_cases import HEIGHT, SAME
+from refinement_cases import HEIGHT, SAME, squared_error
 
 from humangs_jax.avatar.animate import with_pixel_footprint_of
-from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.capture.fitting.own_poses import with_own_poses
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
@@ -38,11 +37,6 @@ def of_head(avatar, region=HEAD):
         i for i, name in enumerate(avatar.joint_names) if any(part in name for part in region)
     ]
     return np.asarray(avatar.skinning_weights)[:, columns].sum(axis=1) > 0.5
-
-
-def squared_error(avatar, capture):
-    drawn = [np.asarray(r.rgb) for r in capture_renderings(avatar, capture)[1]]
-    return float(np.mean(np.square(np.clip(drawn, 0, 1) - capture.images)))
 
 
 @pytest.mark.slow

@@ -7,7 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refinement_cases import HEIGHT, STEPS, WIDTH, assert_nearly_all_close, toy_avatar, toy_capture
+from refinement_cases import (
+    HEIGHT,
+    STEPS,
+    WIDTH,
+    assert_nearly_all_close,
+    squared_error,
+    toy_avatar,
+    toy_capture,
+)
 
 from humangs_jax.avatar.animate import (
     pixel_sizes,
@@ -90,11 +98,6 @@ def test_refined_avatars_look_the_same_at_other_sizes(person):
     np.testing.assert_allclose(
         again.gaussians.pixel_footprint, refined.gaussians.pixel_footprint, rtol=0.01
     )
-
-
-def squared_error(avatar, capture):
-    drawn = [np.asarray(r.rgb) for r in capture_renderings(avatar, capture)[1]]
-    return float(np.mean(np.square(np.clip(drawn, 0, 1) - capture.images)))
 
 
 @pytest.mark.slow

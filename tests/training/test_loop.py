@@ -4,7 +4,6 @@ Nothing is left out without a message.
 """
 
 import dataclasses
-import json
 import logging
 import signal
 
@@ -12,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from training_runs import lines
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.network.weights import load_weights
@@ -24,10 +24,6 @@ from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
 
 CONFIG = tiny()
-
-
-def lines(out):
-    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
 
 @pytest.fixture(scope="module")

@@ -63,6 +63,7 @@ def run_several(count, *arguments):
 
 
 def lines(out):
+    """Returns the entries of a run's log."""
     return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
 
