@@ -1,5 +1,5 @@
-"""Small operations on arrays by numpy. Outside of `jit`, each operation of `jnp` is compiled for
-each shape, which takes some ten milliseconds even if there is hardly anything to compute.
+"""Does operations on small arrays with numpy. Outside of `jit`, JAX compiles each operation of
+`jnp` for each shape. This takes some ten milliseconds, even if there is hardly anything to compute.
 """
 
 from collections.abc import Sequence
@@ -11,14 +11,14 @@ import numpy as np
 from jax.core import Tracer
 
 SMALL = 1 << 16
-"""Largest count of numbers that are brought from an accelerator and back in less time than a
-program takes to compile.
+"""Largest number of entries of an array that is brought from an accelerator and back in less time
+than a program takes to compile.
 """
 
 
 def from_host(array: Any, dtype: Any = None) -> Any:
     """Returns an array of JAX with the numbers of a list or of an array of numpy. An array of JAX
-    only gets the dtype.
+    is returned with the dtype changed. dtype: None keeps numpy's or JAX's type.
 
     `jnp.asarray` gives the same result, but compiles a program for each shape.
     """
@@ -30,8 +30,8 @@ def from_host(array: Any, dtype: Any = None) -> Any:
 
 
 def on_host(array: Any) -> bool:
-    """Says whether numpy can read an array at once, because it is numpy's, or JAX's on a CPU of
-    this process.
+    """Says whether numpy can read an array at once. It can if the array is numpy's, or is JAX's on
+    a CPU of this process.
     """
     if isinstance(array, np.ndarray):
         return True
@@ -39,7 +39,11 @@ def on_host(array: Any) -> bool:
 
 
 def taken(array: Any, index: Any) -> Any:
-    """Returns `array[index]`, by numpy where it can read the array, or the array is small."""
+    """Returns `array[index]`, for arrays of numpy and of JAX.
+
+    An array of JAX is indexed by numpy if it is small or if numpy can read it at once, see
+    `on_host`. The result is then an array of JAX again.
+    """
     small = _plain(array) and array.size <= SMALL
     if isinstance(index, Tracer) or isinstance(array, np.ndarray) or not (small or on_host(array)):
         return array[index]
@@ -49,7 +53,7 @@ def taken(array: Any, index: Any) -> Any:
 
 
 def joined(arrays: Sequence[Any]) -> Any:
-    """Returns `jnp.stack(arrays)`, by numpy where it can read the arrays."""
+    """Returns `jnp.stack(arrays)`. numpy computes it if it can read all arrays at once."""
     if all(on_host(array) for array in arrays):
         return from_host(np.stack(arrays))
     return jnp.stack(arrays)

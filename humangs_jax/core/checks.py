@@ -1,14 +1,14 @@
-"""Checks of what users hand in: arguments of the right class with shapes that fit each other, and
-values that are finite and in range.
+"""Checks what users hand in: arguments must be of the right class with shapes that fit each other,
+and values must be finite and in range.
 
     render(gaussians, camera, ...): gaussians: expected Gaussians, got Avatar; animate(avatar, pose)
     poses them
     ValueError: render: gaussians.opacities: expected numbers in [0, 1], but 2 of 52375 are not, the
         first at [17]: nan
 
-Classes and shapes are known inside transformations, too, and checking them computes nothing. Values
-are there only outside of `jit`, `vmap` and `grad`: inside nothing is checked, so the pure function
-behind a public one needs no switch.
+Classes and shapes are known inside of `jit`, `vmap` and `grad`, too, and checking them computes
+nothing. Values are known only outside. Inside they are not checked, so the pure function behind a
+public one needs no switch.
 """
 
 import dataclasses
@@ -33,9 +33,11 @@ from humangs_jax.core.pytree import shape_fault
 P = ParamSpec("P")
 T = TypeVar("T")
 NUMBERS = (int, float, complex, bool)
-"""Classes that are not checked, because numbers of numpy and JAX are accepted, too."""
+"""Classes of numbers. An argument that is annotated with one is not checked, because numbers of
+numpy and JAX are accepted, too.
+"""
 SEQUENCES = {list: Sequence, Sequence: Sequence, Iterable: Iterable, os.PathLike: os.PathLike}
-"""Classes that lists and paths may have; what is in them is not checked."""
+"""The class that is checked for each generic class of an annotation. Its items are not checked."""
 HINTS = {
     ("Gaussians", "Avatar"): "animate(avatar, pose) poses them",
     ("Avatar", "Gaussians"): "an Avatar has what they need to be posed",
@@ -55,13 +57,16 @@ HINTS = {
 
 
 def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorates a function so that its arguments are of the classes of their annotations, and the
-    arrays of one pytree fit each other.
+    """Decorates a function so that each call checks the classes of its arguments, and the shapes of
+    the arrays in them.
 
-    Parameters that may be something else than plain classes, sequences or arrays (numbers,
-    callables) are left alone.
-    Raises: TypeError, one line, for another class or a name that the function does not have;
-    ValueError for shapes, and for a batch of what functions take one of (`one_at_a_time`).
+    A parameter is not checked if its annotation allows anything besides plain classes and
+    sequences, or anything besides arrays. So numbers and callables are not checked. Of a parameter
+    that is an array, only the number of axes is checked.
+    Raises: TypeError, of one line, for an argument of another class, for a name that the function
+    does not have, and for a missing argument. ValueError for an array with another number of axes,
+    for a pytree that does not fit its annotations (`shape_fault`), and for a batch where the
+    function takes one example (`one_at_a_time`).
     """
     # annotations are read once, when the function is defined
     signature = inspect.signature(function)
@@ -117,8 +122,8 @@ def _arrays(annotation: Any) -> tuple[Any, ...]:
 
 
 def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
-    """Returns a text that says why a value is not the expected array, or None. Numbers count as
-    arrays without axes.
+    """Returns a text that says why a value is not the expected array, or None if it is one. Only
+    the number of axes is compared. Numbers count as arrays without axes.
     """
     if value is None and type(None) in options:
         return None
@@ -138,8 +143,8 @@ def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
 
 
 def _classes(annotation: Any) -> tuple[type, ...]:
-    """Returns the classes that an annotation stands for. Empty if the annotation says more than a
-    class.
+    """Returns the classes that an annotation stands for. Empty if `isinstance` cannot check the
+    annotation, or if one of its classes is in `NUMBERS`.
     """
     union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     options = typing.get_args(annotation) if union else (annotation,)
@@ -158,8 +163,8 @@ def _classes(annotation: Any) -> tuple[type, ...]:
 
 
 def _call(function: Callable[..., Any], signature: inspect.Signature) -> str:
-    """Returns the call of a function as text: parameters without a default, then dots for the
-    others.
+    """Returns the call of a function as text: its positional parameters without a default, then
+    dots if it has others.
     """
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     parameters = signature.parameters.values()
@@ -228,8 +233,8 @@ LARGEST = 1e6
 and float32 holds products of several such numbers."""
 BOUNDED = Values(f"finite numbers of at most {LARGEST:g} in magnitude", -LARGEST, LARGEST)
 ROUNDING = 1e-6
-"""Distance by which numbers may lie outside of [0, 1]. It is a few float32 roundings, as in resized
-photos and in opacities from a sigmoid.
+"""Distance by which numbers may lie outside of [0, 1] or [-1, 1]. It is a few float32 roundings, as
+in resized photos and in opacities from a sigmoid.
 """
 UNIT = Values("numbers in [0, 1]", -ROUNDING, 1 + ROUNDING)
 SIGNED_UNIT = Values("numbers in [-1, 1]", -1 - ROUNDING, 1 + ROUNDING)
@@ -241,7 +246,7 @@ def check_values(
     owner: str,
     arrays: Mapping[str, tuple[Shaped[Array, "..."] | Shaped[np.ndarray, "..."] | None, Values]],
 ) -> None:
-    """Checks that arrays hold what they should.
+    """Checks that the numbers in arrays are finite and in their ranges.
 
     Arguments: owner: the function that was called, for the message. arrays: by name (for the
     message too), each with the values that it may have; None and empty arrays pass. Arrays of JAX
@@ -275,7 +280,7 @@ def check_values(
 
 
 def require_concrete(owner: str, why: str, *trees: Any) -> None:
-    """Checks that no array is traced.
+    """Checks that no array in some pytrees is traced.
 
     owner: the function that was called. why: text that says why it needs values. Raises: TypeError
     of one line.

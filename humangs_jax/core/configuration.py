@@ -1,7 +1,7 @@
 """Writes configurations (frozen dataclasses, nested) as JSON, reads them back, and checks them
 against their annotations.
 
-Numbers are annotated with their range. Every way to make a configuration checks it:
+Numbers are annotated with their range. The range is checked whenever a configuration is made:
 
     @configuration
     class Fit:
@@ -9,9 +9,10 @@ Numbers are annotated with their range. Every way to make a configuration checks
 
 A class variable `renamed_fields` maps the names of fields in earlier files to the names of today.
 
-A field annotated with a subclass of `Part` may hold any class derived from it that is decorated
-with `part`. The JSON names the class under "kind", as "PatchTransformer". Reading imports nothing:
-a part of another package is known once its module is imported.
+A field annotated with a subclass of `Part` may hold an object of any class derived from it. The
+class must be decorated with `part`, or it cannot be written. The JSON names the class under "kind",
+as "PatchTransformer". Reading imports nothing: a part of another package is known once its module
+is imported.
 """
 
 import dataclasses
@@ -155,8 +156,8 @@ def check_fields(cls: type, values: Mapping[str, Any], owner: str) -> None:
     """Checks that the values of fields have the types and ranges of the annotations of a
     configuration.
 
-    An `int` field takes any integer, and a `float` field any real number. owner: begins the
-    message.
+    An `int` field takes any integer of up to 2^63 in magnitude, and a `float` field takes such
+    integers and any finite real number. Booleans are not numbers here. owner: begins the message.
 
     Raises: ValueError, which names owner and field.
     """
@@ -175,7 +176,9 @@ def _annotations(cls: Any) -> dict[str, Any]:
 
 
 def _fits(value: Any, annotation: Any) -> bool:
-    """Says whether a value has the annotated type. Parts and arrays are not checked here."""
+    """Says whether a value has the annotated type. Annotations other than numbers, texts, booleans,
+    None, literals, tuples and dataclasses accept any value.
+    """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, option) for option in arguments)
@@ -220,7 +223,8 @@ def in_words(annotation: Any) -> str:
 
 @typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, knob))
 def configuration(cls: type[T]) -> type[T]:
-    """Makes a class a frozen dataclass whose fields are checked when an instance is made.
+    """Makes a class a frozen dataclass whose fields are checked when an instance is made. A
+    subclass of `Part` stays the dataclass that Linen made of it.
 
     A wrong value raises a ValueError that names the class, the field, the value and what is
     expected.
@@ -242,8 +246,8 @@ def configuration(cls: type[T]) -> type[T]:
 
 
 class Part:
-    """Base class of modules of Linen that are fields of configurations. Files name them by their
-    registered name. Their fields cannot be assigned once they are made.
+    """Base class of modules of Linen that are fields of configurations. Files name such a module by
+    its registered name. Its fields cannot be assigned once it is made.
     """
 
     def __setattr__(self, name: str, val: Any) -> None:  # the names of Linen's
@@ -257,7 +261,9 @@ _MADE = "_made"
 
 @functools.cache
 def field_names(cls: Any) -> tuple[str, ...]:
-    """Returns the names of the fields of a configuration."""
+    """Returns the names of the fields of a configuration. `parent` and `name`, which Linen adds to
+    a `Part`, are left out.
+    """
     # the fields of a `Part` that say where it is are no configuration
     place = ("parent", "name") if issubclass(cls, Part) else ()
     return tuple(field.name for field in dataclasses.fields(cls) if field.name not in place)
@@ -288,14 +294,14 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
 
     Args:
         config: a frozen dataclass.
-        changes: new values by path.
+        changes: new values by path. docs/knobs.md lists all paths.
 
     Returns:
         The changed copy.
 
     Raises:
-        ValueError: naming the path, and those that are like it, for a field that does not exist;
-            and as the configuration's own checks. docs/knobs.md lists all paths.
+        ValueError: if a field does not exist. The message names its path, and up to three similar
+            ones. Also if the configuration's checks refuse a value.
 
     Examples:
         >>> class_token = "model.architecture.encoder.transformer.class_token"
@@ -320,8 +326,10 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
 
 
 def field_paths(config: Any, before: str = "") -> dict[str, Any]:
-    """Returns the values of all fields of a configuration by path, with those of nested
-    configurations.
+    """Returns the value of each field by its path, such as "loss.squared". Nested configurations
+    are included, themselves and their fields.
+
+    before: text that begins each path.
     """
     found: dict[str, Any] = {}
     for name in field_names(type(config)):
@@ -341,7 +349,7 @@ def _varied(config: Any, names: list[str], value: Any) -> Any:
 
 def check_range(cls: type, name: str, value: Any, path: str) -> None:
     """Checks that a number of a field, or each number in its tuple, is in the range of the
-    annotation.
+    annotation. path: names the field in the message.
 
     Raises: ValueError if one is not, or if the tuple is too long.
     """
@@ -367,7 +375,7 @@ def _ranges(cls: Any) -> dict[str, tuple[Range, ...]]:
 
 
 def marks_in(annotation: Any, kind: type[T]) -> Iterator[T]:
-    """Yields the marks of class `kind` in an annotation or a part of it, as in `Annotated[int,
+    """Yields the marks of class `kind` in an annotation and in its parts, as in `Annotated[int,
     Range(1, 9)] | None`.
     """
     if typing.get_origin(annotation) is Annotated:
@@ -377,7 +385,10 @@ def marks_in(annotation: Any, kind: type[T]) -> Iterator[T]:
 
 
 def config_to_json(config: Any, indent: int | None = None) -> str:
-    """Returns a configuration as JSON, with nested configurations as nested objects."""
+    """Returns a configuration as JSON, with nested configurations as nested objects.
+
+    Raises: ValueError for a `Part` whose class is not registered.
+    """
     return json.dumps(_plain(config), indent=indent)
 
 
@@ -413,8 +424,9 @@ def config_from_json(cls: type[T], text: str) -> T:
     """Returns the configuration of class `cls` that `config_to_json` wrote. Missing fields take
     their defaults.
 
-    Raises: ValueError, which names the field, for a field that the configuration does not have, a
-    missing field without a default, or a value of a wrong type.
+    Raises: ValueError if the text is not JSON. Also, with the path of the field, for a field that
+    the configuration does not have, a missing field without a default, or a value of a wrong type
+    or out of range.
     """
     try:
         values = json.loads(text)
@@ -424,8 +436,12 @@ def config_from_json(cls: type[T], text: str) -> T:
 
 
 def _build(annotation: Any, value: Any, path: str) -> Any:
-    """Returns a JSON value as the type that its annotation asks for. A value that does not fit is
-    returned unchanged, and checked by the caller.
+    """Returns a JSON value converted to the annotated type. Objects become configurations, lists
+    become tuples, and integers become floats. A value that cannot be converted is returned
+    unchanged, and the caller checks it.
+
+    path: names the value in messages. Raises: ValueError for an object that is no such
+    configuration, and for a tuple with a wrong item.
     """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     # a part names its class, a dataclass is known by the annotation

@@ -18,7 +18,7 @@ from humangs_jax.core.array_types import Array, Float, Key
 def uniform_by_name(
     key: Key, shapes: Mapping[str, tuple[int, ...]], dtype: Any = jnp.float32
 ) -> dict[str, Float[Array, "..."]]:
-    """Returns uniform random numbers in [0, 1), an array of each shape by its name."""
+    """Returns arrays of uniform random numbers in [0, 1) by name. shapes: their shapes by name."""
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
     parts = jnp.split(jax.random.uniform(key, (ends[-1],), dtype), ends[:-1])
     return {

@@ -1,8 +1,9 @@
-"""Loops over what does not depend on each other: the photos, targets and images of one subject.
+"""Runs a function for things that do not depend on each other: the photos, targets and images of
+one subject.
 
-A CPU runs them one after the other: memory for one, and loops of tiles and faces that end when
-their own image is done. An accelerator would then wait for thousands of small operations, so it
-runs them side by side.
+A CPU runs them one after the other. So memory is needed for one at a time, and the loops over tiles
+and faces end when the work of one image is done. An accelerator would then wait for thousands of
+small operations, so it runs them side by side.
 """
 
 from collections.abc import Callable
@@ -15,24 +16,25 @@ from humangs_jax.core.array_types import PyTree
 T = TypeVar("T", bound=PyTree)
 PIXELS_AT_ONCE = 1 << 22
 """Pixels of the images that an accelerator works on side by side for one subject: sixteen of 512 x
-512, so that four photos or targets of the published size are worked on together. More go in parts.
+512, so that four photos or targets of the published size are worked on together. Images with more
+pixels are worked on in several parts.
 """
 
 
 def one_after_the_other() -> bool:
-    """Says whether loops are faster than `vmap` on the default backend, which is so on a CPU."""
+    """Says whether loops are faster than `vmap` on the default backend. They are on a CPU."""
     return jax.default_backend() == "cpu"
 
 
 def over(function: Callable[[PyTree], T], xs: PyTree, pixels: int = 1) -> T:
-    """Calls `function` for each element along the first axis of `xs`; results are stacked, as
-    `jax.lax.map` does.
+    """Calls `function` for each element along the first axis of `xs`, and returns the stacked
+    results as `jax.lax.map` does.
 
     Args:
         function: a pure function of one element.
         xs: arrays with one leading axis.
-        pixels: pixels of an element's image. No more than `PIXELS_AT_ONCE` are worked on side by
-            side.
+        pixels: pixels of an element's image. An accelerator works on elements of up to
+            `PIXELS_AT_ONCE` pixels side by side, and on at least one.
     """
     if one_after_the_other():
         return jax.lax.map(function, xs)

@@ -1,4 +1,4 @@
-"""Every gradient-safety trick of the package, in one tested place.
+"""Functions for arrays whose gradients have to stay finite.
 
 The double-where rule: a `jnp.where` that selects a finite value still back-propagates NaN from the
 branch it rejects, so the rejected branch must be evaluated at a harmless argument first. All
@@ -12,7 +12,8 @@ from humangs_jax.core.array_types import Array, Float, PyTree
 
 
 def at_least_float32(tree: PyTree) -> PyTree:
-    """Returns the tree with its bfloat16 and float16 arrays in float32; wider ones unchanged.
+    """Returns the tree with arrays of less precision in float32: bfloat16, float16, integers and
+    booleans. Wider floating-point arrays are unchanged.
 
     Gradients come back in the narrow type.
     """
@@ -35,8 +36,8 @@ def safe_divide(
 
 
 def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Returns sqrt(max(x, 0)) with zero gradient where x <= 0, where the true one is infinite or
-    undefined.
+    """Returns sqrt(max(x, 0)) with zero gradient where x <= 0. The gradient of `jnp.sqrt` is
+    infinite or undefined there.
     """
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
@@ -50,10 +51,10 @@ def absolute(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def safe_normalize(x: Float[Array, "*b d"], fallback: Float[Array, " d"]) -> Float[Array, "*b d"]:
-    """Returns x / |x|, and `fallback` with zero gradient where |x| is 0.
+    """Returns x / |x|, and `fallback` with zero gradient where |x| is 0 or NaN.
 
-    Scaled by the largest magnitude first, so that neither squares overflow nor small vectors
-    underflow.
+    x is divided by its largest magnitude first, so that squares do not overflow and small vectors
+    do not underflow.
     """
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
     zero = ~(largest > 0)

@@ -25,11 +25,11 @@ from typing import Any, TypeVar
 
 
 def keep_freed_memory() -> bool:
-    """Makes the process keep the memory that it frees. Returns whether the C library has this
-    setting (glibc).
+    """Makes the process keep blocks of up to 1 GiB that it frees. Returns whether the C library
+    took these settings, which glibc does.
 
     Programs call it once, before the first large array; the library never does. The process then
-    never gets smaller than its peak.
+    hardly gets smaller than its peak.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -46,8 +46,8 @@ def peak_memory() -> Generator[list[float | None]]:
     """Yields a list of one number. After the block, the number is the memory in MiB that the block
     added to the process at its peak.
 
-    The number is None on systems other than Linux with glibc, because it is read from /proc. It
-    does not include the memory of a GPU or TPU.
+    The number is None on systems other than Linux with glibc, and where /proc cannot be written to.
+    It does not include the memory of a GPU or TPU.
     """
     result: list[float | None] = [None]
     trim = None
@@ -69,8 +69,8 @@ def peak_memory() -> Generator[list[float | None]]:
 
 
 def memory_status(name: str) -> float:
-    """Returns a number of /proc/self/status in MiB: "VmRSS" is the resident memory now, "VmHWM"
-    that at the peak.
+    """Returns a number of /proc/self/status in MiB. "VmRSS" is the resident memory now, and "VmHWM"
+    is its peak.
 
     This works on Linux only.
     """
@@ -129,10 +129,10 @@ def in_processes(
     """Yields (name, work(*arguments)) for each named task, in the order in which the tasks end.
     Several processes of one thread each run them, on the CPU.
 
-    Arguments: tasks: the arguments of `work` by name. workers: largest number of processes.
-    prepare: called as prepare(*given) when a process starts. All of these are pickled. If the
-    caller stops, by Ctrl-C or otherwise, unfinished tasks are dropped and the processes end.
-    Raises: OSError if a process is killed.
+    Arguments: work: a function. tasks: the arguments of `work` by name. workers: largest number of
+    processes. prepare: called as prepare(*given) when a process starts. All of these are pickled.
+    If the caller stops, by Ctrl-C or otherwise, unfinished tasks are dropped and the processes end.
+    Raises: OSError if a process is killed; anything that `work` raises.
     """
     import concurrent.futures.process
 
@@ -196,8 +196,8 @@ VARIABLE = "HUMANGS_COMPILE_CACHE"
 OF_JAX = "JAX_COMPILATION_CACHE_DIR"
 """JAX's environment variable for the folder of compiled programs."""
 LARGEST = 2 << 30
-"""Largest size of the cache, bytes. Beyond it, the files that were not used for longest are
-deleted. JAX's own limit needs the package `filelock`.
+"""Largest size of the cache, bytes. `enable_compile_cache` deletes the files beyond it that were
+not used for longest. JAX's own limit needs the package `filelock`.
 """
 
 
@@ -209,21 +209,22 @@ second, most programs of a command are compiled again each time.
 
 
 def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Turn on JAX's persistent compilation cache, in a folder for each version of JAX and kind of
+    """Turns on JAX's persistent compilation cache, in a folder for each version of JAX and kind of
     processor.
 
     Programs call it once, before the first computation; the library never does. JAX is not imported
     here: it finds the folder in its environment variable, as do the programs that this one starts.
-    A cache that JAX already has (`JAX_COMPILATION_CACHE_DIR`) stays.
+    A cache that JAX already has (`JAX_COMPILATION_CACHE_DIR`) stays. With `HUMANGS_COMPILE_CACHE=0`
+    nothing is done.
 
     Args:
-        folder: where the cache lies. None: what the environment variable `HUMANGS_COMPILE_CACHE`
-            names, else `humangs_jax` in the user's cache folder (`XDG_CACHE_HOME`, or what the
-            platform has in its place).
+        folder: the folder that holds the caches. None: what the environment variable
+            `HUMANGS_COMPILE_CACHE` names, else `humangs_jax` in the user's cache folder
+            (`XDG_CACHE_HOME`, or what the platform has in its place).
 
     Returns:
-        The folder in use, or None where there is none: `HUMANGS_COMPILE_CACHE=0` turns the cache
-        off, and a folder that cannot be written to is not an error.
+        The folder in use, which lies in `folder`, or the one that JAX already had. None with
+        `HUMANGS_COMPILE_CACHE=0`, or if the folder cannot be written to.
 
     Examples:
         >>> hg.enable_compile_cache()
@@ -288,7 +289,7 @@ def _processor() -> str:
 
 def _delete_oldest(root: Path, largest: int) -> None:
     """Deletes cached programs under `root` until at most `largest` bytes are left. Programs that
-    were not used for longest go first, whatever their version of JAX.
+    were not used for longest go first, of any version of JAX.
     """
     files = []
     for file in root.glob("jax-*/*-cache"):
@@ -363,9 +364,11 @@ Call = tuple[Any, tuple[Any, ...]]
 
 
 def spare_cores() -> int:
-    """Returns the number of cores beside the two that a command's own work keeps busy: Python's and
-    XLA's threads. Measured on two cores: compiling one program ahead, or two at once, made the demo
-    15 s slower the first time, since each program and the work beside it took longer.
+    """Returns the number of the machine's cores less two, at least 0. A command's work keeps two
+    cores busy with the threads of Python and XLA.
+
+    Measured on two cores: compiling one program ahead, or two at once, made the demo 15 s slower
+    the first time, since each program and the work beside it took longer.
     """
     return max(0, (os.cpu_count() or 1) - 2)
 
@@ -408,7 +411,7 @@ class Ahead:
         threading.Thread(target=self._begin, args=(calls,), daemon=True).start()
 
     def _begin(self, calls: Iterable[Call]) -> None:
-        """Starts a thread for each program, few at a time."""
+        """Starts a thread for each program, at most `at_once` of them at a time."""
         with contextlib.suppress(Exception):
             for call in calls:
                 self._free.acquire()

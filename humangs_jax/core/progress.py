@@ -1,14 +1,13 @@
-"""What the package shows on a terminal: stages of long work, bars, and lines of text (`say`), all
-of it printable.
+"""Shows stages of long work, bars and lines of text (`say`) on a terminal. All of it is printable.
 
     with stage("reading the capture"):
         ...
     for view in bar(views, desc="render"):
         ...
 
-No other module prints. The library opens stages where work takes long. Unless a program asked for
-it by `begin`, a stage shows and costs nothing. The seconds of the outermost stages are kept for the
-program that began; stages inside of them only change the line that is shown.
+No other module prints. The library opens stages where work takes long. A stage shows nothing and
+costs nothing unless a program has called `begin`. Only stages outside of all others are measured,
+and `Progress.seconds` keeps their times. Stages inside of them only change the line that is shown.
 """
 
 import contextlib
@@ -23,11 +22,12 @@ from typing import Any
 
 
 def printable(text: object, lines: bool = False) -> str:
-    r"""Escapes every character that a terminal would act on as Python does (\x1b, \u202e, \n).
+    r"""Returns a text with every character that a terminal would act on escaped, as Python escapes
+    it (\x1b, \u202e, \n).
 
     These are control characters, C1 included, marks of direction and other format characters,
-    separators of lines, and bytes of file names that are not UTF-8 (\xe9). lines: line feeds and
-    tabs stay, for a report of several lines.
+    separators of lines, and bytes of file names that are not UTF-8 (\xe9). lines: whether line
+    feeds and tabs stay, for a report of several lines.
     """
     text = str(text)
     if text.isprintable():
@@ -70,18 +70,22 @@ CLEAR = "\r\033[K"
 
 @dataclasses.dataclass
 class Progress:
-    """The settings of what is shown, and the measured times."""
+    """What a program shows of its work, and the times that were measured."""
 
     ticking: bool = False
     """Whether a line on stderr counts the seconds of a stage while it runs."""
     naming: bool = False
-    """Whether a stage longer than `LONG` leaves its name on stderr, where that is no terminal."""
+    """Whether an outermost stage longer than `LONG` leaves its name on stderr, where that is no
+    terminal.
+    """
     lines: bool = False
-    """Whether each stage leaves a line with its seconds."""
+    """Whether each outermost stage leaves a line with its seconds, even where stderr is no
+    terminal.
+    """
     quiet: bool = False
     """Whether neither stages nor bars are shown."""
     started: float = dataclasses.field(default_factory=time.perf_counter)
-    """Time at which it began, seconds of `time.perf_counter`."""
+    """Time at which the program began, seconds of `time.perf_counter`."""
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     """Seconds of the finished outermost stages by name, since `started`."""
     names: list[str] = dataclasses.field(default_factory=list)
@@ -98,10 +102,11 @@ _bars: "weakref.WeakSet[Any]" = weakref.WeakSet()
 
 
 def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
-    """Starts to show stages. A terminal on stderr gets a line that counts seconds.
+    """Starts to show stages, and returns the settings. If stderr is a terminal, a line there counts
+    the seconds of a stage.
 
-    Arguments: quiet: show neither stages nor bars. lines: leave a line for each stage, wherever
-    stderr goes.
+    Arguments: quiet: whether neither stages nor bars are shown. lines: whether each outermost stage
+    leaves a line, wherever stderr goes.
     """
     global _current
     terminal, shown = sys.stderr.isatty(), not quiet
@@ -120,9 +125,8 @@ def current() -> Progress:
 
 
 def end() -> None:
-    """Stops showing stages, as before `begin`.
-
-    Bars that an error has left open get their last line.
+    """Stops showing stages, as before `begin`. All bars that are still open are closed, which shows
+    their last line.
     """
     global _current
     _current = Progress()
@@ -133,8 +137,8 @@ def say(text: object, *, error: bool = False, lines: bool = True) -> None:
     """Prints text on stdout, with everything that a terminal would act on escaped. Bars and the
     line of a stage make room for it.
 
-    Arguments: error: print on stderr. lines: whether the text may have several lines; otherwise
-    line feeds are escaped, too.
+    Arguments: error: whether to print on stderr instead. lines: whether the text may have several
+    lines; otherwise line feeds and tabs are escaped, too.
     """
     stream = sys.stderr if error else sys.stdout
     encoding = getattr(stream, "encoding", None) or "utf-8"  # a terminal may know ASCII only
@@ -152,7 +156,9 @@ def say(text: object, *, error: bool = False, lines: bool = True) -> None:
 
 @contextlib.contextmanager
 def stage(name: str) -> Generator[None]:
-    """Shows a part of long work while the block runs, and measures it."""
+    """Shows a part of long work while the block runs. If no other stage runs, its seconds are
+    measured.
+    """
     # what is shown around this stage comes back at its end
     current, paused, bars = _current, _current.paused, set(_bars)
     name = printable(name)
@@ -225,13 +231,13 @@ def compiling(program: Hashable = None) -> Generator[None]:
 def bar(
     iterable: Iterable[Any] | None = None, *, shown: bool = True, first: str = "", **how: Any
 ) -> Any:
-    """Makes a bar of tqdm, whose options `how` are. It takes the place of the line of the stage
-    around it.
+    """Returns a bar of tqdm. While it runs, it takes the place of the line of the stage around it.
 
-    Where stderr is no terminal (a log, a notebook) it moves every `LONG` seconds.
+    Where stderr is no terminal (a log, a notebook) the bar moves every `LONG` seconds.
 
     Arguments: shown: whether the caller of the library asked for bars; a program may still hide all
-    of them. first: what it says until the first item is there.
+    of them. first: text that the bar shows until the first item is there. how: further options of
+    tqdm.
     """
     from tqdm import tqdm
 
@@ -271,7 +277,9 @@ def followed() -> bool:
 
 
 def watched() -> bool:
-    """Says whether a program shows stages on a terminal. Long loops without a bar then show one."""
+    """Says whether a program shows stages on a terminal. Callers then show a bar for a long loop
+    that has none otherwise.
+    """
     return _current.ticking
 
 

@@ -79,7 +79,9 @@ def _make_exportable(cls: type[Any]) -> None:
     of this class.
 
     Its name in such files consists of the package and the class, so that files stay readable if a
-    module moves. Classes that are defined inside functions have no such name and are left out.
+    module moves. Classes that are defined inside functions or in `__main__` are left out.
+
+    Raises: TypeError if another module has a pytree of this name.
     """
     name = f"{cls.__module__.partition('.')[0]}.{cls.__qualname__}"
     if "<locals>" in name or cls.__module__ == "__main__":
@@ -102,7 +104,7 @@ def _make_exportable(cls: type[Any]) -> None:
 def _static_bytes(values: tuple[Any, ...]) -> bytes:
     """Returns static fields as JSON.
 
-    Raises: TypeError if a field holds anything but numbers, texts and tuples of these.
+    Raises: TypeError if JSON cannot hold a field's value.
     """
     return json.dumps(values).encode()
 
@@ -170,7 +172,9 @@ class Batchable:
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """Sizes of the leading batch axes; () for one example."""
+        """Sizes of the leading batch axes, or () for one example. The first field with an array
+        decides.
+        """
         for field in dataclasses.fields(self):  # ty: ignore[invalid-argument-type]
             value = getattr(self, field.name)
             if isinstance(value, Batchable):
@@ -198,8 +202,9 @@ class Batchable:
         """Returns one example of a batch (for an integer), or a batch of some examples (for a
         slice, a mask or an array of integers), along the first axis.
 
-        Raises: TypeError if this is no batch; IndexError for an integer out of range. JAX clamps
-        traced integers and arrays instead.
+        Raises: TypeError if this is no batch; IndexError for an integer out of range. A traced
+        index out of range is clamped by JAX. In an array of integers, numbers out of range raise an
+        IndexError where numpy indexes the leaves (`core.arrays.taken`), and are clamped elsewhere.
         """
         size = len(self)
         if not isinstance(index, slice | Tracer) and getattr(index, "ndim", 0) == 0:
@@ -245,7 +250,7 @@ def shape_fault(tree: Any) -> str | None:
     The rules:
 
     - Axes with one name have one size.
-    - A batch has further axes in front. Most of the arrays say how many.
+    - A batch has further axes in front. Their number is the one that most of the arrays have.
     - An array that is annotated as floating-point numbers holds no integers.
     - A static field that is an `int` holds a whole number.
     """
@@ -353,8 +358,8 @@ def _annotated_fields(cls: Any) -> dict[str, _Field]:
 
 
 def annotated_axes(array: Any) -> tuple[str | int, ...] | None:
-    """Returns the names and sizes of the axes in a jaxtyping annotation. None for arrays of any
-    shape.
+    """Returns the names and sizes of the axes in a jaxtyping annotation. None if an axis is neither
+    a name nor a number, as in "..." and "*b".
     """
     texts = str(array.dim_str).split()
     axes = tuple(int(text) if text.isdigit() else text for text in texts)

@@ -51,9 +51,11 @@ class ArrayField(NamedTuple):
     """Parts that are checked by themselves."""
 
     def shape(self, array: Any, sizes: dict[str, int]) -> tuple[int | str, ...]:
-        """Returns the shape that an array should have; names stand for sizes that are not known.
+        """Returns the shape that an array should have. It has the name of an axis whose size is not
+        known.
 
-        sizes: of axes by their names; those that this array is the first to have are added.
+        sizes: the known sizes of axes by name. If the array has as many axes as expected, the sizes
+        of its other axes are added to it.
         """
         own = np.shape(array)
         if self.axes is None:
@@ -65,7 +67,9 @@ class ArrayField(NamedTuple):
         return tuple(sizes.get(axis, axis) if isinstance(axis, str) else axis for axis in self.axes)
 
     def checks(self, array: Any, label: str) -> dict[str, tuple[Any, Values]]:
-        """Returns the array and its parts, with the values each may have, for `check_values`."""
+        """Returns the array and its parts by name, each with the values that it may have, for
+        `check_values`. Empty if the array is None or is not checked.
+        """
         if array is None or self.values is None:
             return {}
         found = {label: (array, self.values)}
@@ -77,8 +81,8 @@ class ArrayField(NamedTuple):
 
 @functools.cache
 def array_fields(record: Any) -> dict[str, ArrayField]:
-    """Returns the arrays of a class of records, and of the records in it that are looked into, by
-    their names: "images", "cameras.K".
+    """Returns what a class of records says of its arrays, by name: "images", "cameras.K". The
+    arrays of a record in it are included if a `Batch` marks its field.
     """
     found = {}
     for field in dataclasses.fields(record):
@@ -104,10 +108,11 @@ def array_fields(record: Any) -> dict[str, ArrayField]:
 def record_values(
     record: Any, name: str, *, on_host: bool = False
 ) -> dict[str, tuple[Any, Values]]:
-    """Returns the arrays of a record with the values that each may have, for `check_values`.
+    """Returns the arrays of a record with the values that each may have, by name, for
+    `check_values`.
 
-    Arguments: record: None has no arrays. name: of the record, in errors. on_host: read all there,
-    since they are few numbers.
+    Arguments: record: a dataclass, or None, which has no arrays. name: name of the record in
+    errors. on_host: whether to bring all arrays to the host, which suits few numbers.
     """
     found: dict[str, tuple[Any, Values]] = {}
     if record is None:
@@ -121,12 +126,13 @@ def record_values(
 
 
 def check_record(record: Any, owner: str, sizes: Mapping[str, int] | None = None) -> None:
-    """Checks the shapes and the values of a record, and of the records in it.
+    """Checks the shapes and the values of a record, and of the records in it that `array_fields`
+    includes. Arrays that are None pass.
 
     Arguments: record: a dataclass whose arrays are annotated. owner: the caller, for the message.
     sizes: known sizes of axes. Other axes are as long as in the first array that has them.
 
-    Raises: ValueError of one line: the array, what was expected and what it has.
+    Raises: ValueError of one line, which names the array, what was expected, and what it has.
     """
     known, values = dict(sizes or {}), {}
     for name, annotated in array_fields(type(record)).items():

@@ -17,22 +17,23 @@ FOLDER = ""
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """One kind of files; tables with more to say of each have a subclass."""
+    """One kind of files. Tables that say more of each kind use a subclass."""
 
     about: str
     """Whose files these are, a few words: shown by `--help` and in the docs."""
     code: str | Callable[..., Any]
-    """The function that reads or writes them; as text "package.module:function"."""
+    """The function that reads or writes such files, or its name as "package.module:function"."""
     suffixes: tuple[str, ...] = ()
-    """Suffixes of its files, in lower case, with the dot; FOLDER for a folder. Empty: names do not
+    """Suffixes of such files, in lower case, with the dot; FOLDER for a folder. Empty: names do not
     tell.
     """
     recognizes: str | Callable[[Path], bool] | None = None
-    """Whether a file with such a suffix is of this format, where suffixes are shared; None: it is.
+    """A function that says whether a path with such a suffix is of this format, or its name as
+    text. It is needed where formats share a suffix. None: every path with such a suffix is.
     """
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        """Returns what the code makes of the arguments."""
+        """Calls the code with the arguments and returns its result."""
         return imported(self.code)(*arguments, **options)
 
 
@@ -48,15 +49,17 @@ class Formats(dict[str, F]):
         return tuple(dict.fromkeys(suffix for each in self.values() for suffix in each.suffixes))
 
     def of(self, path: Path) -> "Formats[F]":
-        """Returns the formats whose files are named like this one, or are folders."""
+        """Returns the formats that have the suffix of a path, or the formats of folders if the path
+        is a folder.
+        """
         suffix = FOLDER
         if not path.is_dir():
             suffix = path.suffix.lower()
         return self.where(lambda each: suffix in each.suffixes)
 
     def recognized(self, path: Path) -> F | None:
-        """Returns the first format that a file has, or None. Formats that look into the file are
-        tried first.
+        """Returns the first format that the file or folder has, or None. Formats with `recognizes`
+        are tried first.
         """
         found = sorted(self.of(path).values(), key=lambda each: each.recognizes is None)
         return next(
@@ -65,7 +68,7 @@ class Formats(dict[str, F]):
         )
 
     def where(self, holds: Callable[[F], bool]) -> "Formats[F]":
-        """Returns the formats for which this holds."""
+        """Returns the formats for which `holds` returns True."""
         return Formats({name: each for name, each in self.items() if holds(each)})
 
     def listed(self) -> str:

@@ -1,3 +1,3 @@
 """Reads untrusted files within one set of limits, refuses bad files in one line, and writes files
-whole or not at all.
+so that no unfinished one appears.
 """

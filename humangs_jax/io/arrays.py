@@ -1,7 +1,7 @@
 """Checks arrays of files, computes their checksums, and reads npz archives without pickle.
 
-Functions raise InvalidFileError, see `io.reading`. `ArrayFile` knows its file, so each of its
-errors is one line with file and key.
+The functions `check_...` raise InvalidFileError, see `io.reading`. `ArrayFile` knows its file, so
+each of its errors is one line with file and key.
 """
 
 import hashlib
@@ -50,9 +50,13 @@ def numbers(
     """Returns a value of a file as an array of real numbers that are finite in float32.
 
     Arguments:
-        shape: expected sizes of the axes; None in it is any size, and None for it any shape. some:
-            whether there must be at least one number. nulls: whether null becomes NaN; numbers then
-            need not be finite. largest: largest magnitude that is allowed.
+        file, field: for the error.
+        shape: expected sizes of the axes; None in it is any size, and None for it any shape.
+        some: whether there must be at least one number.
+        nulls: whether null becomes NaN; numbers then need not be finite.
+        largest: largest magnitude that is allowed.
+        dtype: type of the numbers in the array that is returned.
+        error: class of the error.
 
     Raises: `error` with file, field and what was expected.
     """
@@ -116,7 +120,7 @@ def check_array(
     high: float = math.inf,
 ) -> None:
     """Checks that an array has the shape, and real numbers in [low, high] that are finite in
-    float32. None and names in the shape stand for any size.
+    float32. Booleans are refused. None and names in the shape stand for any size.
 
     Raises: InvalidFileError.
     """
@@ -137,7 +141,7 @@ def check_array(
 
 
 def check_row_sums(name: str, weights: np.ndarray) -> None:
-    """Checks that rows of weights sum to 1."""
+    """Checks that rows of weights sum to 1, to within 0.01. Raises: InvalidFileError."""
     sums = weights.sum(axis=1, dtype=np.float64)
     if not sums.size:
         return
@@ -147,7 +151,11 @@ def check_row_sums(name: str, weights: np.ndarray) -> None:
 
 
 def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], bound: int) -> None:
-    """Checks that an array has integers in [0, bound)."""
+    """Checks that an array has the shape, and integers in [0, bound). None in the shape stands for
+    any size.
+
+    Raises: InvalidFileError.
+    """
     check_array(name, array, shape)
     if array.dtype.kind not in "iu" or (
         array.size and not 0 <= int(array.min()) <= int(array.max()) < bound
@@ -156,7 +164,8 @@ def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], b
 
 
 def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
-    """Checks that joints have names and form a tree with one root, whose parent is -1.
+    """Checks that joints form a tree with one root, whose parent is -1, that their names are
+    printable, and that they are within the limit `joints`.
 
     Raises: InvalidFileError.
     """
@@ -202,8 +211,8 @@ def file_checksum(file: Path) -> str:
 
 
 def check_checksum(recorded: Any, found: str) -> None:
-    """Checks that the recorded checksum is the one that was found. None, from versions that
-    recorded none, is accepted.
+    """Checks that the recorded checksum of a file is the one that was found. A recorded None is
+    accepted, because earlier versions recorded none.
 
     Raises: InvalidFileError.
     """
@@ -215,7 +224,11 @@ def check_checksum(recorded: Any, found: str) -> None:
 
 
 class ArrayFile:
-    """The named arrays of a file. error: class of the error for a value that is not as expected."""
+    """The named arrays of a file.
+
+    values: the arrays by key. pickled: keys of pickled objects, which are not read. error: class of
+    the error for a value that is not as expected.
+    """
 
     def __init__(
         self,
@@ -233,8 +246,8 @@ class ArrayFile:
         error: type[FileError] = FileError,
         wanted: Callable[[str], bool] | None = None,
     ) -> "ArrayFile":
-        """Opens an npz archive, or else a pickle, without running anything in it. The suffix or the
-        content decides.
+        """Reads an npz archive or a pickle without running anything in it. A file is an archive if
+        its first bytes or its suffix say so.
 
         Arguments: wanted: says by name which arrays of an archive to read; None: all.
         Raises: `error` if the file is damaged or larger than the limits allow; for a missing file
@@ -251,7 +264,9 @@ class ArrayFile:
         return key in self.values
 
     def array(self, key: str) -> np.ndarray:
-        """Returns the value of a key as an array of any type. Raises: `error`."""
+        """Returns the value of a key as an array of any type. Raises: `error` if the key is
+        missing, or if its value is no array.
+        """
         if key not in self.values:
             found = ", ".join(sorted(map(str, self.values))) or "none"
             reason = "a pickled object, which is never read"
@@ -266,22 +281,22 @@ class ArrayFile:
     def numbers(
         self, key: str, shape: tuple[int | None, ...] | None, largest: float = np.inf
     ) -> Float[np.ndarray, "..."]:
-        """Returns the value of a key as finite float64 numbers, at least one. Raises: as
-        `numbers`.
+        """Returns the value of a key as finite float64 numbers, at least one. shape, largest: as in
+        the function `numbers`. Raises: `error`.
         """
         return numbers(
             self.array(key), self.path, key, shape, some=True, largest=largest, error=self.error
         )
 
     def number(self, key: str) -> float:
-        """Returns the value of a key, an array of any rank with a single number. Raises: as
-        `numbers`.
+        """Returns the single number in the array of a key, which may have any rank. Raises:
+        `error`.
         """
         return float(self.numbers(key, (1,) * self.array(key).ndim).reshape(-1)[0])
 
     def indices(self, key: str, bound: int) -> np.ndarray:
-        """Returns the value of a key as triangles (f, 3) of integers in [0, bound). Raises:
-        `error`.
+        """Returns the value of a key as triangles, (f, 3), int64, with vertices in [0, bound).
+        Raises: `error`.
         """
         array = self.numbers(key, (None, 3)).astype(np.int64)
         if array.min() < 0 or array.max() >= bound:
@@ -303,8 +318,8 @@ _HEADERS = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 LONGEST_HEADER = 512
-"""Largest number of characters of a header. A plain array takes some hundred, and longer headers
-can exhaust Python's parser.
+"""Largest number of characters of an array's header. A plain array takes some hundred, and longer
+headers can exhaust Python's parser.
 """
 
 
@@ -312,7 +327,7 @@ def read_npz(
     path: str | Path, wanted: Callable[[str], bool] | None = None
 ) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """Returns the arrays of an npz archive by name, and the names of entries that are pickled
-    objects. These are never read.
+    objects. Pickled objects are never read.
 
     Arguments: wanted: says by name which entries to read; None: all.
     Raises: FileNotFoundError; FileError if the file is no npz archive, is damaged, or is larger
@@ -352,7 +367,8 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
     """Opens a zip archive of `size` bytes, after checking that its members together stay within the
     limits.
 
-    Raises: InvalidFileError; anything that zipfile raises for damaged archives.
+    Raises: InvalidFileError, also for two members of one name and for a compression other than
+    deflate; anything that zipfile raises for damaged archives.
     """
     # the list of members is not read yet
     ending = zipfile._EndRecData(file)  # ty: ignore[missing-attribute]
@@ -375,10 +391,10 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
 
 
 def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Returns the shape of an npy array, whether columns come first, and its type. The array's
-    bytes follow in the file.
+    """Returns the shape of an npy array, whether columns come first, and its type. The file is then
+    at the first byte of the numbers.
 
-    Raises: InvalidFileError.
+    Raises: InvalidFileError, and what numpy raises for damaged headers.
     """
     version = np.lib.format.read_magic(file)
     if version not in _HEADERS:
@@ -417,8 +433,9 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
 def write_npz(
     path: str | os.PathLike[str], arrays: Mapping[str, Any], compressed: bool = True
 ) -> None:
-    """Writes array-likes by name into an npz archive, under any suffix. The file appears whole or
-    not at all. Raises: OSError.
+    """Writes arrays to an npz archive, each under its name. The path may have any suffix. If
+    writing fails, the path stays as it was. compressed: whether the archive is compressed. Raises:
+    OSError.
     """
     save = np.savez_compressed if compressed else np.savez
     converted: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}

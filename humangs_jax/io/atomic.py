@@ -1,4 +1,4 @@
-"""Writes files and folders so that they appear whole or not at all.
+"""Writes files and folders so that no unfinished one appears under its name.
 
 They are written under a temporary name in the same folder, then renamed.
 
@@ -25,24 +25,24 @@ from humangs_jax.core.processes import undisturbed
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
-"""Seconds without a change after which a temporary file of another machine (on a shared disk)
-counts as abandoned.
+"""Seconds without a change after which a temporary file counts as abandoned. On a shared disk,
+another machine may be writing it for so long.
 """
 MOVE_AWAY = "move it away, or choose another folder"
-"""Advice in errors about a file that was not written here and has the name of an output."""
+"""Advice in errors about a file that has the name of an output and that humangs did not write."""
 _TEMPORARY = re.compile(
     r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?"
 )
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Writes bytes to a file, whole or not at all. Raises: OSError."""
+    """Writes bytes to a file. If writing fails, the path stays as it was. Raises: OSError."""
     replace_file(path, lambda temporary: temporary.write_bytes(data))
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Writes text to a file in UTF-8. Names of files in it whose bytes are no UTF-8 keep these
-    bytes.
+    """Writes text to a file in UTF-8. If writing fails, the path stays as it was. Bytes of file
+    names that are no UTF-8 are written unchanged.
 
     Raises: OSError.
     """
@@ -50,8 +50,8 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def _encoded(text: str) -> bytes:
-    """Returns the bytes that `write_text` writes. Half surrogates that are no bytes of a name are
-    escaped.
+    """Returns the bytes that `write_text` writes. If the text has a lone surrogate that stands for
+    no byte, all its lone surrogates are escaped.
     """
     try:
         return text.encode("utf-8", "surrogateescape")
@@ -60,7 +60,7 @@ def _encoded(text: str) -> bytes:
 
 
 def write_texts(texts: Mapping[str | os.PathLike[str], str]) -> None:
-    """Writes texts to files in UTF-8, all of them or none. Raises: OSError."""
+    """Writes texts to files in UTF-8, see `replace_files`. Raises: OSError."""
     replace_files(
         {
             path: functools.partial(Path.write_bytes, data=_encoded(text))
@@ -70,8 +70,8 @@ def write_texts(texts: Mapping[str | os.PathLike[str], str]) -> None:
 
 
 def replace_file(path: str | os.PathLike[str], write: Callable[[Path], object]) -> None:
-    """Writes one file whole or not at all: write(temporary) makes the file, which is then renamed
-    to `path`. See `replace_files`.
+    """Writes one file: write(temporary) makes the file, which is then renamed to `path`. If writing
+    fails, the path stays as it was. See `replace_files`.
     """
     replace_files({path: write})
 
@@ -80,11 +80,11 @@ def replace_files(writers: Mapping[str | os.PathLike[str], Callable[[Path], obje
     """Calls write(temporary) for each path, which makes that file, then renames all files to their
     paths.
 
-    If one of them cannot be written, none appears. A temporary name has the suffix of its path.
-    Folders that do not exist are made.
+    Files are renamed only after all of them are written, so none appears if one cannot be written.
+    A temporary name has the suffix of its path. Folders that do not exist are made.
 
-    Raises: OSError, which names the path, if a file cannot be written; anything that `write`
-    raises.
+    Raises: OSError, which names the path, if a file cannot be written or renamed; anything that
+    `write` raises.
     """
     temporaries: dict[Path, Path] = {}
     with contextlib.ExitStack() as unfinished:
@@ -128,8 +128,8 @@ def replace_folder(
     """Calls write(temporary), which makes that folder, and renames it to `folder`. An existing
     folder is replaced.
 
-    The existing folder is moved aside first and deleted last, so its contents are never lost.
-    Parents are made.
+    The existing folder is moved aside first and deleted last, so it is not lost if the new one
+    cannot be put in its place. Parents are made.
 
     Arguments: mark: a file that all folders of this kind hold. A filled folder without that file is
     not replaced.
@@ -154,8 +154,8 @@ _being_written: set[Path] = set()
 
 @contextlib.contextmanager
 def _unfinished(temporary: Path) -> Generator[None]:
-    """Removes a temporary file or folder after the block if it still exists, and when the process
-    ends early (`remove_unfinished`).
+    """Removes a temporary file or folder after the block if it still exists. `remove_unfinished`
+    removes it if the process ends during the block.
     """
     _being_written.add(temporary.absolute())
     try:
@@ -212,11 +212,11 @@ def check_replaceable(
     mark: str | None = None,
     inputs: Iterable[str | os.PathLike[str] | None] = (),
 ) -> None:
-    """Checks that a folder can be replaced, to be asked before the work begins.
+    """Checks that a folder can be replaced. Call it before the work begins.
 
-    Arguments: mark: a file that all folders of this kind hold. Then the folder has to be empty or,
-    with `overwrite`, of this kind. inputs: what the work reads (None is left out); it may not lie
-    in the folder, which would delete it.
+    Arguments: mark: a file that all folders of this kind hold. The folder has to be empty or, with
+    `overwrite`, to hold this file; without a mark it may hold anything. inputs: what the work
+    reads, which may not lie in the folder, because it would be deleted. None is left out.
     Raises: ValueError for one of these, and for a symbolic link, a file, the working folder or one
     above it, a mount point, or a folder beside which nothing can be written.
     """
@@ -266,8 +266,8 @@ def check_replaceable(
 
 
 def contents(folder: str | os.PathLike[str]) -> str:
-    """Returns a short list of what a folder holds, such as "capture.json, images (60 files)". It is
-    empty if the folder holds nothing or does not exist.
+    """Returns a short text that lists what a folder holds, such as "capture.json, images (60
+    files)". It is empty if the folder holds nothing or does not exist.
     """
     entries, most = _entries(folder), 12
     shown = ", ".join(_described(Path(folder, entry)) for entry in entries[:most])
@@ -314,14 +314,14 @@ def add_files(
     once, so a kill seldom falls between two of them, and the moves of two processes do not mix. The
     folder may be a mount point or the working folder.
 
-    Arguments: without: files in the folder that are out of date. Those that are not replaced are
-    deleted after the last move. invalid: files that must never lie beside the new ones. They are
-    deleted before the first move. last: the file that is moved last. If it was not there before, it
-    shows that all others are in place. first: the file that is moved first. It shows that the
-    others are ours. ours: says whether an existing file may be replaced or deleted; None: all may
-    be.
-    Raises: ValueError for an existing file that is not ours, see `check_ours`; OSError, which names
-    `folder`, if a file cannot be written; anything that `write` raises.
+    Arguments: paths of files are relative to `folder`. without: files that are out of date. Those
+    that are not replaced are deleted after the last move. invalid: files that must never lie beside
+    the new ones. They are deleted before the first move. last: the file that is moved last. If it
+    was not there before, it shows that all others are in place. first: the file that is moved
+    first. It shows that the others are ours. ours: says whether an existing file may be replaced,
+    or deleted as one of `without`; None: all may be. It is not asked about `invalid`.
+    Raises: ValueError for a file that would be replaced and is not ours, see `check_ours`; OSError,
+    which names `folder`, if a file cannot be written; anything that `write` raises.
     """
     folder = Path(folder)
     # in it where it exists: then on the same disk, even if others hold what is beside it
@@ -377,7 +377,7 @@ def check_ours(
 
 @contextlib.contextmanager
 def only_writer(folder: str | os.PathLike[str], *, replaced: bool = False) -> Generator[None]:
-    """Keeps other processes out of a folder while this process writes to it.
+    """Keeps other processes that call this out of a folder while this process writes to it.
 
     The lock ends with the process, even if the process is killed. Where there are no locks
     (Windows, some network disks), nothing is checked.
@@ -484,8 +484,8 @@ def _tag() -> str:
 
 @functools.cache
 def _sweep(parent: Path) -> None:
-    """Removes the temporary files that killed processes left in a folder, and puts old folders
-    back.
+    """Removes the temporary files that killed processes left in a folder. An old folder that was
+    moved aside is put back if its name is free, else removed.
 
     It runs once per process and folder, because folders may have very many files.
     """
@@ -502,8 +502,8 @@ def _sweep(parent: Path) -> None:
 
 
 def _abandoned(path: Path, machine: str, pid: int) -> bool:
-    """Says whether no process writes a temporary file any more. False if the file does not
-    exist.
+    """Says whether a temporary file counts as abandoned, because its process on this machine has
+    ended, or because it is older than `ABANDONED_SECONDS`. False if the file does not exist.
     """
     try:
         age = time.time() - path.stat().st_mtime
@@ -513,7 +513,9 @@ def _abandoned(path: Path, machine: str, pid: int) -> bool:
 
 
 def _runs(pid: int) -> bool:
-    """Says whether a process with this id runs on this machine."""
+    """Says whether a process with this id runs on this machine. Always True on systems other than
+    POSIX.
+    """
     try:
         if os.name == "posix":  # elsewhere it would end the process
             os.kill(pid, 0)

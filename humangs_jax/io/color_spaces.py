@@ -64,8 +64,8 @@ def _pq_to_light(levels: np.ndarray) -> np.ndarray:
 
 
 def _hlg_to_light(levels: np.ndarray) -> np.ndarray:
-    """Returns light in front of the camera, of levels by the curve HLG, ARIB STD-B67. White paper
-    is 1.
+    """Returns the light in front of the camera for levels of the curve HLG, ARIB STD-B67. White
+    paper is 1.
     """
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     light = np.where(levels <= 0.5, levels**2 / 3, (np.exp((levels - c) / a) + b) / 12)
@@ -102,7 +102,7 @@ PRIMARIES = {
     12: ((0.680, 0.320), (0.265, 0.690), (0.150, 0.060)),
 }
 """Chromaticities of red, green and blue, by their code point (H.273): BT.2020 and Display P3. All
-other primaries are close to sRGB's.
+other primaries are read as sRGB's.
 """
 CURVES: dict[int, Curve] = {
     4: _power(2.2),
@@ -111,8 +111,8 @@ CURVES: dict[int, Curve] = {
     16: _pq_to_light,
     18: _hlg_to_light,
 }
-"""Curves by their code point (H.273). Other curves, of BT.709 and its kin, are read as sRGB, as all
-programs show them.
+"""Curves by their code point (H.273). All other curves are read as sRGB's. All programs show BT.709
+and similar curves in this way.
 """
 PQ = 16
 """Number of the transfer function PQ in H.273."""
@@ -139,8 +139,8 @@ FROM_XYZ = np.linalg.inv(_to_xyz(SRGB, D65))
 
 
 def of_code_points(primaries: int, transfer: int) -> Encoding | None:
-    """Returns the encoding that two code points of H.273 stand for, or None if it is sRGB's. PNG's
-    cICP, nclx of HEIC and AVIF, and videos have such numbers.
+    """Returns the encoding that two code points of H.273 stand for, or None if both are read as
+    sRGB's. PNG's cICP, nclx of HEIC and AVIF, and videos have such numbers.
     """
     if primaries not in PRIMARIES and transfer not in CURVES:
         return None
@@ -150,7 +150,8 @@ def of_code_points(primaries: int, transfer: int) -> Encoding | None:
 
 
 def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Encoding | None:
-    """Returns the encoding that PNG's gAMA and cHRM describe; None if it is sRGB's.
+    """Returns the encoding that PNG's gAMA and cHRM describe. None if it is sRGB's, or if the
+    chromaticities are those of no real colors.
 
     chromaticities: x and y of white, red, green and blue, in this order.
     """
@@ -173,7 +174,7 @@ def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> E
 
 
 def is_srgb(encoding: Encoding) -> bool:
-    """Says whether a file's values are sRGB already, to within half a level of 8 bits."""
+    """Says whether colors of this encoding are sRGB already, to within half a level of 8 bits."""
     steps = np.linspace(0, 1, 9)
     grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     return bool(np.abs(in_srgb(grid, encoding) - grid).max() < 0.5 / 255)
@@ -362,7 +363,8 @@ def _curve(tag: bytes) -> Curve:
 
 
 def by_tables(image: Any, profile: bytes) -> Any:
-    """Returns a PIL.Image converted to sRGB with an ICC profile that consists of tables.
+    """Returns a PIL.Image converted to sRGB with an ICC profile that consists of tables. Returns
+    `image` itself if the profile calls itself sRGB.
 
     Raises: InvalidFileError if the profile cannot be used.
     """

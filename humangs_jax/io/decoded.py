@@ -1,5 +1,5 @@
-"""Keeps decoded photos, so that each photo that several steps of a command read is decoded once,
-within a limit of memory.
+"""Keeps the pixels of decoded photos in memory, up to a limit. A photo that several steps of a
+command read is then decoded once.
 """
 
 import contextlib
@@ -12,8 +12,8 @@ import numpy as np
 from humangs_jax.core.array_types import Float, UInt8
 
 WHOLE_LEVELS = np.float32(255)
-"""Number of levels of a byte. Pixels that are whole multiples of 1 / 255 are kept as bytes, and
-others as they are.
+"""Largest level of a byte. Pixels that are all whole multiples of 1 / 255 are kept as bytes, and
+others as float32.
 """
 
 
@@ -30,8 +30,8 @@ class Decoded:
         self.pixels: dict[bytes, UInt8[np.ndarray, "h w c"] | Float[np.ndarray, "h w c"]] = {}
 
     def find(self, key: bytes) -> Float[np.ndarray, "h w c"] | None:
-        """Returns the pixels of a file's content, (h, w, c), 0 to 1, in a new array. Returns None
-        if they are not kept.
+        """Returns the pixels of a file's content, (h, w, c), float32 from 0 to 1, in a new array.
+        Returns None if they are not kept.
         """
         pixels = self.pixels.get(key)
         if pixels is None:
@@ -57,7 +57,7 @@ _current: contextvars.ContextVar[Decoded | None] = contextvars.ContextVar("decod
 
 @contextlib.contextmanager
 def decoded_once(most: int = 256 << 20) -> Generator[None]:
-    """Within the block, lets `io.images` decode each photo only once. Pixels are kept as long as
+    """Lets `io.images` decode each photo only once within the block. Pixels are kept as long as
     they fit into `most` bytes, by default those of twenty photos of four megapixels. At the end of
     the block all are dropped.
     """
@@ -69,7 +69,7 @@ def decoded_once(most: int = 256 << 20) -> Generator[None]:
 
 
 def forget_decoded() -> None:
-    """Drops all kept pixels and keeps no more. For a time when no later step reads photos."""
+    """Drops all kept pixels and keeps no more. It is called when no later step reads photos."""
     kept = _current.get()
     if kept is not None:
         kept.pixels, kept.room = {}, 0
@@ -81,7 +81,7 @@ def kept_photos() -> Decoded | None:
 
 
 def content_key(data: bytes, as_stored: bool = False) -> bytes:
-    """Returns the key of the pixels of a file. data: bytes of the file. as_stored: whether its
-    color profile is not applied.
+    """Returns the key of the pixels of a file. data: bytes of the file. as_stored: whether the
+    pixels are not converted to sRGB.
     """
     return hashlib.blake2b(data, salt=bytes([as_stored])).digest()

@@ -1,5 +1,5 @@
-"""Colors of a photo in sRGB, by what the photo says of its encoding: an ICC profile, or numbers in
-its header.
+"""Converts colors of a photo to sRGB from what the photo says of its encoding: an ICC profile, or
+numbers in its header.
 """
 
 import functools
@@ -28,8 +28,12 @@ logger = logging.getLogger(__name__)
 def colors_in_srgb(
     path: str | Path, image: Any, data: bytes, levels: UInt[np.ndarray, "h w c"], most: int
 ) -> Float[np.ndarray, "h w 3"] | None:
-    """Returns the colors of a photo in sRGB, (h, w, 3), if its file says how they are encoded. None
-    where the levels are in sRGB already.
+    """Returns the colors of a photo in sRGB, (h, w, 3), in [0, 1]. None if the levels are to be
+    taken as sRGB: the file says so or says nothing, or its color profile cannot be used, which is
+    logged.
+
+    path: for the warning. image: the PIL.Image. data: bytes of the file. levels: the photo's
+    levels, (h, w, c), from 0 to `most`.
     """
     channels = 1 if levels.shape[-1] < 3 else 3
     levels = levels[..., :channels]
@@ -54,9 +58,11 @@ def colors_in_srgb(
 
 
 def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
-    """Reads the color encoding that a photo's header states; it wins over an ICC profile.
+    """Returns the color encoding that numbers in a photo's header state. None if an ICC profile
+    decides, if there are no such numbers, or if they state sRGB.
 
-    None if it states none. Of PNG's ways the newest wins.
+    Of a PNG, cICP wins over an ICC profile and over sRGB, and these win over gAMA and cHRM. Of
+    other formats, an ICC profile wins.
     """
     if image.format == "PNG":
         chunks = png_chunks(data)
@@ -82,8 +88,11 @@ def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
 def _by_tables(
     image: Any, profile: bytes, levels: UInt[np.ndarray, "h w c"], most: int
 ) -> Float[np.ndarray, "h w 3"] | None:
-    """Returns colors converted by Little CMS, which has 8 bits here. If the file has 16 bits, the
-    lower ones are added unchanged. None where the levels are in sRGB already.
+    """Returns colors converted by Little CMS, (h, w, 3), in [0, 1]. None if the profile calls
+    itself sRGB.
+
+    Little CMS gets 8 bits of a channel here. If the file has 16 bits, the lower ones are added
+    unchanged. Raises: InvalidFileError for a grey photo, or if the profile cannot be used.
     """
     from PIL import Image
 

@@ -31,15 +31,15 @@ SCAN = 0xDA
 WITH_LENGTH = frozenset(
     (*range(0xC0, 0xC8), *range(0xC9, 0xD0), SCAN, 0xDB, 0xDC, 0xDD, *range(0xE0, 0xF0), 0xFE)
 )
-"""Markers that are followed by two bytes of length, as libjpeg reads them. All others stand alone,
-or libjpeg ends there.
+"""Markers that are followed by two bytes of length, as libjpeg reads them. No length follows the
+others, or libjpeg ends there.
 """
 
 
 def jpeg_scans(data: bytes) -> int:
     """Returns the number of scans of the picture that a JPEG file begins with.
 
-    Segments are skipped, and bytes behind the picture are not read.
+    Segments are skipped. Bytes after the picture are not counted.
     """
     at, count = len(JPEG_START), 0
     while True:
@@ -80,7 +80,7 @@ def webp_size(data: bytes) -> tuple[int, int]:
 def iso_kind(data: bytes) -> str | None:
     """Returns Pillow's name, HEIF or AVIF, of a file that begins as such a photo, else None.
 
-    If the first brand is mif1 or msf1, the further brands decide.
+    If the first brand is mif1 or msf1, the file is AVIF if a further brand is AVIF's, else HEIF.
     """
     if data[4:8] != b"ftyp":
         return None
@@ -118,10 +118,10 @@ def nclx_colors(data: bytes) -> tuple[int, int] | None:
 
 
 def check_png_chunks(data: bytes) -> None:
-    """Checks that a PNG file is whole. Pillow decodes some damaged files, and pixels of a palette
-    that is missing.
+    """Checks that a PNG file is whole, by the checksums of its chunks. It must have pixels, an end,
+    and a palette if its pixels need one. Pillow decodes some files without these.
 
-    Raises: InvalidFileError, or another ValueError.
+    Raises: InvalidFileError, or another error for damaged chunks.
     """
     at, names = 8, set()
     while at < len(data) and b"IEND" not in names:
@@ -144,8 +144,8 @@ def check_png_chunks(data: bytes) -> None:
 
 
 def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] | None:
-    """Returns the width and height in EXIF's tags if a photo of this size was cut out of such a
-    frame, else None.
+    """Returns the width and height that EXIF's tags state, if a photo of `size`, (width, height),
+    was cut out of such a frame. Else returns None.
     """
     # EXIF's width and height of the photo as it was taken
     width, height = tags.get(0xA002), tags.get(0xA003)

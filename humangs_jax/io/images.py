@@ -48,7 +48,7 @@ starts Ghostscript.
 NAMES = {"HEIF": "HEIC", "AVIF": "AVIF", "WEBP": "WebP"}
 """Names of Pillow's formats, as people write them."""
 HEAD = 256
-"""Number of bytes at the start of a file that show its format."""
+"""Number of bytes at the start of a file that `is_heic` reads."""
 GREY_SLACK = 16 / 255
 """Largest difference between the channels of an image that still counts as grey, after
 compression.
@@ -108,8 +108,8 @@ def _colors_and_alpha(
 
 
 def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
-    """Returns a mask, coverage in [0, 1], (h, w), from a grey image or what else segmentation tools
-    write.
+    """Returns a mask, coverage in [0, 1], (h, w), from a grey image or from another image that
+    segmentation tools write.
 
     In an image with a palette or colors, the mask is 1 where the image has the one label (of a
     palette) or the one color that is not the background. The background is black, and label 0 if
@@ -155,9 +155,10 @@ def _is_grey(colors: np.ndarray) -> bool:
 
 
 def _mask_of_labels(labels: np.ndarray, palette: np.ndarray) -> np.ndarray:
-    """Returns the mask of a palette image.
+    """Returns the mask of a palette image, (h, w), in [0, 1].
 
     Arguments: labels (h, w); palette (256, 3): the colors of the labels, from 0 to 255.
+    Raises: InvalidFileError if it is not clear which label is the person.
     """
     used = np.unique(labels)
     black = [label for label in used.tolist() if not palette[label].any()]
@@ -199,8 +200,8 @@ def _mask_of_alpha(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def orientation(path: str | Path) -> int:
-    """Returns the EXIF orientation of a photo, from 1 (shown as stored; also without a flag) to 8.
-    See `oriented`.
+    """Returns the EXIF orientation of a photo, from 1 to 8, see `oriented`. 1 is shown as stored; a
+    photo without a flag has 1, too.
 
     Raises: as `open_image`.
     """
@@ -231,10 +232,10 @@ def focal_length(path: str | Path) -> float | None:
 
 def cropped_from(path: str | Path) -> tuple[int, int] | None:
     """Returns the width and height in EXIF if their ratio differs from the photo's, because the
-    photo was cut out of that frame. Otherwise returns None.
+    photo was cut out of that frame. Otherwise returns None, as for a photo that was made smaller or
+    turned.
 
-    A photo that was made smaller or turned keeps the shape that EXIF describes. Raises: as
-    `open_image`.
+    Raises: as `open_image`.
     """
     with open_image(path) as (image, data):
         return other_frame(_exif(image, data, EXIF_TAGS), image.size)
@@ -274,9 +275,9 @@ def write_png(
     mark: str | None = None,
 ) -> None:
     """Writes colors or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level. Values outside
-    are clipped.
+    are clipped, and bytes are written unchanged.
 
-    A fourth channel is alpha. The file appears whole or not at all.
+    A fourth channel is alpha. If writing fails, the path stays as it was.
 
     Arguments: compress_level: of zlib; level 1 takes a third of the time and a sixth more room.
     mark: DRAWN for a picture that shows results and must not be taken for a photo, MASK for a mask,
@@ -328,8 +329,8 @@ def is_own_picture(path: str | Path) -> bool:
 
 
 def is_own_output(path: str | Path) -> bool:
-    """Says whether a new output may replace a file. True for an own picture, and for a file that is
-    no PNG or cannot be read as an image.
+    """Says whether a new output may replace a file. True for an own picture, for a file with
+    another suffix than .png, and for one that cannot be read as an image.
     """
     if Path(path).suffix.lower() != ".png" or is_own_picture(path):
         return True
@@ -496,7 +497,7 @@ def _check_size(width: int, height: int) -> None:
 
 def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
     """Checks an image, a PNG file by its checksums and others by decoding. Returns ((width,
-    height), whether there is an alpha channel).
+    height), whether the image has an alpha channel).
 
     Raises: as `open_image`.
     """
@@ -516,8 +517,8 @@ def image_size(path: str | Path) -> tuple[int, int]:
 
 
 def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray, "h w c"]:
-    """Returns float32 pixels (h, w, channels) with 1 (grey), 2 (grey, alpha), 3 or 4 channels.
-    Colors are in sRGB, or as stored.
+    """Returns float32 pixels (h, w, channels) in [0, 1], with 1 (grey), 2 (grey, alpha), 3 or 4
+    channels. as_stored: whether colors are not converted to sRGB.
     """
     kept = kept_photos()
     with open_image(path) as (image, data):
@@ -559,8 +560,8 @@ def _levels(image: Any, data: bytes) -> tuple[UInt[np.ndarray, "h w c"], int]:
 
 
 def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
-    """Returns all 16 bits of the pixels of a PNG file. Pillow keeps only the upper 8 bits, so the
-    lower 8 bits are decoded separately.
+    """Returns the pixels of a PNG file with all of their 16 bits, (h, w, channels). Pillow keeps
+    only the upper 8 bits, so the lower 8 bits are decoded separately.
     """
     if data[26:28] != b"\0\0" or data[28] > 1:
         raise InvalidFileError("not a readable image: a PNG header with unknown methods")
@@ -572,8 +573,8 @@ def _deep_pixels(data: bytes) -> UInt[np.ndarray, "h w c"]:
 
 
 def _decoded(data: bytes, raw: str) -> UInt[np.ndarray, "h w c"]:
-    """Returns bytes of the pixels of a PNG file, (h, w, channels), selected by Pillow's name `raw`
-    of a pixel layout.
+    """Returns 8 bits of each channel of a PNG file's pixels, (h, w, channels), in uint16. raw:
+    Pillow's name of a pixel layout, which selects the bits.
     """
     with image_in(data) as image:
         image.tile = [(*tile[:3], raw) for tile in image.tile]

@@ -96,8 +96,8 @@ def count_of(accessor: dict[str, Any]) -> int:
 
 
 def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndarray:
-    """Returns the array of an accessor, (count, columns), float64. Normalized integers are
-    converted to numbers up to 1.
+    """Returns the array of an accessor, (count, columns), float64. Normalized integers become
+    numbers in [-1, 1].
 
     Raises: InvalidFileError, KeyError, TypeError, ... for anything that does not fit the file.
     """
@@ -148,7 +148,9 @@ class GlbWriter:
         self.data, self.views, self.accessors = bytearray(), [], []
 
     def bytes_(self, data: bytes, target: int | None = None) -> int:
-        """Adds bytes at a multiple of 4, and returns the index of their buffer view."""
+        """Adds bytes at a multiple of 4, and returns the index of their buffer view. target:
+        VERTICES, INDICES or None.
+        """
         self.data += bytes(-len(self.data) % 4)
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
         if target is not None:
@@ -163,8 +165,8 @@ class GlbWriter:
         """Adds an array, as float32 unless it has unsigned integers, and returns the index of its
         accessor.
 
-        Arguments: kind: a key of COLUMNS. bounds: whether to record the smallest and the largest
-        number of each column, which positions and times need.
+        Arguments: kind: a key of COLUMNS. target: as in `bytes_`. bounds: whether to record the
+        smallest and the largest number of each column, which positions and times need.
         """
         dtype = values.dtype if values.dtype.kind == "u" else "<f4"
         values = np.ascontiguousarray(values, dtype)
@@ -184,8 +186,8 @@ class GlbWriter:
         return len(self.accessors) - 1
 
     def sparse(self, values: np.ndarray) -> int:
-        """Adds an array (n, 3) of which most rows are 0, and returns the index of its accessor.
-        Only rows that are not 0 are in the file.
+        """Adds an array (n, 3), of which most rows are 0, as float32. Returns the index of its
+        accessor. Only rows that are not 0 are in the file.
         """
         rows = np.flatnonzero(values.any(axis=1))
         accessor = {
@@ -206,9 +208,10 @@ class GlbWriter:
         return len(self.accessors) - 1
 
     def write(self, path: str | os.PathLike[str], document: dict[str, Any]) -> None:
-        """Writes the file: the glTF document with the arrays, the buffer and `asset` added to it.
+        """Writes the file from the glTF document and all arrays that were added. If writing fails,
+        the path stays as it was.
 
-        The file appears whole or not at all.
+        document: glTF's JSON without the arrays; `asset` is added if it is missing.
         """
         self.data += bytes(-len(self.data) % 4)
         document = {"asset": {"version": "2.0", "generator": "humangs_jax"}} | document
@@ -281,11 +284,12 @@ def read_obj(path: str | Path) -> list[Any]:
 
 
 def _grouped(text: str) -> str:
-    """Returns the text of an OBJ file with the faces of each material together, at its end.
+    """Returns the text of an OBJ file with the faces of each material together, at its end. Names
+    of objects and groups are removed.
 
-    Names of objects and groups are removed, and without materials all faces form one part.
-    trimesh's time grows faster than linearly with the number of such changes, even with those that
-    it finds in a comment.
+    trimesh's time grows faster than linearly with the number of changes of material, object and
+    group. It even counts changes in comments.
+    Raises: InvalidFileError beyond a limit.
     """
     text = text.replace("\r\n", "\n").replace("\\\n", "")
     faces = re.compile(r"^f[ \t].*\n?", re.MULTILINE)
@@ -367,8 +371,9 @@ def _names_in(text: str) -> list[str]:
     """Returns the file names that the name of a material or texture may stand for, the likeliest
     first.
 
-    The name may be meant as it stands, with spaces. It may be meant without quotes, options of
-    textures and Windows separators. Of several materials in one line, the first may be meant.
+    The first is the name unchanged, with its spaces. The next ones are without quotes and options
+    of textures, and without Windows separators. The last is the first of several materials in one
+    line.
     """
     # before the name of a texture stand options, as `-s 1 1 1` or `-clamp on`
     options = r"^(?:-\w+(?:\s+(?:on|off|[lrgbmz]|[-+.\deE]+))+\s+)+"

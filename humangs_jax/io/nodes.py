@@ -13,7 +13,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.io.reading import InvalidFileError, shown
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
-"""What a track of an animation can move, with the number of values in a key."""
+"""What a track of an animation can move -> number of values at each of its times."""
 
 
 Nodes = list[dict[str, Any]]
@@ -78,8 +78,7 @@ def world_matrices(
 
 
 def node_matrices(nodes: Nodes) -> list[Float[np.ndarray, "4 4"]]:
-    """Returns the places of the nodes of a GLB file without animation, a matrix (4, 4) for each,
-    world from node.
+    """Returns a matrix (4, 4), world from node, for each node of a GLB file without animation.
 
     Raises: InvalidFileError. Damaged numbers may raise other errors.
     """
@@ -115,7 +114,9 @@ def _local(
 
 
 def _sampled(track: Track, times: Float[np.ndarray, " m"], path: str) -> Float[np.ndarray, "m c"]:
-    """Returns the values of a track at some times, (m, c). path: what the track moves."""
+    """Returns the values of a track at some times, (m, c). Times outside of the track's get its
+    first or last value. path: what the track moves.
+    """
     keys, values, stepped = track
     if stepped or len(keys) == 1:
         step = times[1] - times[0] if len(times) > 1 else 1.0

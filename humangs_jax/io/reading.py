@@ -41,8 +41,6 @@ LONGEST_LINE = 1000
 class Limits:
     """Limits on what a file or a command may cost. Each error line that a limit causes names that
     limit.
-
-    The limits from `capture_pixels` on apply to a command, and are checked before it begins.
     """
 
     file_bytes: int = 16 << 30
@@ -50,15 +48,17 @@ class Limits:
     text_bytes: int = 64 << 20
     """Bytes of JSON and other text, and of the pickle inside of a `.pt`."""
     slow_text_bytes: int = 1 << 19
-    """Bytes of YAML, of the JSON of a GLB scan and of the header of safetensors, which are slow to
-    read.
+    """Bytes of YAML, TOML, XML and `.mtl` files, of the JSON of a GLB file with Gaussians, and of
+    the header of safetensors, which are slow to read.
     """
     mesh_bytes: int = 512 << 20
-    """Bytes of a scan."""
+    """Bytes of a scan, of its textures together, of a GLB motion, or of a COLMAP file."""
     image_bytes: int = 256 << 20
     """Bytes of a photo before it is decoded."""
     array_bytes: int = 4 << 30
-    """Unpacked bytes of all arrays of an archive, or bytes of an EXR file that is written."""
+    """Unpacked bytes of all arrays of an archive, bytes of a pickle, an npy file or a file of
+    Gaussians, or bytes of an EXR file that is written.
+    """
     plain_bytes: int = 256 << 20
     """Bytes to which a file of any size may unpack, and bytes of a sparse matrix made dense."""
     ratio: int = 100
@@ -80,7 +80,7 @@ class Limits:
     corners: int = 60_000_000
     """Corners of the triangles of a scan, every instance counted."""
     joints: int = 1024
-    """Joints of a body."""
+    """Joints of a body or of a moving skeleton."""
     gaussians: int = 20_000_000
     """Gaussians of a file."""
     photos_outside: bool = False
@@ -92,7 +92,7 @@ class Limits:
     video_pixels: int = 50_000_000_000
     """Pixels of all frames that are taken out of videos."""
     views: int = 4096
-    """Photos that are read together."""
+    """Photos that are read together, or cameras of a file."""
     network_views: int = 512
     """Photos that the network looks at together."""
     views_per_photo: int = 16
@@ -169,7 +169,7 @@ class _Shown(reprlib.Repr):
         ) = 4
 
     def repr_int(self, x: int, level: int) -> str:
-        """Shows integers of 40 digits or more by their size, because Python refuses to write
+        """Shows integers of more than 40 digits by their size, because Python refuses to write
         integers of thousands of digits.
         """
         if abs(x) < 10**40:
@@ -177,7 +177,9 @@ class _Shown(reprlib.Repr):
         return f"an integer of {x.bit_length():,} bits"
 
     def repr_instance(self, x: object, level: int) -> str:
-        """Shows numpy scalars like Python's, and any other object by the name of its type."""
+        """Shows texts, None, booleans and floats as `repr` does, also those of subclasses, and any
+        other object by the name of its type.
+        """
         if isinstance(x, str):
             return self.repr_str(str(x), level)
         if x is None or isinstance(x, bool | float):
@@ -381,11 +383,11 @@ def check_unpacked(size: int, unpacked: int) -> None:
 
 def inside(folder: str | os.PathLike[str], name: str, photo: bool = False) -> Path:
     """Returns the path `folder / name`, after checking that it lies in the folder when symbolic
-    links are followed. A file in the folder names the path.
+    links are followed.
 
-    Arguments: photo: whether the path is that of a photo or mask. The limit `photos_outside` lets
-    these lie elsewhere.
-    Raises: InvalidFileError.
+    Arguments: name: a path that comes from a file in the folder. photo: whether the path is that of
+    a photo or mask. The limit `photos_outside` lets these lie elsewhere.
+    Raises: InvalidFileError, also for a name with control characters.
     """
     path = Path(folder) / name
     # control characters would make several lines, or none, of a path in a report
@@ -424,7 +426,8 @@ def read_text(path: str | os.PathLike[str], limit: str = "text_bytes") -> str:
 def parse_json(text: str) -> Any:
     """Returns the value of a JSON text. NaN and Infinity, which Python's tools write, are accepted.
 
-    Raises: InvalidFileError (a ValueError), which names the line.
+    Raises: InvalidFileError (a ValueError) if the text is not JSON, which names the line, or if it
+    is nested too deeply.
     """
     try:
         value = json.loads(text)
@@ -439,7 +442,7 @@ def parse_json(text: str) -> Any:
 
 
 def check_nesting(value: Any) -> None:
-    """Checks that lists and dicts contain each other at most `nesting` times.
+    """Checks that lists and dicts lie within each other at most `nesting` deep, which is a limit.
 
     Raises: InvalidFileError.
     """
@@ -467,7 +470,7 @@ def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
 
 
 def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = 1) -> None:
-    """Writes a value to a JSON file, whole or not at all.
+    """Writes a value to a JSON file. If writing fails, the path stays as it was.
 
     Raises: TypeError if JSON cannot hold the value; OSError.
     """

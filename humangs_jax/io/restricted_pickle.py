@@ -4,11 +4,11 @@ A pickle is a program: it names functions and classes, and calls them. `Restrict
 Python's own unpickler, but the only names that it finds are those of a table, and they stand for
 inert stand-ins. `_Looked` looks at each instruction before the unpickler gets it. It refuses an
 instruction that no pickle of arrays has, a number or an index larger than files need, and a dict
-whose key is made of tuples within tuples. So loading takes no more memory than the file can hold.
+whose key is made of tuples within tuples. So a small file cannot take much memory.
 
 For body models and motions the table has numpy's arrays, scipy's sparse matrices and chumpy's
 arrays. numpy itself gets a type and bytes only in the end, when `as_array` makes an array of
-numbers.
+numbers. Single integers are the exception, because they may be keys.
 """
 
 import io
@@ -30,8 +30,8 @@ REFUSED = {
 }
 """Instructions that no pickle of arrays has."""
 LARGEST_INTEGER = 1 << 64
-"""Integers of a pickle must be smaller than this. Greater ones can be chosen so that a dict becomes
-very slow.
+"""Integers of a pickle must be smaller than this in magnitude. Greater ones can be chosen so that a
+dict becomes very slow.
 """
 LARGEST_KEY = 256
 """Largest number of values that the key of a dict may be made of, because all of them are hashed.
@@ -73,7 +73,9 @@ class _Looked:
         return self.file.readline()
 
     def array_bytes(self, count: int) -> bytes:
-        """Reads the bytes of an array between two instructions."""
+        """Returns the next `count` bytes of the file as the bytes of an array, which lie between
+        two instructions. Raises: InvalidFileError within a frame.
+        """
         if self.file.tell() != self.seen:
             raise InvalidFileError("the bytes of an array within a frame of instructions")
         data = self.file.read(count)
@@ -168,7 +170,7 @@ class _Looked:
 
 
 class Call(NamedTuple):
-    """A function of this module that a name of a pickle may stand for. A pickle cannot change the
+    """A function of this package that a name of a pickle may stand for. A pickle cannot change the
     function.
     """
 
@@ -181,7 +183,7 @@ class Call(NamedTuple):
 
 
 class Named(NamedTuple):
-    """A class of Python that a pickle names as the base of another one; it cannot be called."""
+    """A class of Python that a pickle names as the base of another class. It cannot be called."""
 
     name: str
     """Name of the class, for error lines."""
@@ -604,7 +606,7 @@ def _check_leaves(value: Any) -> None:
 
 
 def read_pickle(path: str | Path) -> dict[str, Any]:
-    """Returns the dict in a pickle of Python 2 or 3. Pass its arrays through `as_array`.
+    """Returns the dict in a pickle of Python 2 or 3. `as_array` makes arrays of its values.
 
     Raises: FileNotFoundError; FileError, which names the file, if it is no pickle of a dict or
     names anything that arrays do not need.

@@ -40,13 +40,13 @@ from humangs_jax.io.restricted_pickle import NAMES, Call, PlainDict, RestrictedU
 
 ZIP_START = b"PK\x03\x04"
 STREAM_START = b"\x8a\x0a" + 0x1950A86A20F9469CFC6C.to_bytes(10, "little") + b"."
-"""First bytes of a stream of torch, behind two bytes of the protocol: the pickle of a magic
-number.
+"""First bytes of a stream of torch, after two bytes that name the protocol. They are the pickle of
+a magic number.
 """
 OLD_STREAM = (
     "written before torch 1.6: torch.save(torch.load(FILE), FILE) of a newer torch writes it again"
 )
-"""Error about a file that is such a stream, and what to do about it."""
+"""Error about a file that torch wrote as a stream, with advice."""
 LARGEST_RATIO = 16
 """Largest size to which members may unpack, relative to the file. torch does not compress at
 all.
@@ -261,7 +261,7 @@ def _of_archive(archive: zipfile.ZipFile, size: int, names: Mapping) -> Any:
 
 
 def everything(key: str) -> bool:
-    """Returns True for any name: all tensors are wanted."""
+    """Returns True for any name, so that all tensors are wanted."""
     return True
 
 
@@ -272,8 +272,7 @@ def read_torch_file(
 
     bfloat16 becomes float32; other types stay as stored.
     Raises: FileNotFoundError; FileError if the file is no checkpoint or a damaged one, if its
-    pickle asks for more than tensors, or if a storage is missing or too short. The error names the
-    storage.
+    pickle asks for more than tensors, or if a storage is missing or too short.
     """
     with reading(path, "torch file"), open_file(path) as file:
         # keys of training scripts; what lies under others (the optimizer's state) is never read
@@ -376,7 +375,8 @@ def is_safetensors(path: str | os.PathLike[str]) -> bool:
 def read_safetensors(
     path: str | os.PathLike[str], wanted: Wanted = everything
 ) -> tuple[Tensors, int, dict[str, str]]:
-    """Returns the wanted tensors by name, the number of the others, and the strings in the header.
+    """Returns the wanted tensors by name, the number of the others, and the texts of the file's
+    metadata.
 
     Raises: FileNotFoundError; FileError.
     """
