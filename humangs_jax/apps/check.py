@@ -236,7 +236,7 @@ def _compared(
     cameras_are_right: bool,
 ) -> ViewCheck:
     """Compares the pixels that the body covers with the mask of a view. cameras_are_right: whether
-    keypoints have shown no camera errors; then the advice is to keep cameras fixed.
+    keypoints have shown that no camera is wrong. Then the advice is to keep cameras fixed.
     """
     name, warning, inside = capture.names[view], found.views[view], found.inside[view]
     if capture.masks is None:
@@ -256,7 +256,7 @@ def _compared(
 
 
 def calls_of_check(capture: Capture, config: HumanGSConfig) -> Iterator[Call]:
-    """Yields the programs that draw the body over photos, for background compilation: one for the
+    """Yields the calls that draw the body over photos, for background compilation. One is for the
     body of the capture, and one for the body that the network of `config` uses.
     """
     small = capture.select([0]).resized(min(_LONGEST_SIDE, max(capture.images.shape[1:3])))
@@ -295,7 +295,7 @@ def draw_body(
     camera: Camera,
     photo: Float[np.ndarray, "h w 3"],
 ) -> tuple[Float[np.ndarray, "h w 3"], BodyImage]:
-    """Draws the posed body over the photo of one camera. Returns that picture, (h, w, 3), 0 to 1,
+    """Draws the posed body over the photo of one camera. Returns the picture, (h, w, 3), 0 to 1,
     and the image of the body alone.
     """
     drawn = body_image(
@@ -374,7 +374,7 @@ def _agreement(
 
 
 def _boundary(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of the body that have a neighbour outside of the body, (h, w)."""
+    """Returns which pixels of the body have one of their four neighbours outside of it, (h, w)."""
     return covered & ~binary_erosion(covered, border_value=1)
 
 

@@ -14,8 +14,8 @@ from humangs_jax.data.body_and_masks import MASK_THRESHOLD
 from humangs_jax.data.capture import Capture
 
 LARGEST_SHARE = 0.7
-"""Largest window that is cut out, as a share of the photo's area. With a larger one the photo is
-shown whole.
+"""Area of the largest window that is cut out, as a share of the photo's area. If a larger window
+would be needed, whole photos are shown.
 """
 
 
@@ -28,8 +28,8 @@ def around_person(
     the same size. Returns the capture, and the upper left corner (x, y) of each window, (v, 2),
     pixels.
 
-    Where the largest window is nearly the whole photo, the capture stays as it is and corners are
-    0.
+    If that window would be more than `LARGEST_SHARE` of the photo, or if no view shows the person,
+    the capture stays as it is and corners are 0.
 
     Arguments: vertices: of the posed body, by frame, (n, 3), metres. marks: further pixels (x, y)
     of each view that the window has to show.

@@ -84,8 +84,8 @@ def run_demo(
         weights: file of the network's weights; None: the shipped ones.
         frame_size: side of the animation's frames, pixels.
         refine: how the avatar is refined by its photos; None: not at all.
-        settings: which photos are used, how the network runs, and how frames are drawn. Their
-        refinement is ignored. None: all photos, and as the weights were trained.
+        settings: settings that decide which photos are used, how the network runs, and how frames
+        are drawn. Their refinement is ignored. None: `Settings()`.
     """
     report: dict[str, Any] = {}
     settings = settings or Settings()
@@ -248,8 +248,9 @@ def _scores(images: np.ndarray, truth: Capture) -> dict[str, Any]:
 
 
 def _timed(timings: dict, name: str, run: Callable[[], Any], twice: bool = False) -> Any:
-    """Runs a stage, records its time in `timings`, seconds, and returns the result. twice: run it
-    again, and record the second time as "run", and the difference to the first as "compile".
+    """Runs a stage, records its time in `timings`, seconds, and returns the result. twice: whether
+    the stage runs a second time. Then the second time is recorded as "run", and what the first run
+    took longer as "compile".
     """
     start = time.perf_counter()
     compiling = stage(COMPILING) if twice else contextlib.nullcontext()

@@ -228,9 +228,9 @@ def with_masked(
     masks: Sequence[Float[np.ndarray, "_h _w"]],
     on_white: Sequence[Float[np.ndarray, "_h _w 3"]],
 ) -> list[PhotoPeople]:
-    """Makes sure that the person of each given mask is among the people of its photo. Where the
-    mask of nobody found matches, the detector looks again at the photo cut to the mask, and the
-    person found there is added.
+    """Returns the photos, with the person of each given mask among the people of its photo if the
+    detector finds this person. Where nobody found matches the mask, the detector looks again at the
+    photo cut to the mask, and the person found there is added.
 
     Arguments: masks: one per photo, (h, w), 0 to 1. on_white: the photos cut to their masks, white
     elsewhere.
@@ -369,8 +369,9 @@ def _has_any(given: Keypoints | Masks, view: int) -> bool:
 
 
 def _agreement(found: PersonInPhoto | None, given: Keypoints | Masks, view: int) -> float:
-    """Returns how well a found person agrees with the keypoints or the mask of a view: the sum of
-    the person's mask at the seen keypoints, or over the pixels of the given mask. 0 for None.
+    """Returns how well a found person agrees with the keypoints or the mask of a view. It is the
+    sum of the person's mask at the seen keypoints, or of its product with the given mask. 0 for
+    None.
     """
     if found is None:
         return 0.0
@@ -403,8 +404,8 @@ def upright(file: Path) -> Float[np.ndarray, "h w 3"]:
 def detect_photos(
     names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 3"]]
 ) -> list[PhotoPeople]:
-    """Finds the people in each photo. In each, people come in the order of their number of pixels,
-    largest first.
+    """Finds the people in each photo. The people of a photo are in the order of their
+    `PersonInPhoto.area`, largest first.
 
     Arguments: photos: values in [0, 1].
     Raises: ValueError if LiteRT is not installed.
@@ -474,8 +475,8 @@ def _found(
 
 
 def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> int:
-    """Returns the number of the intended person: the one that was asked for, or the only one who is
-    large.
+    """Returns the number of the intended person. It is the number that was asked for, or that of
+    the only large person.
 
     Arguments: person: the number that was asked for; None: none was. sheet: where the numbers can
     be looked up. It is written if the choice fails.
@@ -614,14 +615,14 @@ def write_found(
     to_capture: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Writes keypoints and masks of a person, and the sheet, into a folder. Either all files are
-    written or none.
+    """Writes keypoints and masks of a person, and the sheet, into a folder. If one of the files
+    cannot be made, no file is written.
 
     Arguments:
         masks: whether to write masks.
-        to_capture: the folder is the capture that has the photos. Then capture.json is changed to
-        name the masks.
-        overwrite: also replace files that were not written by this function.
+        to_capture: whether the folder is the capture that has the photos. Then capture.json is
+        changed to name the masks, and unknown/ gets the places where others may hide the person.
+        overwrite: whether files that were not written by this function may be replaced, too.
     Raises: ValueError if the names of two photos differ in the suffix only, or if a file of others
     is in the way, see `check_found_place`.
     """

@@ -1,5 +1,6 @@
 """Makes an avatar from a folder of photos or from a video. Cameras, masks and keypoints are used if
-the folder has them, and found if it has none. This is what `humangs start` does, as a function.
+the folder has them. If it has none, they are found in the photos, which needs LiteRT. This is what
+`humangs start` does, as a function.
 """
 
 import dataclasses
@@ -82,7 +83,7 @@ class Step:
     warning: bool = False
     """Whether something looks wrong."""
     photos: PreparedCapture | None = None
-    """The prepared capture with its fitted body; None until the photos are prepared."""
+    """The prepared capture with its fitted body; None in steps before the avatar is made."""
     avatar: Avatar | None = None
     """The finished avatar, in the last step; None before."""
 
@@ -137,31 +138,37 @@ def avatar_from_photos(
     """Makes an avatar from photos or a video of a person, step by step, as `humangs start` does.
 
     Files are written into `out`: the capture with its body, check.png, avatar.npz and avatar.html.
-    A call that was interrupted can be repeated. It goes on from the fitted body if there is one in
-    `out`.
+    A call that was interrupted can be repeated. It goes on from the fitted body if the interrupted
+    call left one in `out`.
 
     Args:
-        photos: folder of photos, which may also have cameras, masks and keypoints; or a video.
+        photos: folder of photos, which may also have cameras, masks and keypoints, or a video.
         out: the capture folder to write.
-        cameras: file or folder of the calibration, if it is not in `photos`. "ignore": ignore the
-        calibration in `photos`, and find the cameras from the person.
+        cameras: file or folder of the calibration, if it is not in `photos`. "ignore": the
+        calibration in `photos` is ignored, and the cameras are found from the person.
         masks: folder of the masks, if it is not in `photos`.
         others: folder of masks of what is in front of the person, if it is not in `photos`.
         keypoints: file or folder of keypoints, if it is not in `photos`.
-        person: number of the person, if several people are in the photos.
-        height: height of the person, metres. It gives the scale if there is no calibration.
-        scale: metres per unit of the calibration.
-        up: the axis of the calibration's world that points up, such as "+z".
-        without_masks: use no masks, because there is only white behind the person.
-        fit_masks: move the boundaries of masks to the edges in the photos.
-        refinement: how the avatar is refined; None: not at all.
-        overwrite: begin anew even if `out` has a body or an avatar.
+        person: number of the person, if several people are in the photos. It is the number in the
+        file of keypoints, or on people.png if there is no such file.
+        height: height of the person, metres. It gives the scale if there is no calibration. None:
+        that of an average person.
+        scale: metres per unit of the calibration. None: 1.
+        up: axis of the calibration's world that points up, such as "+z". None: that of the
+        calibration's format.
+        without_masks: whether masks are not used, because there is only white behind the person.
+        fit_masks: whether the boundaries of masks are moved to the edges in the photos.
+        refinement: how the avatar is refined. None: not at all.
+        overwrite: whether to begin anew even if `out` has a body or an avatar.
 
     Yields:
         What was found and made, one step after the other. The last step has the avatar.
 
     Raises:
-        ValueError: one line that names the file or argument and what is missing or wrong.
+        ValueError: if something is missing or wrong. The message is one line that names the file or
+        the argument.
+        OSError: if another process writes `out`.
+        KeyboardInterrupt: if refinement was interrupted.
 
     Examples:
         >>> *steps, last = hg.avatar_from_photos("photos", "me", height=1.78)
@@ -217,9 +224,9 @@ class FromPhotos:
     person: int | None = None
     """Number of the person, if there are several; None: the only one."""
     height: float | None = None
-    """Height of the person, metres; None: that of an average person."""
+    """Height of the person, metres, without a calibration. None: that of an average person."""
     scale: float | None = None
-    """Metres per unit of the calibration; None: 1."""
+    """Metres per unit of the calibration. None: 1."""
     up: str | None = None
     """The axis of the calibration's world that points up; None: that of the calibration's
     format.
@@ -273,8 +280,8 @@ class FromPhotos:
                     raise ArgumentError(argument, problem)
 
     def mark(self, **more: Any) -> dict[str, dict[str, Any]]:
-        """Returns the content of the file that marks a folder as made by a run: the photos, and the
-        options that a later run has to repeat. more: further entries.
+        """Returns the name and the content of the file that marks a folder as made by a run. The
+        content is the photos and the options that a later run has to repeat. more: further entries.
         """
         return {
             START_MARK: {"photos": str(self.photos.resolve()), "options": self._decisive(), **more}
@@ -539,9 +546,9 @@ class FromPhotos:
     def _with_own_poses(
         self, photos: Path, bodies: list[RefinedCapture], record: FitRecord
     ) -> Generator[Step, None, tuple[list[RefinedCapture], FitRecord]]:
-        """Fits a pose for each photo if several photos share a pose and show that the person moved
-        between them. Returns the new bodies and a record of the fit that matches them; else returns
-        the given ones.
+        """Fits a pose for each photo if all photos share one pose and show that the person moved
+        between them. Returns the new bodies and the record of the fit that belongs to them, or else
+        the given bodies and record.
 
         Arguments: photos: folder from which the photos were imported, for their times. bodies: for
         loose and tight clothes.
@@ -560,7 +567,7 @@ class FromPhotos:
 
     def _finish(self, capture: Capture, estimate: HeldOut | None) -> Iterator[Step]:
         """Checks the capture, then makes, refines and writes the avatar. estimate: how well an
-        avatar of this body reproduces a held-out photo; None: to be measured here.
+        avatar of this body reproduces a held-out photo. None: it is measured here.
         """
         forget_decoded()  # the capture has the photos
         with stage("preparing the photos"):

@@ -243,9 +243,11 @@ def rivals(photos: Sequence[PhotoPeople]) -> list[int]:
 
 
 def is_unclear(photos: Sequence[PhotoPeople], photo: int, person: int) -> bool:
-    """Returns whether a photo in which the person was not found may still show the person. That is
-    so if it has somebody large that no photo shows together with the person, and where numbers do
-    not mean who is who.
+    """Returns whether it is unclear who in a photo is the person.
+
+    This is so if the photo's numbers do not show who is who (see `PhotoPeople.known`). It is also
+    so if the person was not found in the photo, and somebody large is in it who is in no photo
+    together with the person.
     """
     people = photos[photo].people
     if not photos[photo].known:

@@ -71,7 +71,9 @@ class Settings:
     head_steps: RefineSteps = knob(
         0, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md"
     )
-    """Further steps on the head, see `RefineConfig`."""
+    """Further steps on the head alone, see `RefineConfig`. 0: none. Without iterations and steps
+    there are none either.
+    """
     refine_size: PhotoSide | None = knob(
         None, cost="detail of the photos", gain="time of a step", measured=MEASURED
     )
@@ -113,7 +115,7 @@ class Settings:
         return dataclasses.replace(config, runtime=self.runtime)
 
     def photos(self, capture: Capture | PreparedCapture) -> PreparedCapture:
-        """Prepares a capture with the photos that these settings use."""
+        """Returns a prepared capture with the photos that these settings use."""
         return prepare_capture(capture, views=self.views)
 
     def shot(self, shot: FrameSettings) -> FrameSettings:
@@ -174,7 +176,8 @@ def reconstruct_with(
         The avatar.
 
     Raises:
-        ValueError: as `reconstruct` and `refine`.
+        ValueError: if there is no preset of this name. Also as `reconstruct` and `refine`.
+        KeyboardInterrupt: if refinement was interrupted.
 
     Examples:
         >>> avatar = hg.reconstruct_with("quality", *hg.load_weights(), capture)

@@ -1,9 +1,10 @@
-"""Looks at a folder of photos: what an avatar needs, what is missing, and which well-known tool
-makes it.
+"""Finds out what a folder of photos has of what an avatar needs, what is missing, and which
+well-known tool makes what is missing.
 
-The user need not describe the folder; its files are found by their names. docs/your_photos.md shows
-the way. Also measures how well an avatar reproduces a photo that it has not seen, and chooses by
-that between two bodies. `apps.video_photos` takes the best frames of a video.
+The user need not describe the folder, because its files are found by their names.
+docs/your_photos.md shows the way. The module also measures how well an avatar reproduces a photo
+that it has not seen, and chooses between two bodies by this. `apps.video_photos` takes the best
+frames of a video.
 """
 
 import dataclasses
@@ -61,7 +62,7 @@ class PhotoFolder:
     folder: Path
     """The folder that was looked at."""
     images: Path
-    """The folder in which its photos are: the folder itself or one in it."""
+    """The folder in which the photos are: `folder` itself or a folder in it."""
     photos: int
     """Number of the photos."""
     size: tuple[int, int]
@@ -71,7 +72,7 @@ class PhotoFolder:
     masks: Path | None = None
     """Folder of masks; None if there is none."""
     alpha: bool = False
-    """Whether photos have their mask in an alpha channel."""
+    """Whether photos have masks in alpha channels, as the first photo shows."""
     keypoints: Path | None = None
     """File or folder of keypoints; None if there are none."""
     unused: tuple[Unused, ...] = ()
@@ -129,8 +130,8 @@ def inspect_folder(
     """Returns what a folder has. Files or folders that the arguments name replace those in the
     folder.
 
-    Raises: CaptureError (one line) if there is no photo, if the folder is a capture already, or if
-    a named file does not exist.
+    Raises: CaptureError (one line) if there is no such folder, if it has no photo, if it is a
+    capture already, or if a named file does not exist.
     """
     _expect_folder(folder)
     if (folder / "capture.json").is_file():
@@ -220,7 +221,7 @@ def _expect_folder(folder: Path) -> None:
 
 
 def missing(material: PhotoFolder, images: Path | None = None) -> tuple[Missing, ...]:
-    """Returns what is still missing, cameras, masks or keypoints, with the commands that make it.
+    """Returns which of cameras, masks and keypoints are missing, with the commands that make them.
 
     Arguments: images: folder of the photos for which keypoints are to be made, if an import has
     changed them, for example removed lens distortion. None: the folder's own photos.
@@ -434,14 +435,15 @@ def better_body(
     refinement: RefineConfig | None,
     ahead: Ahead | None = None,
 ) -> tuple[Capture, HeldOut | None]:
-    """Chooses between two captures that differ in the body: returns the one whose avatar reproduces
-    held-out photos better. Also returns how well that avatar reproduces the first held-out photo
-    after refinement.
+    """Chooses between two captures that differ in the body. Returns the one whose avatar reproduces
+    held-out photos better, and how well that avatar reproduces the first held-out photo after
+    refinement.
 
     A body that fills the clothes covers more of the masks, but the avatar is not better for it, so
-    photos decide. Several photos vote, see `photos_agree`. They judge avatars without refinement:
-    the better body shows already there, and refinement takes most of the time. With too few photos
-    the first capture is returned, and None.
+    photos decide. Several photos vote, see `photos_agree`. The second capture has to be better by
+    0.1 dB. Photos judge avatars without refinement, because the better body shows already there,
+    and refinement takes most of the time. Without masks or with fewer than four photos, the first
+    capture and None are returned.
 
     Arguments: refinement: as for `held_out_psnr`. ahead: compiles the programs of the refinement in
     the background.

@@ -127,7 +127,7 @@ def motion_from_video(
 
     Raises:
         FileError: if the video cannot be read. The message names it.
-        ValueError: if nobody is found, or LiteRT is not installed.
+        ValueError: if nobody is found, LiteRT is not installed, or an argument is wrong.
 
     Examples:
         >>> motion = hg.motion_from_video("dance.mp4", height=1.72)
@@ -294,7 +294,7 @@ class _Follower:
 
     def look(self, photo: Float[np.ndarray, "h w 3"]) -> Landmarks | None:
         """Finds the person in the next frame. Returns None if nobody is found who may be the same
-        person.
+        person, or if the frame is not searched (see `_Following.rarely`).
         """
         found = None
         if self.last is not None and not self.missed:

@@ -176,8 +176,9 @@ def _by_direction(video: Path, sharpness: Float[np.ndarray, " n"]) -> list[int]:
 
 def followed(frames: Iterable[UInt[np.ndarray, "h w 3"]], count: int) -> Iterable[Landmarks | None]:
     """Follows the largest person of the first frame that shows somebody. Yields the person's
-    landmarks in each frame, or None where the person is not found. Ends early if nobody is found in
-    `PATIENCE` frames in a row.
+    landmarks in each frame, or None where nobody is found. If the person is lost, the largest
+    person who is found next is followed. It ends early if nobody is found in `PATIENCE` frames in a
+    row.
     """
     networks, last, missed = Networks(), None, 0
     for frame in bar(frames, total=count, desc="following the person", unit="frame"):

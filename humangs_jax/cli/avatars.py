@@ -277,8 +277,8 @@ class Reconstruct:
 class Refine:
     """Fit an avatar to the photos of a capture.
 
-    First by iterations of the learned optimizer, then by gradient descent. Ctrl-C ends it early,
-    and the best avatar so far is written.
+    Iterations of the learned optimizer come first, then gradient descent. Ctrl-C ends it early, and
+    the best avatar so far is written.
     """
 
     examples: ClassVar[tuple[str, ...]] = (

@@ -79,7 +79,9 @@ class Detect:
     out: Annotated[Path, OutputPath()]
     """Folder for keypoints.json, masks/ and people.png (the sheet)."""
     person: Annotated[int | None, at_least(0)] = None
-    """Number of the person on people.png. Default: the largest person."""
+    """Number of the person on people.png. Default: the only large person. Needed if several people
+    are large.
+    """
     overwrite: bool = False
     """Also replace keypoints.json, people.png and masks of other programs."""
 
@@ -206,10 +208,10 @@ class Synth:
     """Number of further photos of each pose that show parts of the person, from 0.8 to 1.7 radii
     away.
 
-    Default: 12, or 0 with --views.
+    Default: 12, or 0 with --views or --for-training.
     """
     poses: Annotated[int, at_least(1)] = 1
-    """Poses per subject."""
+    """Number of poses of each person."""
     sequences: bool = False
     """Take the poses from a motion: a walk, a turn or a reach, which is written as motion.npz."""
     motion_frames: Annotated[int, at_least(1)] = 60

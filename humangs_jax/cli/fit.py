@@ -82,7 +82,7 @@ class MaskFit:
     """Leave cameras as they are.
 
     Otherwise a fit to keypoints turns back cameras that the keypoints show to be turned, and
-    --to-masks moves all cameras.
+    --to-masks moves all cameras, if the views determine how.
     """
     tight_clothes: bool = False
     """With --to-masks, let the body fill the masks, to measure a body in tight clothes or none.

@@ -5,8 +5,8 @@ Checks raise an error of one line that names the option.
 Places of results are checked before the work begins, and before anything heavy is imported. All
 commands have the same rules. A single file that exists is replaced as a whole, once the work is
 done. The file of an avatar replaces only an avatar, and no command replaces a file that it reads.
-The folder of a capture or of a fit to a scan is replaced only with --overwrite. `demo`, `render`,
-`synth` and `train` add files to their folders.
+The folder of a capture is replaced only with --overwrite. Commands such as `demo`, `detect`,
+`render`, `synth` and `train` add files to their folders.
 """
 
 import dataclasses
@@ -205,8 +205,8 @@ def fields_of(command: type[Any]) -> Iterator[tuple[dataclasses.Field, Any]]:
 
 
 def types_in(kind: Any) -> list[Any]:
-    """Returns the types inside of an annotation, a union or a tuple. For another type returns the
-    type itself.
+    """Returns the types inside of an annotation, a union or a tuple. For any other type it returns
+    this type.
     """
     if get_origin(kind) is Annotated:
         return types_in(get_args(kind)[0])
@@ -387,7 +387,7 @@ def refine_limits(text: str) -> dict[str, Any]:
 def first_refinement(text: str | None) -> RefineConfig | None:
     """Parses --refine of a new avatar, as `refine_limits` does.
 
-    Returns None for "0", which means no refinement. Without --refine, returns iterations alone.
+    Returns None for "0", which means no refinement. Without --refine, returns `ITERATIONS_ALONE`.
     """
     if text is None:
         return ITERATIONS_ALONE

@@ -124,7 +124,8 @@ class LossNetworkFiles:
     lpips_backbone: Path | None = None
     """Weights of the network of LPIPS.
 
-    Default: no LPIPS in validation, and SSIM in its place in the loss.
+    Default: the weights of the extra `lpips`, if it is installed and the loss has LPIPS. Otherwise
+    there is no LPIPS in validation, and SSIM takes its place in the loss.
     """
     lpips_heads: Path | None = None
     """The linear heads of LPIPS, if the backbone's file does not have them."""
