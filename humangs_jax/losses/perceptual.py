@@ -1,13 +1,13 @@
-"""Losses that compare the features of frozen convolutional networks: LPIPS and the published
-perceptual loss.
+"""Computes losses that compare the features of frozen convolutional networks: LPIPS, the published
+perceptual loss, and a loss of VGG-16.
 
 A network is a tuple of slices, and a slice is a tuple of layers. The map after the last layer of
 each slice is a feature that is compared. The names of layers are torchvision's numbers in its
 `features` list ("0", "3.squeeze"). Every convolution has a bias and is followed by a ReLU. A fire
 module is a 1x1 convolution whose output enters a 1x1 and a 3x3 convolution.
 
-All functions take ONE image in [0, 1]; use `jax.vmap` for batches. `losses.loss_networks` reads the
-weights.
+All functions take single images, and losses take them in [0, 1]. Use `jax.vmap` for batches.
+`losses.loss_networks` reads the weights.
 """
 
 import functools
@@ -67,7 +67,7 @@ class Pool(NamedTuple):
     average: bool = False
     """Whether to take the mean instead of the largest value."""
     ceil: bool = False
-    """Whether windows that reach over the border count too."""
+    """Whether windows that reach beyond the border also count."""
 
 
 class Fire(NamedTuple):
@@ -86,7 +86,7 @@ class Fire(NamedTuple):
 
     @property
     def convolutions(self) -> tuple[Conv, Conv, Conv]:
-        """The narrow convolution, then the two that take its output."""
+        """The narrow convolution, then the two convolutions that take its output."""
         half = self.outputs // 2
         return (
             Conv(f"{self.name}.squeeze", self.inputs, self.squeezed, 1, 1, 0),
@@ -100,8 +100,9 @@ Slices = tuple[tuple[Layer, ...], ...]
 
 
 def vgg(depths: tuple[int, ...], feature: tuple[int, ...], average: bool = False) -> Slices:
-    """Returns a VGG whose block b has `depths[b]` convolutions. The map behind convolution
-    `feature[b]` of the block (counted from 1) is compared.
+    """Returns a VGG whose block b has `depths[b]` convolutions, up to the last map that is
+    compared. The map behind convolution `feature[b]` of the block (counted from 1) is compared.
+    average: whether pools take means.
     """
     slices: list[tuple[Layer, ...]] = []
     layers: list[Layer] = []
@@ -176,8 +177,8 @@ def smallest_side(slices: Slices) -> int:
 
 
 def _size_after(layer: Conv | Pool, size: Any) -> Any:
-    """Returns the size of the maps behind a convolution or a pool. Sizes are an int, or an array of
-    several.
+    """Returns the size of the maps behind a convolution or a pool. size: size before it, an int or
+    an array of several sizes.
     """
     if isinstance(layer, Conv):
         margin = 2 * layer.padding
@@ -219,7 +220,7 @@ def feature_maps(
 
 
 def _cleared(x: Float[Array, "y x c"], size: Int[Array, "2"] | None) -> Float[Array, "y x c"]:
-    """Returns a map with zeros beyond its size, as a convolution finds them outside of an image."""
+    """Returns a map with zeros beyond its size, as convolutions pad an image with zeros."""
     if size is None:
         return x
     inside = [jnp.arange(side) < n for side, n in zip(x.shape[:2], size, strict=True)]
@@ -259,8 +260,8 @@ def _convolve(weights: Convolution, layer: Conv, x: Float[Array, "y x c"]) -> Fl
 
 
 def _pool(layer: Pool, x: Float[Array, "y x c"]) -> Float[Array, "i j c"]:
-    """Returns the pooled map. Strided slices of columns, then of rows, are seven times as fast on a
-    CPU as a windowed reduction and its gradient.
+    """Returns the pooled map. It combines strided slices of columns, then of rows, which is seven
+    times as fast on a CPU as a windowed reduction and its gradient.
     """
     if layer.ceil:
         missing = [-(side - layer.size) % layer.stride for side in x.shape[:2]]
@@ -314,8 +315,8 @@ def lpips_distances(
     target: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> Float[Array, " _"]:
-    """Returns the distance of two images at each depth of the backbone: five for vgg and alex,
-    seven for squeeze. Their sum is `lpips`.
+    """Returns the distances of two images at the depths of the backbone, of which vgg and alex have
+    five and squeeze seven. Their sum is `lpips`.
     """
     maps = [lpips_features(weights, image, size) for image in (predicted, target)]
     return _distances(weights, *maps)
@@ -330,19 +331,21 @@ LpipsMaps = list[tuple[Float[Array, "_y _x _c"], Int[Array, "2"] | None]]
 def lpips_features(
     weights: Lpips, image: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
 ) -> LpipsMaps:
-    """Returns the features of an image that `lpips` compares."""
+    """Returns the features of an image that `lpips` compares. size: see `feature_maps`."""
     image = at_least_float32(image)
     maps = feature_maps(weights.backbone, BACKBONES[weights.net], _scaled(image), size)
     return [(_unit(at_least_float32(x)), own) for x, own in maps]
 
 
 def lpips_to(weights: Lpips, predicted: Float[Array, "h w 3"], target: LpipsMaps) -> Scalar:
-    """Returns the `lpips` distance of an image to one whose features are given."""
+    """Returns the `lpips` distance between an image and another image, whose features are
+    `target`.
+    """
     return jnp.sum(_distances(weights, lpips_features(weights, predicted), target))
 
 
 def _distances(weights: Lpips, predicted: LpipsMaps, target: LpipsMaps) -> Float[Array, " _"]:
-    """Returns the distance of two images' features at each depth."""
+    """Returns the distances of two images' features at all depths, (depths,)."""
     distances = []
     for head, (x, own), (y, _) in zip(weights.heads, predicted, target, strict=True):
         different = jnp.sum(head * jnp.square(x - y), axis=-1)
@@ -378,10 +381,10 @@ def vgg16_loss(
     """Returns the mean absolute difference of two images' features of VGG-16, relative to the mean
     of the target's features, averaged over five depths.
 
-    weights: those of LPIPS "vgg", whose heads are not used. `perceptual_loss` needs the weights of
-    the original VGG-19; this loss works with the weights of the extra `lpips`. LPIPS compares the
-    directions of features; this loss compares their sizes, too. No gradient flows into the target.
-    Raises: ValueError for images under 16 pixels a side, and for another network.
+    weights: the weights of LPIPS "vgg", whose heads are not used. `perceptual_loss` needs the
+    weights of the original VGG-19; this loss works with the weights of the extra `lpips`. LPIPS
+    compares the directions of features; this loss compares their sizes, too. No gradient flows into
+    the target. Raises: ValueError for images under 16 pixels a side, and for another network.
     """
     if weights.net != "vgg":
         raise ValueError(f"vgg16_loss: expected LPIPS vgg, got {weights.net}")
@@ -414,10 +417,10 @@ def perceptual_errors(
     of their features of VGG-19 (with average pooling) at five depths.
 
     Colors enter as 255 * rgb - (123.68, 116.779, 103.939). The weights of the original VGG-19
-    expect this (those of MatConvNet's file and of the released checkpoint). torchvision's weights
+    expect this. They are in MatConvNet's file and in the released checkpoint. torchvision's weights
     expect other scales, and would make another loss. The features are those after the second ReLU
-    of each block. No gradient flows into the target.
-    Raises: ValueError for images under 16 pixels a side.
+    of each block. No gradient flows into the target. Raises: ValueError for images under 16 pixels
+    a side.
     """
     target = jax.lax.stop_gradient(target)
     images = [255 * image for image in at_least_float32((predicted, target))]
@@ -432,6 +435,8 @@ def perceptual_errors(
 def perceptual_loss(
     vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
 ) -> Scalar:
-    """Returns the published perceptual loss: the weighted sum of `perceptual_errors`."""
+    """Returns the published perceptual loss: the sum of `perceptual_errors` over `DIVISORS`,
+    divided by 255.
+    """
     errors = perceptual_errors(vgg, predicted, target)
     return jnp.sum(errors / jnp.asarray(DIVISORS, errors.dtype)) / 255

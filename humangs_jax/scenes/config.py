@@ -1,4 +1,6 @@
-"""Settings of `fit_scene`: how many Gaussians, how long, how fast each parameter moves."""
+"""Settings of `fit_scene`: the number of Gaussians and of steps, the rate of each parameter, and
+the loss.
+"""
 
 from typing import Annotated
 
@@ -15,12 +17,12 @@ Capacity = Annotated[int, Range(1, 100_000_000)]
 
 @configuration
 class SceneRates:
-    """The change of each parameter in a step of Adam. The rates are those of Kheradmand et al.
-    except for colors, which are no harmonics here.
+    """How far a step of Adam moves each parameter. The rates are those of Kheradmand et al. except
+    for colors and harmonics.
     """
 
     means: Spread = 1.6e-4
-    """Rate of the means, metres; it is multiplied by the extent of the cameras."""
+    """Rate of the means, in extents of the cameras (`extent_of`)."""
     quats: Spread = 1e-3
     """Rate of the quaternions, which may have any length."""
     log_scales: Spread = 5e-3
@@ -28,7 +30,9 @@ class SceneRates:
     opacity_logits: Spread = 5e-2
     """Rate of the logits of the opacities."""
     color_logits: Spread = 1e-2
-    """Rate of the logits of the colors, whose slope is a quarter in the middle."""
+    """Rate of the logits of the colors. A color changes by at most a quarter of its logit's
+    change.
+    """
     harmonics: Spread = 1e-3
     """Rate of the coefficients of the harmonics, which have the unit of colors."""
 
@@ -38,15 +42,17 @@ class SceneConfig:
     """How `fit_scene` fits Gaussians to photos."""
 
     capacity: Capacity = 200_000
-    """The number of slots, which is the most Gaussians that a scene can have. Every step works on
-    all.
+    """The number of slots, which is the largest number of Gaussians that a scene can have. Every
+    step works on all slots.
     """
     steps: Steps = 7_000
     """The number of steps, of one photo each."""
     start: Capacity = 5_000
-    """The number of Gaussians to begin with where no points are given."""
+    """The number of Gaussians to begin with if no points are given."""
     degree: Annotated[int, Range(0, 3)] = 1
-    """The degree of the harmonics, by which colors depend on the direction of sight."""
+    """The degree of the harmonics, by which colors depend on the direction of sight. 0: no
+    harmonics.
+    """
     rates: SceneRates = SceneRates()
     """Learning rates."""
     final_share: Share = 0.01
@@ -54,7 +60,7 @@ class SceneConfig:
     other_final_share: Share = 0.1
     """Share of the other rates that is left at the end. They fall exponentially."""
     structural: Share = 0.2
-    """Share of the structural dissimilarity in the loss; the rest is absolute error."""
+    """Share of 1 - SSIM in the loss. The rest is the absolute error."""
     opacity_penalty: Weight = 0.01
     """Weight of the mean opacity (`mcmc_penalty`)."""
     scale_penalty: Weight = 0.01
@@ -64,7 +70,9 @@ class SceneConfig:
     extent squared.
     """
     relocate_every: Steps = 100
-    """Steps after which dead Gaussians move and more slots are used."""
+    """Number of steps from one relocation to the next. A relocation moves dead Gaussians and uses
+    more slots.
+    """
     growth: Annotated[float, Range(1, 10)] = 1.05
     """Factor on the number of used slots at each relocation, up to the capacity."""
     relocate_until: Share = 0.85

@@ -1,8 +1,8 @@
-"""`fit_scene` fits Gaussians of a scene to posed photos, with Adam and the strategy of
+"""Fits the Gaussians of a scene to posed photos by `fit_scene`, with Adam and the strategy of
 `scenes.mcmc`.
 
-A scene is an explicit state, whose steps and relocations are pure functions (`scenes.steps`),
-compiled once for each size of photos. This module has the loop around them.
+A scene is an explicit state. Its steps and relocations are pure functions (`scenes.steps`). A step
+is compiled once for each kind of camera. This module has the loop around them.
 """
 
 import os
@@ -42,15 +42,15 @@ from humangs_jax.scenes.steps import (
 )
 
 MARGIN = 2.0
-"""Factor on the number of pairs at the time of planning, which the buffers hold. The number of
-pairs grows.
+"""Size of the buffers, relative to the number of pairs when they are planned. The number of pairs
+grows.
 """
 CHECK_EVERY = 25
-"""Steps after which a check finds out whether all pairs have fit."""
+"""Number of steps from one check to the next. A check finds out whether all pairs have fit."""
 SAVE_SECONDS = 60.0
 """Seconds between two checkpoints."""
 MARK = "humangs_jax scene"
-"""The text that tells a checkpoint, whose name may be any, from other files."""
+"""Text in a checkpoint that distinguishes it from other files, because its name may be any."""
 
 
 class SceneFit(NamedTuple):
@@ -59,7 +59,7 @@ class SceneFit(NamedTuple):
     gaussians: Gaussians
     """The Gaussians of the used slots."""
     steps: int
-    """The number of steps, including those before a continuation."""
+    """The number of steps, including the steps of earlier calls that the checkpoint had."""
     seconds: float
     """The time of this call, seconds."""
     psnr: float
@@ -87,21 +87,22 @@ def fit_scene(
         images: (h, w, 3) of each camera, RGB in [0, 1] or bytes, or paths of files; sizes may
             differ.
         cameras: one for each image, in the same order, with or without lenses.
-        points: (n, 3) where Gaussians begin, as structure from motion finds them, perhaps as
-            (points, colors); or Gaussians.
-            None: `SceneConfig.start` random points where most cameras look.
+        points: points (n, 3) where Gaussians begin, as structure from motion finds them, or a pair
+            (points, colors), or Gaussians. None or a pair without points: `SceneConfig.start`
+            random points where most cameras look.
         config: None: `SceneConfig()`.
-        background: behind the scene, as `render` takes it.
+        background: the color behind the scene: three numbers in [0, 1], a CSS name or "#rrggbb".
         checkpoint: a file that takes the state each minute, at the end and at Ctrl-C, and from
             which the same call continues.
-        progress: Show a bar.
-        watch: is called with the number of steps and the Gaussians, whenever some have moved.
+        progress: whether to show a bar.
+        watch: is called with the number of steps and the Gaussians after each relocation.
 
     Returns:
         The Gaussians, the number of steps, seconds and the mean PSNR of the photos.
 
     Raises:
-        ValueError: images that do not fit their cameras, or more points than the capacity.
+        ValueError: images that do not fit their cameras, are not in [0, 1] or are too small for
+            SSIM; points that are not finite or not (n, 3), or more than the capacity.
         FileError: a checkpoint that cannot be read, or is of other photos, cameras, points or
             settings.
 
@@ -166,8 +167,8 @@ def fit_scene(
 
 
 def _photo_of_step(step: int, count: int, seed: int) -> int:
-    """Returns the number of the photo of a step. Each photo is taken once in every `count` steps,
-    in an order that depends on the step and the seed alone.
+    """Returns the index of the photo of a step. Each photo is taken once in every `count` steps, in
+    a random order that depends on the seed.
     """
     epoch, place = divmod(step, count)
     return int(np.random.default_rng([seed, epoch]).permutation(count)[place])
@@ -182,7 +183,9 @@ def _kind(camera: Camera) -> tuple[Any, ...]:
 def _plans(
     gaussians: Gaussians, views: Sequence[Camera], config: SceneConfig
 ) -> dict[tuple[Any, ...], SplatConfig]:
-    """Returns how images are drawn, with buffers, for the cameras of each kind."""
+    """Returns the configuration with which images are drawn, by the kind of their camera. It has
+    buffers.
+    """
     kinds: dict[tuple[Any, ...], list[Camera]] = {}
     for camera in views:
         kinds.setdefault(_kind(camera), []).append(camera)
@@ -213,7 +216,9 @@ def _mean_psnr(
 def _about(
     config: SceneConfig, photos: Sequence[np.ndarray], views: Sequence[Camera], start: SceneState
 ) -> str:
-    """Returns a checksum of all that a run depends on."""
+    """Returns a checksum of the photos, cameras, first Gaussians and settings of a run. The
+    background is no part of it.
+    """
     arrays = {f"photo {i}": photo for i, photo in enumerate(photos)}
     for name, tree in (("cameras", list(views)), ("start", start.parameters)):
         arrays |= {f"{name} {i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(tree))}
@@ -226,7 +231,7 @@ def _save(path: str | os.PathLike[str], state: SceneState, about: str) -> None:
 
 
 def _resumed(path: str | os.PathLike[str] | None, state: SceneState, about: str) -> SceneState:
-    """Returns the state in a checkpoint; the given state if there is no such file.
+    """Returns the state in a checkpoint, or the given state if there is no such file.
 
     Raises: FileError for a checkpoint of another run, or another file.
     """

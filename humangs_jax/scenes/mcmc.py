@@ -1,21 +1,22 @@
-"""A fixed number of Gaussians that move to where they are needed: 3D Gaussian Splatting as Markov
-Chain Monte Carlo.
+"""Moves a fixed number of Gaussians to where they are needed: 3D Gaussian Splatting as Markov Chain
+Monte Carlo.
 
 After Kheradmand et al. 2024 (https://arxiv.org/abs/2404.09591). A scene has slots, as many as it
-may ever have Gaussians, and `used` says which of them are Gaussians. In place of cloning, splitting
-and pruning
+may ever have Gaussians, and `used` says which of them are Gaussians. These functions take the place
+of cloning, splitting and pruning:
 
-- `mcmc_relocate` moves Gaussians that have become transparent, and slots that are to be used from
-  now on, onto opaque ones, chosen by opacity. N Gaussians that then lie on one place look as the
-  one did: with o its opacity and s its scales (equation 9)
+- `mcmc_relocate` moves Gaussians that have become transparent, and slots that are used from now on,
+  onto other Gaussians. These are drawn at random in proportion to their opacity. The N Gaussians
+  that then lie in one place look as the one before. If o was its opacity and s its scales, theirs
+  are (equation 9)
 
       o' = 1 - (1 - o)^(1/N),
       s' = s o / sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1);
 
 - `mcmc_noise` shakes the means along their covariances, transparent Gaussians most, so that they
   explore (equation 8);
-- `mcmc_penalty` keeps opacities and scales small, so that what is not needed becomes transparent
-  (section 3.4).
+- `mcmc_penalty` keeps opacities and scales small, so that Gaussians that are not needed become
+  transparent (section 3.4).
 
 All are pure functions of one scene, for any optimizer and loss. The double sum is an integral
 without cancellation: with 1/sqrt(k+1) = 2/sqrt(pi) int_0^inf exp(-(k+1) t^2) dt it is 2/sqrt(pi)
@@ -35,9 +36,9 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.rendering.gaussians import UnconstrainedGaussians, constrain, covariances
 
 DEAD = 0.005
-"""Opacity at and below which a Gaussian is moved; the paper's."""
+"""Opacity at and below which a Gaussian is moved. It is the paper's."""
 SHARPNESS = 100.0
-"""Steepness of the sigmoid of the opacity by which noise fades around `DEAD`; the paper's."""
+"""Steepness of the sigmoid of the opacity by which noise fades around `DEAD`. It is the paper's."""
 STEP = 0.1
 """Distance of the nodes of the integral. The trapezoidal rule converges exponentially at this
 distance; tests compare it with the double sum.
@@ -45,8 +46,8 @@ distance; tests compare it with the double sum.
 REACH = 5.0
 """The upper end of the integral, where exp(-t^2) is below float32's rounding."""
 MOST = 1.0 - 1e-6
-"""The largest opacity that is split; Gaussians above it are split as if they had it. For an opacity
-of 1, (1 - o)^(1/N) is 0 and has no logarithm.
+"""The largest opacity in `divided`. Gaussians with a larger opacity are split as if they had this
+one. For an opacity of 1, (1 - o)^(1/N) is 0 and has no logarithm.
 """
 
 
@@ -58,8 +59,8 @@ class Relocated(NamedTuple):
     used: Bool[Array, " g"]
     """Which slots hold a Gaussian, (g,)."""
     moved: Bool[Array, " g"]
-    """Which slots hold another Gaussian than before, (g,). The optimizer forgets what it knew of
-    these.
+    """Which slots have changed, (g,): those that were moved, and those onto which others were
+    moved. The optimizer should forget its moments of these slots.
     """
 
 
@@ -67,7 +68,7 @@ def divided(
     opacity_logits: Float[Array, " g"], copies: Float[Array, " g"]
 ) -> tuple[Float[Array, " g"], Float[Array, " g"]]:
     """Returns the logits of the opacities o' of N = `copies` Gaussians that together look as one,
-    and the ratio s' / s of their scales.
+    (g,), and the ratio s' / s of their scales, (g,).
     """
     logits = jnp.minimum(opacity_logits, math.log(MOST / (1 - MOST)))
     depth = jax.nn.softplus(logits) / copies  # -log(1 - o')
@@ -86,17 +87,19 @@ def mcmc_relocate(
     used: Bool[Array, " g"],
     count: Int[Array, ""] | int | None = None,
 ) -> Relocated:
-    """Move dead Gaussians onto Gaussians that are seen, and use more slots, up to `count`. The
-    scene looks the same afterwards.
+    """Move dead Gaussians onto others, which are drawn at random by opacity, and use more slots, up
+    to `count`. The scene looks about the same afterwards. If all Gaussians are dead, nothing
+    changes.
 
     Args:
         key: of `jax.random`.
         parameters: of all slots, by `unconstrain`.
         used: (g,) which slots are Gaussians.
-        count: how many slots are used afterwards, no fewer than now. None: as many as now.
+        count: number of slots that are used afterwards, if there are so many. None, or fewer than
+            now: as many as now.
 
     Returns:
-        Parameters and used slots, and which have been changed.
+        Parameters, which slots are used, and which slots have changed.
 
     Examples:
         >>> moved = jax.jit(hg.mcmc_relocate)(key, parameters, used, jnp.sum(used) * 21 // 20)
@@ -143,13 +146,14 @@ def mcmc_noise(
     rate: Float[Array, ""] | float,
 ) -> UnconstrainedGaussians:
     """Move the means at random, by `rate` times the covariance times normal numbers. The noise
-    fades out above an opacity of 0.005.
+    fades out around an opacity of 0.005.
 
     Args:
         key: of `jax.random`.
         parameters: of all slots.
         used: (g,) which slots are Gaussians; others stay.
-        rate: 1 / metres; the paper's is 5e5 times the learning rate of the means.
+        rate: weight of the noise, 1 / metres. The paper's is 5e5 times the learning rate of the
+            means.
 
     Returns:
         Parameters with other means.

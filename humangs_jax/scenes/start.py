@@ -24,23 +24,26 @@ START_SHARE = 0.5
 points.
 """
 PARALLEL = 1e-3
-"""Axes of cameras are parallel if the squared sine of the angle between them is below this."""
+"""Axes of cameras count as parallel if the mean squared sine of their angles to a common direction
+is below this.
+"""
 CANDIDATES = 16
-"""The number of random points of which one becomes a Gaussian."""
+"""The number of random points for each Gaussian. One of them becomes the Gaussian."""
 SMALLEST = 1e-4
 """The least scale of a Gaussian at the start, as a share of the extent of the cameras. Points may
 coincide.
 """
 Points = Gaussians | np.ndarray | Array | tuple[Any, Any] | None
-"""The points where Gaussians begin: (n, 3) points, perhaps with their colors (n, 3) in [0, 1], or
-Gaussians.
+"""The points where Gaussians begin: points (n, 3), a pair of points and colors (n, 3) in [0, 1], or
+Gaussians. None stands for random points.
 """
 
 
 def read_photos(images: Any, views: Sequence[Camera], config: SceneConfig) -> list[np.ndarray]:
-    """Read the photos of `fit_scene`.
+    """Returns the photos of `fit_scene`, (h, w, 3) each, as bytes or float32 in [0, 1].
 
-    Raises: ValueError for another number or size than the cameras have, or values beyond [0, 1].
+    Raises: ValueError for another number or size than the cameras have, for values beyond [0, 1],
+    or for photos that are smaller than the window of SSIM.
     """
     if len(images) != len(views) or not views:
         raise ValueError(
@@ -68,8 +71,8 @@ def read_photos(images: Any, views: Sequence[Camera], config: SceneConfig) -> li
 
 
 def extent_of(views: Sequence[Camera]) -> Float[Array, ""]:
-    """Returns the largest distance of a camera from the middle of all; 1 if all stand in one
-    place.
+    """Returns the largest distance of a camera from the mean of all cameras' centres, metres. It is
+    1 if all stand in one place.
     """
     centers = np.stack([np.asarray(camera.center) for camera in views])
     reach = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
@@ -77,7 +80,9 @@ def extent_of(views: Sequence[Camera]) -> Float[Array, ""]:
 
 
 def first_gaussians(points: Points, views: Sequence[Camera], config: SceneConfig) -> Gaussians:
-    """Returns the first Gaussians of a scene, with harmonics of the configured degree."""
+    """Returns the first Gaussians of a scene. They have harmonics of the configured degree, unless
+    the given Gaussians have harmonics already.
+    """
     gaussians = points
     if not isinstance(gaussians, Gaussians):
         gaussians = _at_points(*_points(points, views, config), float(extent_of(views)))
@@ -90,7 +95,7 @@ def first_gaussians(points: Points, views: Sequence[Camera], config: SceneConfig
 def _points(
     points: Any, views: Sequence[Camera], config: SceneConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the points and the colors of the first Gaussians.
+    """Returns the points and the colors of the first Gaussians, (n, 3) each.
 
     Raises: ValueError for points that are not finite or not of shape (n, 3).
     """
@@ -114,12 +119,13 @@ def _points(
 def _seen_points(
     views: Sequence[Camera], count: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
-    """Returns `count` random points in the cube around the cameras. Points that more cameras see
+    """Returns `count` random points in a cube around the point at which the cameras look
+    (`_middle`). Half a side of the cube is `extent_of` the cameras. Points that more cameras see
     are likelier.
 
-    The chance of a point is the fourth power of the number of cameras that see it. If the cameras
-    stand around an object, the points lie on it and not between it and the cameras. In a room they
-    lie everywhere.
+    The chance of a point is in proportion to the fourth power of the number of cameras that see it.
+    If the cameras stand around an object, the points lie on it and not between it and the cameras.
+    In a room they lie everywhere.
     """
     middle, reach = _middle(views), float(extent_of(views))
     points = middle + rng.uniform(-reach, reach, (CANDIDATES * count, 3))
@@ -134,8 +140,8 @@ def _seen_points(
 
 
 def _middle(views: Sequence[Camera]) -> Float[np.ndarray, "3"]:
-    """Returns the point nearest to the axes of all cameras. If the axes are parallel, it is a point
-    in front of the first camera.
+    """Returns the point nearest to the axes of all cameras. If the axes are parallel, it lies on
+    the axis of the first camera, as far in front of it as `extent_of` the cameras.
     """
     poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in views])
     centers, axes = np.stack([np.asarray(camera.center) for camera in views]), poses[:, 2, :3]
@@ -147,7 +153,9 @@ def _middle(views: Sequence[Camera]) -> Float[np.ndarray, "3"]:
 
 
 def _at_points(points: np.ndarray, colors: np.ndarray, extent: float) -> Gaussians:
-    """Returns round Gaussians at points, about as large as the points are far apart."""
+    """Returns round Gaussians at points. Their scales are `START_SHARE` times the mean distance to
+    the three nearest points, between `SMALLEST` times the extent and the extent.
+    """
     near = min(4, len(points))
     distances = np.full((len(points), 1), extent)
     if near > 1:

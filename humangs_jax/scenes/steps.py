@@ -1,5 +1,5 @@
-"""The state of a scene that is fitted, and two pure functions that make the next state: a step of
-Adam with the noise of `scenes.mcmc`, and the relocation of dead Gaussians.
+"""Defines the state of a scene that is fitted, and two pure functions that make the next state. One
+is a step of Adam with the noise of `scenes.mcmc`, the other relocates dead Gaussians.
 """
 
 import functools
@@ -27,7 +27,7 @@ from humangs_jax.scenes.config import SceneConfig
 from humangs_jax.scenes.mcmc import mcmc_noise, mcmc_penalty, mcmc_relocate
 
 HIDDEN = -20.0
-"""The logit of the opacity of unused slots; none of them meets a tile."""
+"""The logit of the opacity of unused slots. It is so low that they meet no tile."""
 ADAM = optax.scale_by_adam(eps=1e-15)
 
 
@@ -50,9 +50,9 @@ class SceneState:
 
 
 def begin_scene(gaussians: Gaussians, capacity: int) -> SceneState:
-    """Returns a state whose first slots are these Gaussians.
+    """Returns a state with `capacity` slots, of which the first are these Gaussians.
 
-    Raises: ValueError for more than the capacity.
+    Raises: ValueError for more Gaussians than the capacity.
     """
     count = len(gaussians.opacities)
     if count > capacity:
@@ -88,8 +88,8 @@ def scene_step(
     config: SceneConfig,
     splat: SplatConfig,
 ) -> SceneState:
-    """Returns the state after one step of Adam on one photo, and noise. extent: that of the
-    cameras, see `extent_of`.
+    """Returns the state after one step of Adam on one photo, with noise. photo: (h, w, 3), bytes or
+    numbers in [0, 1]. extent: see `extent_of`, metres.
     """
     target = photo.astype(jnp.float32) / (255 if photo.dtype == jnp.uint8 else 1)
 
@@ -126,7 +126,7 @@ def scene_step(
 
 def relocate_scene(state: SceneState, key: Key, growth: Float[Array, ""] | float) -> SceneState:
     """Returns the state after a relocation: dead Gaussians are moved, `growth` times as many slots
-    are used, and Adam's moments of changed Gaussians are 0.
+    are used, up to all, and Adam's moments of changed slots are 0.
     """
     count = jnp.ceil(growth * jnp.sum(state.used)).astype(jnp.int32)
     found = mcmc_relocate(key, state.parameters, state.used, count)
@@ -145,7 +145,7 @@ def relocate_scene(state: SceneState, key: Key, growth: Float[Array, ""] | float
 def compiled_programs() -> tuple[Callable[..., SceneState], Callable[..., SceneState]]:
     """Returns the compiled step and the compiled relocation.
 
-    States are not donated, since Ctrl-C may come before there is the next one.
+    States are not donated, since Ctrl-C may come before the next state is there.
     """
     step = jax.jit(scene_step, static_argnums=(6, 7), compiler_options=compiler_options())
     return step, jax.jit(relocate_scene)
