@@ -73,11 +73,8 @@ def cache_folder() -> Path:
     """
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     cpu = Path("/proc/cpuinfo")
-    flags = (
-        [line for line in cpu.read_text().splitlines() if line.startswith(("flags", "Features"))]
-        if cpu.exists()
-        else []
-    )
+    lines = cpu.read_text().splitlines() if cpu.exists() else []
+    flags = [line for line in lines if line.startswith(("flags", "Features"))]
     machine = hashlib.sha256(f"{platform.machine()} {flags[:1]}".encode()).hexdigest()[:12]
     return (
         root / "humangs_jax" / "tests" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{machine}"

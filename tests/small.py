@@ -32,11 +32,9 @@ def random_gaussians(seed=0, g=20, harmonics=0):
         f32(rng.uniform(0.05, 0.95, g)),
         f32(rng.random((g, 3))),
     )
-    return (
-        replace(gaussians, harmonics=f32(rng.uniform(-0.9, 0.9, (g, harmonics, 3))))
-        if harmonics
-        else gaussians
-    )
+    if not harmonics:
+        return gaussians
+    return replace(gaussians, harmonics=f32(rng.uniform(-0.9, 0.9, (g, harmonics, 3))))
 
 
 def small_body(n=6, j=3, s=2, seed=0):

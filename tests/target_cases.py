@@ -32,11 +32,9 @@ def small(name: str) -> HumanGSConfig:
     parts = config.architecture
     change = dataclasses.replace
     if name in PIXELS:
-        sizes = (
-            {"texture": TriplaneConfig(resolution=8, channels=2), "fusion": 8}
-            if name == "humanram"
-            else {}
-        )
+        sizes = {}
+        if name == "humanram":
+            sizes = {"texture": TriplaneConfig(resolution=8, channels=2), "fusion": 8}
         sizes |= {"latents": 6} if name == "lvsm_latents" else {}
         config = config.with_parts(driver=change(parts.driver, transformer=BLOCKS, **sizes))
     elif name == "lca":

@@ -99,11 +99,10 @@ def unfounded(notebook):
     wrong = [found[0] for found in IN_WORDS.finditer(text)]
     for found in STATED.finditer(text):
         zeros, number, unit = found.groups()
-        known = (
-            numbers(shown, rf" ?{re.escape(unit)}(?!\w)")
-            if unit
-            else numbers(shown) + numbers(code)
-        )
+        if unit:
+            known = numbers(shown, rf" ?{re.escape(unit)}(?!\w)")
+        else:
+            known = numbers(shown) + numbers(code)
         if not any(rounds_to(value, number, zeros) for value in known):
             wrong.append(" ".join(found[0].split()))
     return wrong

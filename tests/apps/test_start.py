@@ -137,11 +137,10 @@ TOOLS = {
 
 def without(folder, *names):
     for name in names:
-        (
+        if name == "cameras":
+            (folder / "calibration.json").unlink()
+        else:
             shutil.rmtree(folder / name)
-            if name != "cameras"
-            else (folder / "calibration.json").unlink()
-        )
 
 
 @pytest.mark.parametrize("names", [("cameras",), ("masks",), ("keypoints",), tuple(TOOLS)])

@@ -110,11 +110,9 @@ def test_one_person_comes_back_from_every_file(tmp_path_factory, seed, up, thick
     assert opacity <= 0.501 / 255 and color <= 0.501 / 255 / 0.15 * SH_C0
     # scales in steps of 1 / 16: e^(1 / 16) of the squares. Those below e^-10 become it; of a
     # covariance whose largest scale is s the largest element is at least s^2 / 3
-    raised = (
-        3 * (np.exp(-10) / np.asarray(scales).max()) ** 2
-        if np.asarray(scales).min() < np.exp(-10)
-        else 0
-    )
+    raised = 0
+    if np.asarray(scales).min() < np.exp(-10):
+        raised = 3 * (np.exp(-10) / np.asarray(scales).max()) ** 2
     assert covariance < 0.08 + raised
 
 

@@ -80,10 +80,10 @@ def checkpoint_of(g):
         "quats": 3 * np.asarray(g.quats),
         "opacities": np.log(o) - np.log1p(-o),
         "sh0": (np.asarray(g.colors)[:, None] - 0.5) / C0,
-        "shN": np.zeros((len(o), 0, 3), np.float32)
-        if g.harmonics is None
-        else np.asarray(g.harmonics),
+        "shN": np.zeros((len(o), 0, 3)),
     }
+    if g.harmonics is not None:
+        parts["shN"] = np.asarray(g.harmonics)
     return {name: np.asarray(part, np.float32) for name, part in parts.items()}
 
 

@@ -96,11 +96,9 @@ def test_deformations_and_a_low_pass_are_in_the_scales(tmp_path):
 def ply(gaussians, kind="<f4", form="binary_little_endian", extra=(), faces=False):
     """Returns a .ply file in the layout of 3DGS's authors."""
     g = gaussians
-    rest = (
-        np.zeros((len(g.means), 0))
-        if g.harmonics is None
-        else np.asarray(g.harmonics).swapaxes(1, 2).reshape(20, -1)
-    )
+    rest = np.zeros((len(g.means), 0))
+    if g.harmonics is not None:
+        rest = np.asarray(g.harmonics).swapaxes(1, 2).reshape(20, -1)
     extra = extra if isinstance(extra, dict) else dict.fromkeys(extra, np.arange(20))
     columns = dict(zip("xyz", np.asarray(g.means).T, strict=True)) | extra
     columns |= {f"f_dc_{i}": (np.asarray(g.colors)[:, i] - 0.5) / C0 for i in range(3)}
@@ -260,11 +258,10 @@ def glb(gaussians, node=None, change=lambda content: None, short=False):
     binary, views, accessors = b"", [], []
     for name, values in columns.items():
         small = short and name.endswith("ROTATION")
-        data = (
-            np.rint(np.asarray(values) * 32767).astype("<i2")
-            if small
-            else np.asarray(values, "<f4")
-        ).tobytes()
+        numbers = np.asarray(values, "<f4")
+        if small:
+            numbers = np.rint(np.asarray(values) * 32767).astype("<i2")
+        data = numbers.tobytes()
         views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(data)})
         binary += data
         kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[np.asarray(values).reshape(20, -1).shape[1]]

@@ -106,6 +106,7 @@ def sphere(rings=12, radius=1.0, open_below=False):
     angles = np.linspace(0, np.pi, rings + 1)[1:-1]
     angles = angles[: len(angles) // 2 + 1] if open_below else angles
     turn = np.arange(columns) * 2 * np.pi / columns
+    # rings between two poles, a little twisted against each other
     grid = [
         [
             [np.sin(a) * np.sin(t + 0.1 * a), np.cos(a), np.sin(a) * np.cos(t + 0.1 * a)]
@@ -115,6 +116,7 @@ def sphere(rings=12, radius=1.0, open_below=False):
     ]
     vertices = np.concatenate([[[0, 1.0, 0]], np.reshape(grid, (-1, 3)), [[0, -1.0, 0]]])
     vertex_at = lambda r, c: 1 + r * columns + c % columns
+    # a fan at the upper pole, two triangles between the rings, a fan at the lower pole
     faces = [(0, vertex_at(0, c), vertex_at(0, c + 1)) for c in range(columns)]
     for r in range(len(angles) - 1):
         for c in range(columns):

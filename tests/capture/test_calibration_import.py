@@ -160,11 +160,9 @@ def test_alpha_is_a_mask_when_undistorted_or_stays_beside_masks(rig, tmp_path, m
     pixels[10:30, 20:40] = (255, 0, 0, 255)
     for file in FILES:
         Image.fromarray(pixels).save(rig[1] / file)
-    masks = (
-        write_masks(tmp_path / "masks", [np.full(PERSON.shape, 255, np.uint8)] * 4)
-        if masked
-        else None
-    )
+    masks = None
+    if masked:
+        masks = write_masks(tmp_path / "masks", [np.full(PERSON.shape, 255, np.uint8)] * 4)
     assert import_rig(rig, masks=masks).undistorted == 3
     for view in views_of(rig[2]):
         photo, mask, _ = read_view(rig[2], view, on_white=False)

@@ -89,11 +89,9 @@ def openpose(*people):
 
 def annots(values, filename, number=0):
     """Returns EasyMocap's content of a file, with hands beside BODY_25."""
-    hands = (
-        {"handl2d": values[25:46].tolist(), "handr2d": values[46:].tolist()}
-        if len(values) == 67
-        else {}
-    )
+    hands = {}
+    if len(values) == 67:
+        hands = {"handl2d": values[25:46].tolist(), "handr2d": values[46:].tolist()}
     person = {
         "bbox": [0, 0, 9, 9, 1.0],
         "personID": number,

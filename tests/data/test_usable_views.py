@@ -84,11 +84,10 @@ def test_a_spoiled_mask_leaves_its_view_out_by_name(demo, spoiled, caplog):
 
 @pytest.mark.parametrize("mask", [*KEPT, None])
 def test_other_masks_are_kept(demo, mask):
-    capture = (
-        dataclasses.replace(demo, masks=None)
-        if mask is None
-        else with_mask(demo, 1, KEPT[mask](demo.masks[1]))
-    )
+    if mask is None:
+        capture = dataclasses.replace(demo, masks=None)
+    else:
+        capture = with_mask(demo, 1, KEPT[mask](demo.masks[1]))
     assert not views_without_person(capture)
 
 

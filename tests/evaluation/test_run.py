@@ -223,11 +223,9 @@ def write_predictions(folder, people, alpha=False):
     for name, (capture, predicted) in people.items():
         (folder / name).mkdir(parents=True)
         for view, image in zip(capture.names, predicted, strict=True):
-            pixels = (
-                np.concatenate([image, np.full((*image.shape[:2], 1), 1.0)], axis=-1)
-                if alpha
-                else image
-            )
+            pixels = image
+            if alpha:
+                pixels = np.concatenate([image, np.full((*image.shape[:2], 1), 1.0)], axis=-1)
             write_png(folder / name / f"{view}.png", pixels)
 
 
@@ -462,11 +460,9 @@ def test_avatars_and_weights_are_drawn_on_the_protocols_background(tmp_path):
             "demo_capture", avatar=replace(avatar, gaussians=dimmed), protocol=protocol
         )
         truth = hg.load_capture("demo_capture/held_out")
-        expected = (
-            truth.images
-            if background
-            else np.clip(truth.images - (1 - truth.masks[..., None]), 0, 1)
-        )
+        expected = truth.images
+        if not background:
+            expected = np.clip(truth.images - (1 - truth.masks[..., None]), 0, 1)
         if protocol == "humangs":
             found = [row.scores["psnr"] for row in nobody.rows]
             np.testing.assert_allclose(

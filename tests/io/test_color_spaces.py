@@ -97,16 +97,12 @@ def test_alpha_is_kept_beside_converted_colors(tmp_path):
 @pytest.mark.parametrize("mode", ["L", "LA", "1", "I;16", "RGB"])
 def test_greys_have_profiles_of_greys_and_of_colors(mode, tmp_path):
     grey = Image.fromarray(COLORS[..., 0])
-    image = (
-        Image.fromarray(COLORS[..., 0].astype(np.uint16) * 257)
-        if mode == "I;16"
-        else grey.convert(mode)
-    )
-    stored = (
-        np.asarray(image.convert("RGB"), float)[..., 0] / 255
-        if mode != "I;16"
-        else COLORS[..., 0] / 255
-    )
+    if mode == "I;16":
+        image = Image.fromarray(COLORS[..., 0].astype(np.uint16) * 257)
+        stored = COLORS[..., 0] / 255
+    else:
+        image = grey.convert(mode)
+        stored = np.asarray(image.convert("RGB"), float)[..., 0] / 255
     for profile in (
         profiles.of_grey(profiles.gamma(1.8)),
         profiles.of_colors(profiles.P3_TO_XYZ, profiles.gamma(1.8)),

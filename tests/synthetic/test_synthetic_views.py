@@ -186,11 +186,9 @@ def test_processes_write_the_same_files(tmp_path):
     writer.write_set(together, 3, layout, "demo", workers=2, progress=False)
 
     def read(file):
-        return (
-            file.read_bytes()
-            if file.suffix != ".npz"
-            else {k: x.tolist() for k, x in np.load(file).items()}
-        )
+        if file.suffix != ".npz":
+            return file.read_bytes()
+        return {name: x.tolist() for name, x in np.load(file).items()}
 
     # an npz tells when it was written
     contents = [

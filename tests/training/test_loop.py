@@ -172,9 +172,10 @@ def test_runs_of_other_seeds_share_a_program(body, captures, variables, monkeypa
         train_step(init_state(config, variables), batch, body, config)
     assert asked[0][1:] == asked[1][1:] and hash(asked[0][1]) == hash(asked[1][1])
     assert (asked[0][0] != asked[1][0]).any()
-    keys_of = lambda seed: step.subject_keys(
-        jnp.asarray(step.seed_numbers(seed)), jnp.asarray(3), 2
-    )
+
+    def keys_of(seed):
+        return step.subject_keys(jnp.asarray(step.seed_numbers(seed)), jnp.asarray(3), 2)
+
     expected = jax.random.split(jax.random.fold_in(jax.random.key(7), 3), 2)
     assert (jax.random.key_data(keys_of(7)) == jax.random.key_data(expected)).all()
 

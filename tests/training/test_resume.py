@@ -40,21 +40,18 @@ def test_resume_of_eight_devices_on_four_and_of_two_processes(captures, tmp_path
     eight, four, stopped = (tmp_path / name for name in ("eight", "four", "stopped"))
     two, two_stopped = tmp_path / "two", tmp_path / "two_stopped"
     cache = ("--cache", tmp_path / "compiled")
-    arguments_on = lambda devices, at_once: (
-        "--batch",
-        8,
-        "--devices",
-        devices,
-        "--at-once",
-        at_once,
-        *cache,
-    )
+
+    def arguments_on(devices, at_once):
+        return ("--batch", 8, "--devices", devices, "--at-once", at_once, *cache)
+
+    # the same arrangement: bit by bit
     run(four, folder, "--stop-at", 4, *arguments_on(4, 2))
     run(stopped, folder, "--stop-at", 2, *arguments_on(4, 2))
     run(stopped, folder, "--stop-at", 4, *arguments_on(4, 2))
     assert same(state_of(stopped, 4), state_of(four, 4))
     assert losses(stopped) == losses(four) and list(losses(four)) == [1, 2, 3, 4]
 
+    # other arrangements, up to rounding
     run(eight, folder, "--stop-at", 2, *arguments_on(8, 1))
     run(eight, folder, "--stop-at", 4, *arguments_on(4, 2))
     assert largest_difference(state_of(eight, 4).params, state_of(four, 4).params) < bound(ACROSS)

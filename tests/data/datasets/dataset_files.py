@@ -222,12 +222,15 @@ def parameter_arrays(seed=0, frames=FRAMES):
 
 def calibration(names, made):
     flat = lambda x: np.asarray(x, float).reshape(-1).tolist()
-    camera_entry = lambda R, T: {
-        "K": flat(made.K),
-        "R": flat(R),
-        "T": flat(T),
-        "imgSize": list(made.size),
-    }
+
+    def camera_entry(R, T):
+        return {
+            "K": flat(made.K),
+            "R": flat(R),
+            "T": flat(T),
+            "imgSize": list(made.size),
+        }
+
     return {name: camera_entry(R, T) for name, R, T in zip(names, made.R, made.T, strict=True)}
 
 

@@ -58,9 +58,8 @@ def write_body(path, people, body, hand_poses):
 def make_people(seeds, vertices=None):
     """Returns (synthetic people, body of the model file), with the body decimated to `vertices`."""
     body = load_body()
-    return [in_tight_clothes(seed, body) for seed in seeds], body if vertices is None else decimate(
-        body, vertices
-    )
+    people = [in_tight_clothes(seed, body) for seed in seeds]
+    return people, body if vertices is None else decimate(body, vertices)
 
 
 def in_tight_clothes(seed, body):

@@ -106,14 +106,15 @@ PHOTO, MASK = "22010708/00000001.jpg", "22010708/mask/pha/00000001.jpg"
 
 def rig(key, change):
     """Changes a value of a camera; a change of None removes it."""
-    return jsn(
-        RIG,
-        lambda c: (
-            c[CAMERA].pop(key)
-            if change is None
-            else c[CAMERA].update({key: change(c[CAMERA][key])})
-        ),
-    )
+
+    def change_camera(cameras):
+        camera = cameras[CAMERA]
+        if change is None:
+            camera.pop(key)
+        else:
+            camera[key] = change(camera[key])
+
+    return jsn(RIG, change_camera)
 
 
 AVATARREX = {
