@@ -2,9 +2,10 @@
 numbers that show what is wrong.
 
 Blue is the person's left side, red is the right side, and the green line is the boundary of the
-body. Photo and body should coincide. A yellow line is the boundary of the displaced body: by the
-displacement of the capture, or else by the displacement to the masks that `reconstruct` finds, with
-a skirt where there is one. `apps.quick_check` names what is wrong with a view.
+body. Photo and body should coincide. A yellow line is the boundary of the displaced body that
+`reconstruct` uses. The displacement is the capture's, or else the one to the masks that
+`reconstruct` finds, with a skirt if the masks show one. `apps.quick_check` names what is wrong with
+a view.
 
 On the sheet of a fit a disc is a keypoint: blue for the person's left, red for the right, white for
 the middle. A ring is an outlier. A line leads from the keypoint to a cross, which is the landmark
@@ -120,8 +121,8 @@ class CheckReport:
     warnings: tuple[str, ...] = ()
     """What looks wrong with the capture as a whole, one line for each problem."""
     displaced: float = 0.0
-    """Largest distance by which `reconstruct` moves a vertex of the body, so that the body fits the
-    masks, metres. 0: nothing is moved.
+    """Largest distance by which `reconstruct` moves a vertex of the body, metres. 0: no vertex is
+    moved.
     """
     registered: bool = False
     """Whether the displacement is that of the capture itself. Else `reconstruct` finds it from the

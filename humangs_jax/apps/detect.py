@@ -1,5 +1,5 @@
-"""Finds the people in photos, chooses one person, the same in all photos, and writes this person's
-keypoints and masks, and a numbered sheet of all people.
+"""Finds the people in photos, and chooses one person, who is the same in all photos. Writes this
+person's keypoints and masks, and a sheet of all people with their numbers.
 
 Files that are written:
 
@@ -8,7 +8,7 @@ Files that are written:
     people.png       the sheet: everybody in every photo, with numbers
     unknown/NAME.png for photos of a capture: where somebody else may hide the person
 
-`apps.same_people` decides who of one photo is who of another.
+`apps.same_people` decides which people in different photos are the same person.
 """
 
 import contextlib

@@ -47,8 +47,8 @@ class _Limits:
     another unit.
     """
     turn: float = 2 * math.pi + 0.5
-    """Length of the longest rotation vector that is accepted, radians. It is at most half a turn,
-    or a whole turn where a program kept counting. Values in degrees are far beyond.
+    """Length of the longest rotation vector that is accepted, radians. Rotation vectors are at most
+    half a turn long, or a whole turn if a program kept counting. Values in degrees are far beyond.
     """
     better: float = 0.1
     """IoU that each view has to gain so that an exchange of cameras explains it."""

@@ -1,4 +1,4 @@
-"""Matches the people in photos: decides who of one photo is who of another.
+"""Matches the people in photos: decides which people in different photos are the same person.
 
 In the simplest case each photo shows one large person, who is the same everywhere. Where several
 are large and cameras are calibrated, people of one moment are matched by how well their landmarks
@@ -72,7 +72,7 @@ class PhotoPeople:
     """
     known: bool = True
     """Whether equal numbers mean the same person. False if several people of this photo are large
-    and nothing shows who of them is who of another photo; then numbers only follow size.
+    and nothing shows who they are in other photos. Then numbers only follow size.
     """
 
 

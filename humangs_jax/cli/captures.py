@@ -75,7 +75,7 @@ class Detect:
         "humangs detect photos --person 1 --out found",
     )
     photos: Positional[Path]
-    """Folder of the photos, or a capture folder that has no body yet."""
+    """Folder of the photos, or a capture folder, which need not have a body yet."""
     out: Annotated[Path, OutputPath()]
     """Folder for keypoints.json, masks/ and people.png (the sheet)."""
     person: Annotated[int | None, at_least(0)] = None
@@ -215,7 +215,7 @@ class Synth:
     sequences: bool = False
     """Take the poses from a motion: a walk, a turn or a reach, which is written as motion.npz."""
     motion_frames: Annotated[int, at_least(1)] = 60
-    """Number of frames of that motion, 30 per second."""
+    """Number of frames of the motion of --sequences, 30 per second."""
     for_training: bool = False
     """Short for 2 poses x 12 views at 256 pixels and no close views, which is enough for `humangs
     train`.

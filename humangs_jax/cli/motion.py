@@ -36,7 +36,7 @@ class MotionOfVideo:
     avatar: Path | None = None
     """Find the motion for the body of this avatar, in its size."""
     focal_mm: Annotated[float | None, Range(5.0, 2000.0)] = None
-    """Focal length of the camera on 35-mm film. Default: that of a telephone, 29."""
+    """Focal length of the camera, millimetres on 35-mm film. Default: 29, that of a telephone."""
     check: Annotated[
         Path | None,
         OutputPath((".mp4", ".webm", ".gif")),

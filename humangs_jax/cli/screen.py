@@ -1,9 +1,9 @@
 """Shows a command's stages, warnings and results on the screen, and handles Ctrl-C.
 
 At its end a command shows how long its stages took, and what to do next. Commands use `stage`,
-`tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `finish` and `fail`. Results
-go to stdout, and everything else to stderr. --quiet shows only results and errors. --verbose also
-shows what libraries log.
+`tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `finish` and `fail`. Results,
+times and suggestions go to stdout. Stages, bars, warnings and errors go to stderr. --quiet hides
+stages, bars, times, suggestions and what `wrote` shows. --verbose also shows what libraries log.
 """
 
 import atexit

@@ -404,7 +404,10 @@ class Evaluate:
     Default: the body that comes with the package.
     """
     inputs: Annotated[int | None, at_least(1)] = None
-    """Number of photos that are inputs, evenly spaced. Default: 4."""
+    """Number of photos that are inputs, evenly spaced. Default: 4.
+
+    With --avatar or --predictions the default is that all views of a capture are compared.
+    """
     indices: Path | None = None
     """JSON that says which views are inputs and targets: {"PERSON": {"context": [...], "target":
     [...]}}.

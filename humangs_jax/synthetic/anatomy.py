@@ -134,7 +134,7 @@ def joint_positions(
 
 
 def limited(rotations: Rotations) -> Rotations:
-    """Shortens rotation vectors (j, 3) to the limits of their joints."""
+    """Returns rotation vectors (j, 3), shortened to the limits of their joints."""
     angle = np.linalg.norm(rotations, axis=1)
     return rotations * np.minimum(1, LIMITS / np.maximum(angle, 1e-9))[:, None]
 
@@ -154,7 +154,7 @@ class Foot:
     x: float
     """x of the point on the ground below the ball of the foot, metres."""
     z: float
-    """z of that point, metres."""
+    """z of the same point, metres."""
     yaw: float = 0.0
     """Heading of the foot, radians about y."""
     pitch: float = 0.0

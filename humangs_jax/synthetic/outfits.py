@@ -300,7 +300,7 @@ _SHAFTS = {
 
 
 def sample_outfit(rng: np.random.Generator, male: bool, years: float) -> tuple[Garment, ...]:
-    """Chooses clothes that go together, innermost first; shoes and accessories come last."""
+    """Returns clothes that go together, innermost first. Shoes and accessories come last."""
     name = drawn(rng, {name: style.men if male else style.women for name, style in _STYLES.items()})
     style = _STYLES[name]
     outer = rng.random() < style.outer

@@ -141,7 +141,7 @@ class Person:
     haircut: Haircut
     """Hair and beard."""
     garments: tuple[Garment, ...]
-    """Clothes, shoes and accessories, innermost first."""
+    """Clothes, innermost first, then shoes and accessories."""
     lights: Lights
     """The light around the person."""
 
@@ -164,7 +164,7 @@ def describe(seed: int, body: BodyModel) -> Person:
 def _sample_shape(
     rng: np.random.Generator, body: BodyModel, male: bool, years: float
 ) -> tuple[np.ndarray, float]:
-    """Draws shape coefficients (s,); returns them and the stature in metres that they give."""
+    """Draws shape coefficients. Returns them, (s,), and the stature that they give, metres."""
     at = {name: i for i, name in enumerate(body.shape_names)}
     # coefficients without another rule: standard deviation 0.55, at most twice that
     betas = np.clip(rng.normal(0, 1, len(at)), -2, 2) * 0.55

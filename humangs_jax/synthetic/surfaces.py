@@ -1,9 +1,9 @@
 """Triangle surfaces on the host, convex silhouettes of body parts, and random functions.
 
 Surfaces can be cut along a level set, smoothed, hemmed and joined, and tubes can be made. A
-`Surface` carries the attributes of its vertices through every operation: a garment that is cut out
-of the body keeps its skinning weights, its cloth coordinates and the skin point below it. Lengths
-are in metres, arrays are float32, and faces are counter-clockwise seen from outside.
+`Surface` carries the attributes of its vertices along: a garment that is cut out of the body keeps
+its skinning weights, its cloth coordinates and the skin point below it. Lengths are in metres,
+arrays are float32, and faces are counter-clockwise seen from outside.
 
 `Boundaries` are the silhouettes of taut cloth around a part of the body. The part is cut across an
 axis into slices. The silhouette of a slice is its radius around the slice's centre at `ANGLES`
@@ -81,7 +81,7 @@ class Folds:
         self.patches = [Ripples(rng, 4 * wavelength) for _ in range(directions)]
 
     def slope(self, points: np.ndarray) -> np.ndarray:
-        """Returns slopes (n, 3) at points (n, 3): about 1 beside a ridge, 0 between patches."""
+        """Returns slopes (n, 3) at points (n, 3): at most about 1, and 0 between patches."""
         points = points.astype(np.float32)
         total, warp = np.zeros_like(points), 3.0 * self.warp(points)
         for k, direction, phase, patch in zip(
@@ -203,7 +203,8 @@ def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
 
 
 def smooth(values: _Values, faces: Faces, iterations: int, keep_hems: bool = False) -> _Values:
-    """Smooths values of vertices (n, c). Each iteration moves them halfway to neighbours' means.
+    """Returns smoothed values of vertices (n, c). Each iteration moves a value halfway to the mean
+    of its neighbours.
 
     keep_hems: whether vertices on the boundary only follow neighbours on the boundary, so that hems
     stay crisp.
@@ -287,7 +288,8 @@ def join(surfaces: list[Surface]) -> Surface:
 
 
 def turn_in_hems(surface: Surface, depth: float) -> Surface:
-    """Adds a strip along every boundary that is folded inwards, so that cloth looks thick.
+    """Returns the surface with a strip along every boundary. The strip is folded inwards, so that
+    cloth looks thick.
 
     depth: metres by which the strip goes against the normal.
     """
@@ -471,7 +473,9 @@ def boundaries(
 
 
 def blurred(shape: Boundaries, times: int = 1) -> Boundaries:
-    """Averages radii over neighbouring slices and angles, `times` times."""
+    """Returns silhouettes whose radii are averaged over neighbouring slices and angles. times: how
+    often they are averaged.
+    """
     radii = shape.radii
     for _ in range(times):
         padded = np.concatenate([radii[:1], radii, radii[-1:]])

@@ -1,7 +1,7 @@
 """Dresses a body: builds the surfaces and materials of garments, layer on layer.
 
-Clothes and closed shoes hide the skin well inside of their hems, and most of them the cloth there,
-too. Straps, collars, belts, ties and most accessories hide nothing.
+Clothes and closed shoes hide the skin that lies well inside of their hems. Most of them also hide
+the cloth there. Straps, collars, belts, ties and most accessories hide nothing.
 """
 
 import dataclasses
@@ -217,7 +217,7 @@ def _top(outfit: Outfit, garment: Garment) -> None:
 
 
 def _outer(outfit: Outfit, garment: Garment) -> None:
-    """Puts on a jacket or a coat: the bodice, and lapels, a hood or a collar.
+    """Puts on a jacket or a coat: the bodice, and on most kinds lapels, a hood or a collar.
 
     A coat also has a tube below the waist.
     """

@@ -1,5 +1,5 @@
-"""Compares variants of a training run with the run itself: the same people, steps and seeds, with
-intervals of the differences.
+"""Compares variants of a training run with the run itself. The runs have the same people and seeds,
+and the differences have intervals.
 
 All runs are compared on the people, photos and targets that the base is validated on, whatever a
 variant changes.
@@ -72,7 +72,7 @@ class Ablation:
     metric: str
     """The name of the score."""
     scores: dict[str, dict[int, float]]
-    """The score of each variant by seed."""
+    """The score of each seed, for the base and each variant by name."""
 
     @property
     def rows(self) -> list[AblationRow]:

@@ -1,8 +1,8 @@
 """Adds errors of real captures to the inputs of training: exposure, masks, cameras, poses and
 shape.
 
-The targets stay true. So the network learns to place Gaussians well although its photos and bodies
-are a little off, as those of `humangs fit` are.
+Photos, cameras and poses of the targets stay true. So the network learns to place Gaussians well
+although its photos and bodies are a little off, as those of `humangs fit` are.
 """
 
 import math
@@ -29,8 +29,8 @@ class Augmentation:
     """
 
     share: Share = 0.0
-    """Share of the examples that have other errors than of exposure and tint. 0: there are no
-    errors at all, and no computation.
+    """Share of the examples that have all errors. Other examples have errors of exposure and tint
+    only. 0: there are no errors at all, and no computation.
     """
     exposure: Spread = 0.08
     """Standard deviation of the natural logarithm of each photo's gain."""
@@ -63,7 +63,7 @@ Numbers = dict[str, Float[Array, "..."]]
 
 
 def random_numbers(key: Key, views: SubjectViews) -> Numbers:
-    """Returns all random numbers of an example with such photos, uniform in [0, 1), by name."""
+    """Returns all random numbers of an example with inputs `views`, in [0, 1), by name."""
     count, joints = views.rotations.shape[:2]
     shapes = {"chosen": (), "betas": views.betas.shape}
     shapes |= {"gains": (count, 1, 1, 1), "tints": (count, 1, 1, 3)}
@@ -146,7 +146,7 @@ def _grown(
     masks: Float[Array, "v h w"], radii: Int[Array, " v"], most: int
 ) -> Float[Array, "v h w"]:
     """Returns masks dilated by radii > 0 and eroded by radii < 0, in pixels. Squares grow to
-    squares.
+    squares. most: largest magnitude of a radius.
     """
     for radius in range(1, most + 1):
         larger, smaller = _largest_near(masks), -_largest_near(-masks)

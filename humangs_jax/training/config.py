@@ -52,8 +52,8 @@ class OptimizerConfig:
     name: Literal["adamw", "nadamw", "lamb", "lion"] = "adamw"
     """The name of the optimizer in `optax`."""
     learning_rate: Spread = 4e-4
-    """Peak of the learning rate. The rate rises from 0 to it in `warmup_steps`, then falls by a
-    cosine to 0 at the end of the run.
+    """Peak of the learning rate. The rate rises from 0 to the peak in `warmup_steps`, then falls by
+    a cosine to 0 at the end of the run.
     """
     warmup_steps: Annotated[int, Range(0, 100_000_000)] = 3000
     """Steps over which the learning rate rises from 0 to its peak."""
@@ -81,7 +81,7 @@ class Phase:
     image_size: InputSide | None = None
     """Side of the input photos, pixels."""
     token_capacity: CapacityOrAuto | None = None
-    """Number of tokens that the network has room for."""
+    """Number of tokens that the network has room for; 0 for as many as may be needed."""
     target_size: Side | None = None
     """Side of the targets, pixels."""
     batch_size: Count | None = None
@@ -204,7 +204,8 @@ def compiled_for(config: TrainConfig) -> TrainConfig:
 
 
 def small() -> TrainConfig:
-    """Returns the configuration for the shipped network: some hours on a CPU of two cores.
+    """Returns the configuration for the shipped network. A run takes some hours on a CPU of two
+    cores.
 
     The shipped weights were trained with other losses (assets/weights.md).
     """

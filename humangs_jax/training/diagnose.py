@@ -105,8 +105,8 @@ class StageReport:
 
     @property
     def spoils(self) -> Leaf | None:
-        """The first gradient that is not finite, although all gradients that came back to this
-        stage are finite. None if there is no such gradient.
+        """The first gradient of the stage that is not finite, if all gradients that came back to
+        the stage are finite. Else None.
         """
         if _first_bad(self.returned):
             return None

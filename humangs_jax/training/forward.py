@@ -64,8 +64,8 @@ def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
     """Returns the network's configuration with the token capacity for a step of `views` photos.
 
     The configured capacity is for the largest of `views.input_counts`. Fewer photos get their share
-    plus that of one view, because one photo may show more of a person than the others. More photos,
-    as in a comparison, get more in proportion.
+    plus that of one view, because one photo may show more of a person than the others. More photos
+    get more in proportion.
     """
     most, capacity = max(config.views.input_counts), config.model.runtime.token_capacity
     if views == most:

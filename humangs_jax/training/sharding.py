@@ -3,7 +3,7 @@ along one axis of the mesh.
 
 The mesh has the axes "data" and "fsdp". Data parallelism uses both. Parameters, moments and
 averages are divided along "fsdp" and equal along "data". A step gathers the parameters once, works
-on its subjects, and sends every device the sum of its part of the gradient. This is ZeRO stage 3
+on its subjects, and sends every device the mean of its part of the gradient. This is ZeRO stage 3
 (Rajbhandari et al., 2020, https://arxiv.org/abs/1910.02054), but with one gathering per step,
 because the network is small compared to what it computes.
 """

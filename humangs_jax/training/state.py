@@ -1,10 +1,11 @@
 """Everything that a run carries from step to step, and the optimizer whose state is part of it.
 
-Random numbers are not carried, because they follow from the seed and the step. The optimizer is the
-published one: AdamW, warm-up and cosine, clipped gradients, and a guard against bad steps. First a
-gradient is made finite entry by entry (NaN becomes 0, infinities +-1e-6). If then its norm exceeds
-`skip_norm`, or the loss is not finite, the step is skipped and counted: it changes neither
-parameters nor moments nor the schedule. Steps that had anything to make finite are counted, too.
+Random numbers are not carried, because they follow from the seed and the step. By default the
+optimizer is the published one: AdamW, warm-up and cosine, clipped gradients, and a guard against
+bad steps. First a gradient is made finite entry by entry (NaN becomes 0, infinities +-1e-6). If
+then its norm exceeds `skip_norm`, or the loss is not finite, the step is skipped and counted. It
+then changes neither parameters nor batch statistics, moments or the schedule. Steps that had
+anything to make finite are counted, too.
 """
 
 from typing import Any, NamedTuple, cast
