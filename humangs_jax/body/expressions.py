@@ -48,27 +48,29 @@ class Expressions:
     vertices: Int[Array, " m"]
     """Indices of the vertices that move, increasing."""
     directions: Float[Array, "m 3 e"]
-    """Metres per unit of a coefficient, in the T-pose."""
+    """Change of these vertices per unit of a coefficient, (m, 3, e), metres, in the T-pose."""
     joint_directions: Float[Array, "j 3 e"] | None = None
     """Change of the joints per unit of a coefficient, (j, 3, e), metres. None: joints do not
     move.
     """
     joint_turns: Float[Array, "j 3 e"] | None = None
-    """Axis-angle in radians per unit, added to the rotations of the pose; None: no joint turns."""
+    """Axis-angle per unit of a coefficient, (j, 3, e), radians, added to the rotations of the pose.
+    None: no joint turns.
+    """
     names: tuple[str, ...] = static_field(default=())
     """Names of the e directions."""
 
 
 @pytree_dataclass
 class FaceParts:
-    """Parts of the shipped face that photos hardly show, as quadrilaterals; their vertices move
-    with the expression, too.
+    """Parts of the shipped face that photos hardly show, as quadrilaterals. Their corners move with
+    the expression, too.
     """
 
     corners: Float[np.ndarray, "q 4 3"]
     """Corners of the quadrilaterals on the mean body in T-pose, (q, 4, 3), metres."""
     directions: Float[np.ndarray, "q 4 3 e"]
-    """How each corner moves per unit of a coefficient, metres."""
+    """Change of each corner per unit of a coefficient, (q, 4, 3, e), metres."""
     parts: Int[np.ndarray, " q"]
     """Part of each quadrilateral, (q,), as an index into `PARTS`."""
     lips: Float[np.ndarray, "4 3"]
@@ -87,9 +89,10 @@ def _shipped() -> dict[str, np.ndarray]:
 
 
 def _read_face(path: str | Path) -> dict[str, np.ndarray]:
-    """Reads the arrays of a face file; adds `rows`: for each offset its vertex and its shape.
+    """Returns the arrays of a face file by key, and `rows`, (offsets, 2): the vertex and the shape
+    of each offset.
 
-    Raises: ValueError, naming the key.
+    Raises: FileNotFoundError; ValueError, which names the key.
     """
     with reading(path, "face file"):
         arrays, _ = read_npz(path)
@@ -122,7 +125,9 @@ def _read_face(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _dense(arrays: dict[str, np.ndarray], count: int) -> Float[np.ndarray, "count 3 e"]:
-    """Returns the offsets of this many vertices in metres, those inside of the mouth last."""
+    """Returns the offsets of `count` vertices for each shape, (count, 3, e), metres. Vertices
+    inside of the mouth are last.
+    """
     dense = np.zeros((count, 3, len(arrays["names"])), np.float32)
     vertices, shapes = arrays["rows"].T
     dense[vertices, :, shapes] = arrays["offsets"].T * np.float32(STEP)
@@ -131,7 +136,9 @@ def _dense(arrays: dict[str, np.ndarray], count: int) -> Float[np.ndarray, "coun
 
 @functools.cache
 def shipped_expressions(body_vertices: int) -> Expressions:
-    """Returns the 52 shapes of ARKit on the shipped body; eyes turn by their joints."""
+    """Returns the 52 shapes of ARKit on the shipped body. They turn the joints of the eyes.
+    body_vertices: number of vertices of that body.
+    """
     arrays = _shipped()
     names = tuple(str(name) for name in arrays["names"])
     dense = _dense(arrays, body_vertices + len(arrays["inside_vertices"]))[:body_vertices]
@@ -148,8 +155,8 @@ def shipped_expressions(body_vertices: int) -> Expressions:
 
 
 def shipped_parts(template: Float[np.ndarray, "n 3"]) -> FaceParts:
-    """Returns teeth, tongue, lids and the inside of the mouth. template: that of the shipped
-    body.
+    """Returns teeth, tongue, lids and the inside of the mouth of the shipped face. template:
+    vertices of the shipped body in T-pose, (n, 3), metres.
     """
     arrays = _shipped()
     places = np.concatenate([template, arrays["inside_vertices"]]).astype(np.float32)

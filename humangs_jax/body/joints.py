@@ -44,8 +44,8 @@ JOINT_NAMES = (
 
 
 def _hand_parents(wrist: int, first: int) -> list[int]:
-    """Returns parents of the 15 joints of a hand: five fingers of three joints each, from the
-    wrist on.
+    """Returns the parents of the 15 joints of a hand: five fingers of three joints each. wrist: the
+    parent of each finger's first joint. first: index of the first of the 15 joints.
     """
     return [parent for j in range(first, first + 15, 3) for parent in (wrist, j, j + 1)]
 

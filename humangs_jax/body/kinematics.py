@@ -13,7 +13,7 @@ def posed_tree(
     parents: Sequence[int],
 ) -> tuple[Float[np.ndarray, "*m j 3 3"], Float[np.ndarray, "*m j 3"]]:
     """Returns rotations (..., j, 3, 3) and positions (..., j, 3) of joints in space, by numpy.
-    `body.model.joint_transforms` does the same in JAX.
+    `body.model.joint_transforms` computes transforms from such a tree in JAX.
 
     turns: rotations of joints relative to their parents. bones: vector from the parent to each
     joint in the rest pose; for the root its position. parents: -1 for roots; each comes before its

@@ -3,12 +3,12 @@
 A landmark is a mean of joints, or a vertex that a rule finds on the body's own template
 (`_Finder`). So every body whose joints have SMPL-X's names has landmarks. Sides are the person's.
 
-These landmarks are joints: shoulder, elbow, wrist, hip, knee, ankle, jaw, eye (the centre of the
-eyeball), and the knuckles `{side}_FINGER_1, 2, 3` from the palm outwards. Two are means of joints:
-neck (of the shoulders, as OpenPose has it) and mid_hip. These are vertices: nose (or face_30),
-face_8 the chin, face_27 the root of the nose, ears, finger tips, and of each foot big_toe,
-small_toe, heel and foot_index, the foremost point. The other 65 points of the face follow
-expressions, which bodies without a face rig do not have.
+These landmarks are joints: shoulder, elbow, wrist (or hand_root), hip, knee, ankle, jaw, eye (the
+centre of the eyeball), and the knuckles `{side}_FINGER_1, 2, 3` from the palm outwards. Two are
+means of joints: neck (of the shoulders, as OpenPose has it) and mid_hip. These are vertices: nose
+(or face_30), face_8 the chin, face_27 the root of the nose, ears, finger tips, and of each foot
+big_toe, small_toe, heel and foot_index, the foremost point. The other 65 points of the face follow
+expressions, and no body has them here.
 
 Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres), so
 fits give these landmarks less weight. If it is known where a detector sees its landmarks, they are
@@ -246,14 +246,15 @@ class LandmarkModel:
     joint_names: tuple[str, ...] = static_field(default=())
     """Names of the j joints."""
     movers: tuple[int, ...] = static_field(default=())
-    """The joints whose turning moves a landmark."""
+    """Indices of the joints whose turning moves a landmark."""
     placed: tuple[PlacedLandmark, ...] = static_field(default=())
     """The landmarks whose places a fit may move, in the order of their points."""
 
     def moved(self, offsets: Float[Array, "g 3"]) -> "LandmarkModel":
         """Returns the model with its placed landmarks moved, each group by its offset.
 
-        offsets: (g, 3), metres in T-pose, of the left landmark of a pair.
+        offsets: (g, 3), metres in T-pose, of the left landmark of a pair, or of the landmark in the
+        middle.
         """
         if not self.placed:
             return self
@@ -300,7 +301,7 @@ def landmark_model(
 
     Arguments: places: definitions of landmarks that are elsewhere than this module says. A
     definition is ignored where the body lacks what it depends on. certainty: weight of each
-    landmark's error; if empty, `usual_certainty` is taken.
+    landmark's error, in the order of `names`; if empty, `usual_certainty` is taken.
     Raises: ValueError if the body has none of the landmarks, for example because its joints do not
     have SMPL-X's names.
     """
@@ -373,7 +374,9 @@ def _grouped(names: tuple[str, ...], placed: Sequence[str]) -> tuple[PlacedLandm
 
 
 def _regressed(body: BodyModel, values: Float[Array, "n *b"]) -> Float[Array, "j *b"]:
-    """Returns what joints have of a quantity that is linear in the vertices."""
+    """Returns the values at the joints, (j, ...), of a quantity that is linear in the vertices.
+    values: (n, ...).
+    """
     return jnp.einsum("jn,n...->j...", body.joint_regressor, values, precision=EXACT)
 
 
@@ -383,7 +386,7 @@ def _rows(points: SurfacePoints, rows: Sequence[int]) -> SurfacePoints:
 
 
 def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
-    """Makes a point of a joint: the joint carries it."""
+    """Returns one joint as a point of the surface. The joint carries it alone."""
     row = body.joint_regressor[joint : joint + 1]
 
     def product(values):
@@ -398,19 +401,19 @@ def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
 
 
 class _Beside(NamedTuple):
-    """Where a landmark is that has a place."""
+    """The place of a landmark that has a definition."""
 
     sources: tuple[int, ...]
     """Vertices, and joints j as -1 - j, whose mean the place starts from."""
     joints: tuple[int, ...]
-    """Joints that carry the place; none: those that carry its sources."""
+    """Indices of the joints that carry the place. Empty: the joints that carry its sources."""
     offset: tuple[float, float, float]
     """From the mean to the place, in the axes of the body at rest, metres."""
 
 
 def _placed(body: BodyModel, place: _Beside) -> SurfacePoints:
-    """Makes a point beside the sources of a landmark: it grows with them, and turns with the joints
-    of the place.
+    """Returns one point beside the sources of a landmark. A shape moves it as it moves the sources
+    on average. The point turns with the joints of the place.
     """
     every = surface_points(body)
     points = [
@@ -430,7 +433,9 @@ def _on_the_body(
     body: BodyModel, vertices: tuple[int, ...], places: tuple[_Beside, ...]
 ) -> tuple[Float[Array, "j 3"], Float[Array, "j 3 s"], SurfacePoints]:
     """Returns the joints at rest, their shape directions, and the points of these vertices and
-    places. One program: eager, it would be dozens, each of some numbers.
+    places.
+
+    It is one jitted program, because eager JAX would compile dozens of small ones.
     """
     points = [_rows(surface_points(body), vertices)]
     points += [_placed(body, place) for place in places]
@@ -442,7 +447,7 @@ def _on_the_body(
 
 
 def _concatenated(points: Sequence[SurfacePoints]) -> SurfacePoints:
-    """Joins points."""
+    """Joins several records of points into one."""
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *points)
 
 
@@ -451,7 +456,7 @@ def pose_landmarks(
 ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
     """Returns landmarks (k, 3) and joints (j, 3) of a person in a pose, metres.
 
-    Landmarks that the body lacks are at the origin.
+    Landmarks that the body lacks are at the origin. The pose's expression is ignored.
     """
     transforms, joints = pose_joints(model, betas, pose)
     posed = pose_points(model.points, betas, pose_features(pose.rotations), transforms)
@@ -462,7 +467,7 @@ def pose_joints(
     model: LandmarkModel, betas: Float[Array, " s_used"], pose: BodyPose
 ) -> tuple[Float[Array, "j 4 4"], Float[Array, "j 3"]]:
     """Returns the transforms of the joints from rest, (j, 4, 4), and the posed joints, (j, 3),
-    metres.
+    metres. The pose's expression is ignored.
     """
     rest = shaped(model.joints, model.joint_directions, betas)
     transforms = joint_transforms(rest, model.parents, pose.rotations, pose.translation)
@@ -481,10 +486,11 @@ def _movers(
     joints_used: Bool[np.ndarray, " j"],
     point_weights: Float[np.ndarray, "p j"],
 ) -> tuple[int, ...]:
-    """Returns the joints whose rotation moves a used joint or a point.
+    """Returns the indices of the joints whose rotation moves a used joint or a point.
 
-    These are the joints that carry a point, and all ancestors of them and of used joints. A used
-    joint itself is not among them for its own sake, because turning a joint does not move it.
+    These are the joints that carry a point with a weight above 0.1, and all ancestors of them and
+    of used joints. A used joint itself is not among them for its own sake, because turning a joint
+    does not move it.
 
     Arguments: joints_used: whether a landmark uses each joint, (j,). point_weights: skinning
     weights of the points, (p, j).
@@ -606,8 +612,8 @@ class _Finder:
         return head[(height > low) & (height < high)]
 
     def _on_midline(self, score: Score, highest: float = np.inf) -> int:
-        """Returns the vertex with the largest score among vertices at the front of the head, within
-        6 mm of the middle and below `highest` metres.
+        """Returns the number of the vertex with the largest score among vertices at the front of
+        the head, within 6 mm of the middle and below `highest` metres.
         """
         head = self._segment("head", "jaw")
         p = self.template[head]

@@ -1,10 +1,10 @@
 """Loads and saves bodies: the CC0 body of the package, a body file of the package's format, or an
 SMPL-X model.
 
-The package's body file is one small npz without pickles. Positions of shape directions are
-multiples of 10 micrometres in int16. Skinning weights are the entries of each vertex that are not
-0, in uint16. Indices are uint16 where they fit. `read_body` returns float32 weights whose rows sum
-to 1. SMPL-X's licence forbids redistribution, so users bring that file.
+The package's body file is one small npz without pickles. Shape directions are multiples of 10
+micrometres in int16 where they fit. Skinning weights are the entries of each vertex that are not 0,
+in uint16. Indices are uint16 where they fit. `read_body` returns float32 weights whose rows sum to
+1. SMPL-X's licence forbids redistribution, so users bring that file.
 """
 
 from importlib import resources
@@ -70,7 +70,8 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: naming file and key, for what cannot be read.
+        ValueError: if the file cannot be read. The message names the file and, for a wrong array,
+            the key.
         TypeError: for options of SMPL-X files given with another body.
 
     Examples:
@@ -106,8 +107,8 @@ def _indices(array: np.ndarray) -> np.ndarray:
 
 
 def _sparse_rows(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns columns and values, (rows, k) each, of the entries that are not 0. k is the largest
-    number of such entries in a row; shorter rows are padded with values of 0.
+    """Returns the columns and the values, (rows, k) each, of a matrix's entries that are not 0. k
+    is the largest number of such entries in a row; shorter rows are padded with values of 0.
     """
     count = max(1, int((matrix != 0).sum(1).max()))
     columns = np.argsort(-np.abs(matrix), axis=1, kind="stable")[:, :count]
@@ -120,7 +121,8 @@ def _dense_rows(
     """Returns the matrix (count, width) that `_sparse_rows` stored, scaled so that each row sums to
     1.
 
-    Raises: InvalidFileError if the arrays do not describe such a matrix.
+    rows: beginning of the key of the values. columns: key of the columns. Raises: InvalidFileError
+    if the arrays do not describe such a matrix.
     """
     check_limit("plain_bytes", 8 * count * width, "bytes of a matrix")
     check_indices(columns, arrays[columns], (count, None), width)
@@ -140,9 +142,10 @@ def _dense_rows(
 
 
 def save_body(path: str | Path, body: BodyModel) -> None:
-    """Writes a body model to a file, without pickles.
+    """Writes a body model to a file, without pickles. `texels` and `relative_vertex_spacing` are
+    not written.
 
-    Raises: ValueError for a body with pose directions, which this format does not hold.
+    Raises: ValueError for a body with pose directions, which this format does not hold; OSError.
     """
     if body.pose_directions is not None:
         raise ValueError(
@@ -189,7 +192,8 @@ def save_body(path: str | Path, body: BodyModel) -> None:
 def read_body(path: str | Path) -> BodyModel:
     """Returns the body model that `save_body` wrote.
 
-    Raises: ValueError, which names the file and the key, if the file is something else.
+    Raises: FileNotFoundError; ValueError, which names the file and the key, if the file is
+    something else.
     """
     with reading(path, "body file"):
         arrays, pickled = read_npz(path)
@@ -259,7 +263,7 @@ EXPRESSION_FIELDS = ("vertices", "directions", "joint_directions", "joint_turns"
 
 
 def expression_arrays(expressions: Expressions) -> dict[str, np.ndarray]:
-    """Returns the arrays of expressions by their key in files."""
+    """Returns the arrays of expressions by their keys in files."""
     found = {name: getattr(expressions, name) for name in EXPRESSION_FIELDS}
     return {
         f"{EXPRESSION}{name}": np.asarray(value)

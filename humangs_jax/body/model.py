@@ -86,7 +86,8 @@ def joint_transforms(
 
 
 def _product(a: Float[Array, "*b i j"], b: Float[Array, "*b j k"]) -> Float[Array, "*b i k"]:
-    """Returns the product of matrices by multiplying and adding, which is exact on every backend.
+    """Returns the product of matrices by multiplying and adding, which has full precision on every
+    backend.
 
     XLA's CPU compiler (jax 0.10 to 0.12) rejects the batched `dot` that two nested vmaps make of
     this product.
@@ -110,19 +111,20 @@ def blend_leg_weights(
     legs: Bool[Array, "2 j"],
     reach: float,
 ) -> Float[Array, "g j"]:
-    """Returns skinning weights (g, j) of points off the skin. Points between the legs take the mean
+    """Returns skinning weights (g, j) of points off the skin. Points between the legs get mean
     weights of the body around them, instead of those of one vertex.
 
     A hem that belongs to the vertices of one leg tears when the legs part. A point at a distance d
-    from its vertex takes the mean of the weights of the vertices around it, by a normal kernel
-    whose standard deviation is d. The point keeps its weights if d is less than 3/4 of `reach`, or
-    if one of the legs has no share in that mean, so hair and sleeves stay as they are. At most a
-    quarter of the points change, those with the largest d. LHM diffuses weights through a grid of
-    voxels to the same end (https://arxiv.org/abs/2503.10625).
+    from its vertex has a mean of the weights of the vertices around it, by a normal kernel whose
+    standard deviation is d. The point keeps its weights if d is less than 3/4 of `reach`, or if one
+    of the legs has no share in that mean, so hair and sleeves stay as they are. It has the mean
+    weights from 5/4 of `reach` on, if each leg has a share of a tenth, and a mixture in between. At
+    most a quarter of the points change, those with the largest d. LHM diffuses weights through a
+    grid of voxels to the same end (https://arxiv.org/abs/2503.10625).
 
     Arguments: points: in the rest pose, metres. distances: of each point from its vertex, metres.
-    weights: of the vertex of each point. legs: whether each joint belongs to each leg, (2, j).
-    reach: metres.
+    weights: of the vertex of each point. vertices, vertex_weights: of the body in the rest pose.
+    legs: whether each joint belongs to each leg, (2, j). reach: metres.
     """
     # every eighth vertex is enough to average skinning weights over centimetres
     near, near_weights = vertices[::8], vertex_weights[::8]
@@ -243,19 +245,25 @@ class BodyModel:
     faces: Int[Array, "f 3"]
     """Vertex indices, counter-clockwise seen from outside."""
     uvs: Float[Array, "u 2"] | None = None
-    """Texture coordinates, v up."""
+    """Texture coordinates, (u, 2), v up."""
     uv_faces: Int[Array, "f 3"] | None = None
-    """Indices into `uvs`."""
+    """Indices into `uvs` of the corners of each face, (f, 3)."""
     collapse_order: Int[Array, " n"] | None = None
-    """Order in which vertices vanish in progressive decimation, (n,): `body.resolution`."""
+    """Rank of each vertex in progressive decimation, (n,). 0 stays longest, n - 1 vanishes first.
+    None: `body.resolution` computes the ranks when they are needed.
+    """
     collapse_into: Int[Array, " n"] | None = None
-    """Vertex that each vertex is merged with, (n,), or None."""
+    """Vertex that each vertex moves onto when it vanishes, (n,). A vertex that never vanishes has
+    its own number. None: as for `collapse_order`.
+    """
     relative_vertex_spacing: Float[Array, " n"] | None = None
     """Distance to neighbouring vertices relative to the mesh before subdivision, (n,), see
     `body.resolution`. None: the mesh was not subdivided.
     """
     texels: Texels | None = None
-    """A map of the surface, for networks that work on one: `network.parts`."""
+    """The point of the surface that each texel of a map shows, for networks that work on one:
+    `network.parts`.
+    """
     expressions: Expressions | None = None
     """Expressions of the body's face. None: the face is rigid."""
     parents: tuple[int, ...] = static_field(default=())
@@ -359,7 +367,7 @@ def expressed(
     expressions: Expressions | None, rest: RestBody, pose: BodyPose
 ) -> tuple[RestBody, BodyPose]:
     """Returns the rest body with a pose's expression applied, and the pose without the expression.
-    Joints that the expression turns are turned in the returned pose.
+    The expression's turns of joints are added to the rotations of the returned pose.
 
     Raises: ValueError if the number of coefficients is not that of the body's expressions.
     """
@@ -405,6 +413,8 @@ def person_vertices(
 def pose_body(body: BodyModel, rest: RestBody, pose: BodyPose) -> PosedBody:
     """Returns a shaped body in a pose. Expression, pose correctives, blend skinning and translation
     are applied in this order.
+
+    Raises: ValueError if the number of coefficients is not that of the body's expressions.
     """
     rest, pose = expressed(body.expressions, rest, pose)
     vertices = rest.vertices

@@ -39,9 +39,11 @@ class Motion:
     """Names of the expressions, such as ARKit's "jawOpen"."""
 
     def pose(self, frame: int, expression_names: Sequence[str] = ()) -> BodyPose:
-        """Returns the pose of one frame. expression_names: expressions of the face that will move
-        (`avatar.expression_names`). The pose has coefficients for them if the motion has any of
-        them.
+        """Returns the pose of one frame.
+
+        expression_names: expressions of the face that will move (`avatar.expression_names`). The
+        pose has a coefficient for each of them if the motion has any of them; otherwise its
+        expression is None.
         """
         faces = self.expressions_of(expression_names)
         expression = None
@@ -112,8 +114,8 @@ def _between(
     next_translations: Float[Array, "m 3"],
     share: Float[Array, " m"],
 ) -> tuple[Float[Array, "m j 3"], Float[Array, "m 3"]]:
-    """Returns frames that lie between frames and the next ones, by the share of the next one, (m,),
-    0 to 1. Where the share is 0, it is the frame itself.
+    """Returns the rotations (m, j, 3) and translations (m, 3) between frames and the next ones.
+    share: of the next frame, (m,), 0 to 1. Where it is 0, the frame itself is returned.
     """
     turned = quaternion.interpolate(rotations, next_rotations, share[:, None])
     moved = translations + share[:, None] * (next_translations - translations)
@@ -121,12 +123,13 @@ def _between(
 
 
 def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion:
-    """Moves a motion by a constant so that the person starts at x = z = 0, and stands on y = 0
-    where the person is lowest.
+    """Moves a motion by a constant so that the root joint starts at x = z = 0, and the person
+    stands on y = 0 where the person is lowest.
 
     Arguments:
         rest: vertices and joints at rest of the body that will move. The lowest joint of the motion
-        decides the height. The sole is as far below it as it is below the lowest joint in T-pose.
+            decides the height. The sole is as far below it as it is below the lowest joint in
+            T-pose.
         parents: parents of the joints of that body.
     """
     moved = _on_the_floor(rest, parents, motion.rotations, motion.translations)
@@ -155,8 +158,8 @@ def turned_upright(
     up: str,
     pelvis: Float[np.ndarray, "3"] = PELVIS,
 ) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]:
-    """Turns a world so that its axis `up` becomes +y. Returns the rotations and translations of the
-    poses in the turned world. pelvis: root joint in T-pose, (3,), metres.
+    """Returns the rotations and translations of poses in a world that is turned so that its axis
+    `up` becomes +y. pelvis: root joint in T-pose, (3,), metres.
     """
     if up == "y":
         return rotations, translations

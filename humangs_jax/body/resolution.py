@@ -58,8 +58,9 @@ def split_long_edges(body: BodyModel, longest: float) -> tuple[BodyModel, sparse
     `relative_vertex_spacing` is the square root of the area around a vertex relative to its
     original area: 1/2 where every edge has been halved.
 
-    Returns: the finer body; a matrix (finer, n) that maps any quantity of the n original vertices
-    that is linear to the vertices of the finer body. A midpoint gets the mean of its ends.
+    Returns: the finer body, and a matrix (finer, n). The matrix maps values at the n original
+    vertices to the vertices of the finer body, for any quantity that is linear. A midpoint gets the
+    mean of its ends.
 
     Raises: ValueError if `longest` is not positive, or less than 1/64 of the longest edge.
     """
@@ -221,8 +222,8 @@ lips and eyelids in place.
 """
 VIEWS = 40
 CELL = 0.004
-"""Size of a depth-buffer cell, metres. It decides how narrow a gap may be and still let light
-through.
+"""Size of a depth-buffer cell, metres, for a body of a person's size. It decides how narrow a gap
+may be and still let light through.
 """
 RIDGE = 1e-13
 """Regularization of the normal equations, relative to their trace. Without it they are singular
@@ -244,8 +245,8 @@ def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> 
 
 
 def exposure(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Returns in which share of `VIEWS` parallel projections each vertex is visible, (n,), in [0,
-    1].
+    """Returns the share of `VIEWS` parallel projections in which each vertex is visible, (n,), in
+    [0, 1].
     """
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
@@ -387,8 +388,8 @@ def _vertex_quadrics(
 ) -> Float[np.ndarray, "n 11"]:
     """Returns the quadrics of the vertices, (n, 11).
 
-    Each is a sum over the faces of a vertex, weighted by area: the ten different entries of the
-    outer product of the plane (normal, d) with itself, and the area.
+    Each is a sum over the faces of a vertex, weighted by twice the area. It holds the ten different
+    entries of the outer product of the plane (normal, d) with itself, and the sum of the weights.
     """
     normal = face_crosses(vertices, faces)
     area = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -407,13 +408,14 @@ def _vertex_quadrics(
 def collapse_sequence(
     vertices: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the order in which the vertices of a triangle mesh collapse, and the vertex that each
-    one moves onto.
+    """Returns the rank of each vertex in the progressive decimation of a triangle mesh, and the
+    vertex that each one moves onto.
 
     Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3): faces of the texture, whose
     seams are kept closed; None: no texture.
-    Returns: order (n,), 0 for the vertex that stays longest; into (n,), the vertex that each one
-    moves onto, or its own number if it can never collapse.
+    Returns: order (n,), 0 for the vertex that stays longest and n - 1 for the one that collapses
+    first; into (n,), the vertex that each one moves onto, or its own number if it can never
+    collapse.
     """
     # what is hidden costs less, but for a few rings beside what is seen
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
@@ -457,7 +459,8 @@ def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> n
     body in every shape.
 
     The weights of a removed vertex move to the vertex that it ends on (`target`). Then the smallest
-    change of the weights near a joint removes the remaining error.
+    change of the weights near a joint removes the remaining error. kept: numbers of the kept
+    vertices.
     """
     regressor = np.asarray(body.joint_regressor, np.float64)
     moved = np.zeros_like(regressor)
@@ -519,7 +522,8 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
     This runs in numpy on the host. It takes about 0.1 s if the body holds its collapse order (the
     shipped one does), and seconds to find the order otherwise. The result holds its collapse order.
 
-    Raises: ValueError if vertex_count is larger than the body or too small for its topology.
+    Raises: ValueError if vertex_count is not positive, is larger than the body, or is too small for
+    its topology.
     """
     return decimate_with_kept(body, vertex_count)[0]
 

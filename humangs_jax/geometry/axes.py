@@ -1,4 +1,6 @@
-"""Axes of a world by name: finds which one points up, and the rotation that turns it to +y."""
+"""Finds which axis of a world points up, and the rotation that turns it to +y. Axes have names such
+as "-z".
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,7 @@ UPRIGHT = {
     "x": (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)),
     "-x": (np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)),
 }
-"""The rotation that turns the named axis to +y, as a quaternion (wxyz)."""
+"""The rotation that turns an axis to +y, a quaternion (wxyz), by the axis's name."""
 CLEARLY_UP = 0.5
 """Least mean cosine between the up direction of a person's pelvis and an axis of the world at which
 the person stands along that axis.
@@ -28,8 +30,8 @@ def upright_matrix(up: str) -> Float[np.ndarray, "3 3"]:
 
 
 def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
-    """Returns the name of the axis along which a vector points most, and the size of its component
-    there.
+    """Returns the name of the axis along which a vector points most, and the size of the vector's
+    component there.
     """
     axis = int(np.argmax(np.abs(direction)))
     sign = "-" if direction[axis] < 0 else ""
@@ -37,8 +39,8 @@ def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
 
 
 def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
-    """Returns the axis of the world along which the y axis of the pelvis points on average. Returns
-    None if it points along none clearly.
+    """Returns the name of the world's axis along which the y axis of the pelvis points on average.
+    Returns None if it clearly points along none.
 
     Arguments: root: axis-angle of the pelvis in each frame, (m, 3), radians.
     """

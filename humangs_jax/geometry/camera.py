@@ -24,8 +24,8 @@ from humangs_jax.geometry import transform
 from humangs_jax.geometry.lens import check_lens, distorted
 
 RIGID_TOLERANCE = 1e-3
-"""Largest difference of R R^T from the identity before a camera is refused. Calibrations are stored
-with few digits.
+"""Largest difference of R R^T from the identity, and largest skew relative to the focal length,
+before a camera is refused. Calibrations are stored with few digits.
 """
 LARGEST_NUMBER = 1e7
 """Largest focal length in pixels, and largest translation in metres. Larger numbers are faults, and
@@ -58,7 +58,9 @@ class Camera(Batchable):
     fisheye. None for no distortion.
     """
     lens: str = static_field(default="pinhole")
-    """ "fisheye": equidistant, fields of view below 180 degrees.
+    """The lens, "pinhole" by default.
+
+    "fisheye": equidistant, fields of view below 180 degrees.
 
     "orthographic": K is in pixels a metre, rays are parallel.
     """
@@ -79,9 +81,10 @@ class Camera(Batchable):
         Its numbers are float32, or float64 where JAX's `jax_enable_x64` is on and the arrays have
         it.
 
-        Raises: ValueError if a shape is wrong, a number not finite, a focal length not positive,
-        the rotation not orthonormal and right-handed (to 1e-3), the image empty, its sides no whole
-        numbers, or the coefficients not those of the lens.
+        Raises: ValueError if a shape is wrong, a number not finite or larger than 1e7, a focal
+        length not positive, K skewed, the rotation not orthonormal and right-handed (to 1e-3), the
+        image empty, its sides no whole numbers, the lens unknown, or the coefficients not those of
+        the lens.
         """
         # arrays of the type that is kept: float64 only if JAX has it
         given = K, cam_from_world, distortion
@@ -165,7 +168,9 @@ class Camera(Batchable):
         return replace(self, K=from_host(K * scale[:, None]), width=width, height=height)
 
     def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
-        """Returns the camera for the same world with all lengths divided by `unit`."""
+        """Returns the camera for the same world with all lengths divided by `unit`, which is in
+        metres.
+        """
         translation = self.cam_from_world[..., :3, 3] / unit
         moved = replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
         if self.lens != "orthographic":
@@ -176,7 +181,7 @@ class Camera(Batchable):
     def moved(self, twist: Float[Array, "*b 6"]) -> "Camera":
         """Returns the camera after a rigid motion in its own frame, exp(twist) `cam_from_world`.
 
-        twist: a rotation vector, radians, then a velocity, metres, in the camera's axes; for
+        twist: a rotation vector, radians, then a velocity, metres, in the camera's axes. It suits
         optimizers: zeros are no motion, and the result stays a rotation (`transform.from_twist`).
 
         Examples:
@@ -219,7 +224,7 @@ def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
 def stack_cameras(cameras: list[Camera]) -> Camera:
     """Returns a batch of cameras that have one image size and lens.
 
-    Raises: ValueError if these differ or the list is empty.
+    Raises: ValueError if image sizes or lenses differ or the list is empty.
     """
     if not cameras:
         raise ValueError("no cameras to stack")
@@ -234,8 +239,8 @@ def stack_cameras(cameras: list[Camera]) -> Camera:
 def project(
     camera: Camera, points: Float[Array, "*b 3"]
 ) -> tuple[Float[Array, "*b 2"], Float[Array, "*b"]]:
-    """Returns the pixel positions (..., 2) of world points in one camera, and their depths z,
-    metres.
+    """Returns the pixel positions (..., 2) of world points (..., 3), metres, in one camera, and
+    their depths z (...), metres.
 
     z = 0 is not guarded against: see `rendering.projection`.
     """
@@ -257,7 +262,8 @@ def project(
 
 
 def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, height: int) -> Matrix3:
-    """Returns the K of a camera with square pixels and a centred axis. vertical_fov: radians.
+    """Returns the K of a pinhole camera with square pixels and a centred axis. vertical_fov:
+    radians. width, height: pixels.
 
     Raises: ValueError for an angle that is not between 0 and pi.
     """

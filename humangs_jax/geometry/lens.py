@@ -33,7 +33,9 @@ RINGS = 16
 
 
 def check_lens(lens: object, count: int | None) -> None:
-    """Checks that a lens is known and has this number of coefficients. Raises: ValueError."""
+    """Checks that a lens is known and may have this number of coefficients. count: None for no
+    coefficients. Raises: ValueError.
+    """
     if lens not in COUNTS:
         raise ValueError(f"lens: expected {', '.join(COUNTS)}, got {lens!r}")
     allowed = COUNTS[str(lens)]
@@ -100,8 +102,10 @@ def distorted_with_slopes(
 def within_reach(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> Bool[Array, "*b"]:
-    """Says whether the image grows outwards all the way from the axis to a point: beyond that, a
-    lens's polynomial folds the image back over itself. Tangential terms are left out. No gradient.
+    """Says whether the image grows outwards all the way from the axis to each point (u, v). Beyond
+    that, a lens's polynomial folds the image back over itself.
+
+    Tangential and thin-prism terms of a pinhole are left out. The result has no gradient.
     """
     u, v = jax.lax.stop_gradient((u, v))
     if coefficients is None:

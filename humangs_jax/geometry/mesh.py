@@ -1,4 +1,6 @@
-"""Triangles and directions on the host, by numpy, in the precision of the arrays."""
+"""Computes areas, normals and edges of triangle meshes, and directions, on the host with numpy.
+Results have the precision of the arrays.
+"""
 
 import numpy as np
 
@@ -8,8 +10,8 @@ from humangs_jax.core.array_types import Bool, Float, Int
 def face_crosses(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "f 3"]:
-    """Returns the normals of the faces, (f, 3), each twice as long as the face's area. They point
-    outwards if corners go round counter-clockwise.
+    """Returns the normals of the faces, (f, 3), each with twice the face's area as its length. They
+    point outwards if corners go round counter-clockwise.
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
@@ -18,14 +20,14 @@ def face_crosses(
 def face_areas(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, " f"]:
-    """Returns areas of the faces, in the unit of the vertices squared."""
+    """Returns the areas of the faces, (f,), in the unit of the vertices squared."""
     return 0.5 * np.linalg.norm(face_crosses(vertices, faces), axis=-1)
 
 
 def vertex_areas(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns a third of the area of the faces around each vertex."""
+    """Returns a third of the area of the faces around each vertex, (n,)."""
     return np.bincount(faces.ravel(), np.repeat(face_areas(vertices, faces) / 3, 3), len(vertices))
 
 
@@ -74,8 +76,11 @@ def in_front(
     cell: float,
     behind: float,
 ) -> Bool[np.ndarray, " q"]:
-    """Says which of some points are at most `behind` behind the nearest of all points in their cell
-    of a grid across `forward`, metres.
+    """Says which of the points `some`, (q, 3), are the foremost ones, seen along `forward`.
+
+    The plane across `forward` has a grid of square cells. A point counts if it is less than
+    `behind` farther along `forward` than the nearest of `points`, (p, 3), in its cell, or if there
+    is none. cell: side of a cell. forward: a unit vector. All lengths are in one unit.
     """
     right = np.linalg.svd(forward[None])[2][1]
     frame = np.stack([right, np.cross(forward, right), forward])

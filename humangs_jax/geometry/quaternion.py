@@ -1,8 +1,8 @@
-"""Rotations: quaternions (w, x, y, z), axis-angle vectors and matrices.
+"""Converts rotations: quaternions (w, x, y, z), axis-angle vectors and matrices. Also finds
+singular vectors of 3x3 matrices.
 
 q = w + xi + yj + zk acts on column vectors by v' = q v q*. Axis-angle is the rotation vector theta
-* axis, in radians. Quaternions q and -q are the same rotation. At the end: singular vectors of 3x3
-matrices.
+* axis, in radians. Quaternions q and -q are the same rotation.
 """
 
 import jax.numpy as jnp
@@ -34,8 +34,8 @@ def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array,
 
 
 def between(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, "*b 4"]:
-    """Returns the shortest rotation from one unit vector to another; half a turn across `a` where
-    they are opposite.
+    """Returns the shortest rotation from unit vectors a to unit vectors b. It is half a turn about
+    an axis across `a` where they are opposite.
     """
     real = jnp.sum(jnp.square(a + b), axis=-1, keepdims=True) / 2  # 1 + a.b without cancellation
     across = jnp.cross(a, jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a), axis=-1)])
@@ -47,7 +47,8 @@ def between(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, 
 def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
     """Returns the rotation matrix of a unit quaternion.
 
-    For |q| != 1 the polynomial is used as it is (see `normalize`).
+    A quaternion of another length is not normalized first, so its matrix is no rotation (see
+    `normalize`).
     """
     w, x, y, z = jnp.moveaxis(q, -1, 0)
     rows = [
@@ -61,11 +62,12 @@ def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
 def candidates_from_matrix(
     m: Float[Array, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 4 4"], Float[Array, "*b 4"]]:
-    """Returns the four quaternions that a rotation matrix can be read as, and how well conditioned
-    each is.
+    """Returns the four quaternions that a rotation matrix can be read as, (..., 4, 4), and how well
+    conditioned each is, (..., 4).
 
-    q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)); candidate c is row c divided by 2 max(q_abs, 0.1). Of
-    a rotation they are all the same; of another matrix they are not.
+    The second result is q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)). Candidate c is row c divided by
+    2 max(q_abs, 0.1). For a rotation, candidates with q_abs of at least 0.1 are equal but for their
+    signs, and others are shorter. For another matrix they differ.
     """
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     squared = jnp.stack(
@@ -175,8 +177,8 @@ def left_singular_vectors(
     """Returns rotations U (det +1) and singular values s >= 0, in no particular order, with m m^T =
     U diag(s)^2 U^T.
 
-    Not meant to be differentiated: U is not unique where singular values coincide. A zero column is
-    completed to a rotation.
+    The results are not meant to be differentiated: U is not unique where singular values coincide.
+    Columns of U for singular values of 0 are completed to a rotation.
     """
     columns = [m[..., :, i] for i in range(3)]
     # cyclic Jacobi converges quadratically: 3x3 matrices reach float64's rounding after five sweeps
@@ -208,8 +210,9 @@ def _orthogonalize(
 def _complete_to_rotation(
     columns: Float[Array, "*b 3 3"], norms: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3 3"]:
-    """Returns rotations of the normalised two longest columns and their cross product. The
-    determinant is 1 even where columns vanish.
+    """Returns rotations whose columns are the directions of the two longest columns, made
+    orthogonal, and their cross product, each in its place. The sign of the last column is chosen so
+    that the determinant is 1, even where columns vanish.
     """
     order = jnp.argsort(-norms, axis=-1)
     first = jnp.take_along_axis(columns, order[..., None, 0:1], axis=-1)[..., 0]

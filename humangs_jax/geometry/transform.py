@@ -1,5 +1,5 @@
-"""Rigid and affine 4x4 transforms of column vectors, named by their frames: p_a = a_from_b p_b; and
-an order of points in space.
+"""Rigid and affine 4x4 transforms of column vectors, named by their frames: p_a = a_from_b p_b.
+Also ranks points along a curve through space.
 
 Products ask for full precision: accelerators otherwise round float32 factors to 8 or 10 bits, which
 is millimetres.
@@ -39,8 +39,8 @@ def apply(
 
 
 def invert_rigid(transform: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
-    """Returns the inverse of a rotation with translation (the linear part is not checked to be
-    orthogonal).
+    """Returns the inverse of a rotation with translation. Whether the linear part is orthogonal is
+    not checked.
     """
     rotation = jnp.swapaxes(transform[..., :3, :3], -1, -2)
     return make(
@@ -68,12 +68,12 @@ def from_twist(twist: Float[Array, "*b 6"]) -> Float[Array, "*b 4 4"]:
 
 
 BITS = 10
-"""Binary digits of a cell's number along an axis: there are 2^10 cells."""
+"""Binary digits of a cell's number along an axis. There are 2^10 cells along each axis."""
 
 
 def along_curve(positions: Float[Array, "n 3"], reach: float) -> Int[Array, " n"]:
-    """Returns the ranks of positions along a space-filling curve (Morton's) of the cube from -reach
-    to reach. Positions outside count as if on its border.
+    """Returns the rank of each position, (n,), along a space-filling curve (Morton's) of the cube
+    from -reach to reach. Positions outside count as if on its border.
     """
     cells = 2**BITS
     at = jnp.floor((positions / (2 * reach) + 0.5) * cells).astype(jnp.int32)

@@ -1,10 +1,10 @@
 """Reads and writes motions: one pose of the body per frame.
 
 `load_motion` reads any format of the table `data.formats.MOTIONS`. A motion in memory
-(`body.motion.Motion`) has SMPL-X's 55 joints, as axis-angles in radians; lengths are in metres, and
-y is up. The readers are in `arrays`, for files of arrays by key, `clips`, for skeletons of other
-programs, which `skeleton` converts to our joints, and `face_files`. `rules` has the tables that all
-readers and the page share.
+(`body.motion.Motion`) has axis-angles in radians; lengths are in metres, and y is up. It has
+SMPL-X's 55 joints, except from files of this package for other bodies. `arrays` reads files of
+arrays by key, `clips` reads skeletons of other programs, which `skeleton` converts to our joints,
+and `face_files` reads faces. `rules` has the tables that all readers and the page share.
 """
 
 import logging
@@ -45,11 +45,11 @@ OTHERS = {
         " .bvh"
     ),
 }
-"""Hints about files that cannot be read, by suffix."""
+"""Hints about files that are no motions, by suffix."""
 
 
 class MotionError(FileError):
-    """Says what is wrong with a motion file, in one line: file, key, and what was expected."""
+    """An error of one line about a motion file: file, key, and what was expected."""
 
 
 class Reading(NamedTuple):
@@ -67,15 +67,17 @@ class Poses(NamedTuple):
     """Poses and their rate as a reader returns them, in the world of the file."""
 
     rotations: Float[np.ndarray, "m j 3"]
-    """Rotation vectors of the joints, (m, 55, 3), radians."""
+    """Rotation vectors of the joints, (m, j, 3), radians. j is 55, except in files of this package
+    for other bodies.
+    """
     translations: Float[np.ndarray, "m 3"]
-    """Translations of the body, (m, 3)."""
+    """Translations of the body, (m, 3), metres."""
     fps: float
     """Frames per second."""
     up: str = "y"
-    """The axis of the world that is up."""
+    """Name of the axis of the world that is up."""
     fixed: bool = False
-    """Whether `up` is certain, so that poses are not asked, see `rules.up_axis`."""
+    """Whether `up` is certain. The poses are then not examined, see `rules.up_axis`."""
     also: tuple[str, ...] = ()
     """Other axes that are up in some files of the format, see `rules.up_axis`."""
     frames: np.ndarray | None = None
@@ -111,10 +113,11 @@ def load_motion(
         clip: the name or number of the animation, in a GLB file of several. None: the first.
 
     Returns:
-        Rotations, translations and frames per second.
+        Rotations, translations and frames per second, and expressions if the file has a face.
 
     Raises:
-        MotionError: one line naming file and key.
+        MotionError: of one line, which names the file and, if one is wrong, the key.
+        ValueError: for another `up`.
 
     Examples:
         >>> motion = hg.load_motion("dance.bvh", rest_joints=avatar.rest_joints)
@@ -203,9 +206,11 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
 def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motion, str]:
     """Fills frames in which nobody was seen, by interpolation between the frames around them.
 
-    Returns: the motion, and a note about filled frames, "" for none.
+    frames: number of each frame of the motion, (m,). Returns: the motion, and a note about filled
+    frames, "" if none was filled.
 
-    Raises: MotionError if the numbers of the frames do not increase.
+    Raises: MotionError if the numbers of the frames do not increase; InvalidFileError for more
+    frames than the limit.
     """
     steps = np.diff(np.asarray(frames, float))
     if not len(steps):
@@ -249,7 +254,7 @@ def _reader(path: Path) -> MotionFormat:
 def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
     """Returns the axis that is up in the world of poses, and a note, see `rules.up_axis`.
 
-    body: returns the joints of the body at rest.
+    body: function that returns the joints of the body at rest, (j, 3).
     """
     rotations, translations, usual = poses.rotations, poses.translations, poses.up
     stands = None
@@ -266,9 +271,10 @@ def _up_of(poses: Poses, body: Callable[[], np.ndarray]) -> tuple[str, str]:
 
 
 def save_motion(path: str | Path, motion: Motion, *, made_from: str | None = None) -> None:
-    """Writes a motion in the package's format, compressed, whole or not at all.
+    """Writes a motion as a compressed npz file in the package's format. If writing fails, the path
+    stays as it was.
 
-    made_from: what the motion was made from, for `made_from_of`.
+    made_from: what the motion was made from; `made_from_of` returns it. Raises: OSError.
     """
     arrays: dict[str, Any] = {
         "rotations": motion.rotations,
@@ -284,9 +290,8 @@ def save_motion(path: str | Path, motion: Motion, *, made_from: str | None = Non
 
 
 def made_from_of(path: Path) -> str | None:
-    """Returns what a motion was made from, as `save_motion` recorded it.
-
-    None: the file has no such record.
+    """Returns what a motion was made from, as `save_motion` recorded it. None if the file has no
+    such record or cannot be read.
     """
     try:
         arrays, _ = read_npz(path)

@@ -49,7 +49,11 @@ _MISSING_RATE = (
 
 
 def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
-    """Reads the poses of one person. Raises: MotionError, which names the key that is wrong."""
+    """Reads one person's poses, or the person's skeleton if the file has points in space.
+
+    Raises: MotionError, which names the wrong key or lists the people to choose from; FileError or
+    InvalidFileError if the file cannot be read.
+    """
     # the person that is asked for, and the format by its keys
     person = _chosen(path, read_people(path), options.person)
     form = format_of(person.values)
@@ -89,12 +93,13 @@ _EXPRESSIONS = ("expressions", "expression", "expressionParameters", "expr")
 
 
 def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
-    """Reads the expressions of a person; None if the file has none.
+    """Returns the expressions of a person, or None if the file has none.
 
     count: number of frames. If expressions in a file of another program do not fit the frames, a
     note is added and None is returned.
 
-    Raises: MotionError if expressions in a file of this package do not fit the frames.
+    Raises: InvalidFileError if expressions in a file of this package do not fit the frames or are
+    too large; MotionError if they are no numbers.
     """
     ours = form.kind == "ours"
     key = "expressions" if ours else file.first(_EXPRESSIONS)
@@ -156,14 +161,16 @@ def _frames(person: Person) -> int:
     return 0
 
 
-# _Rotations
+# Rotations
 # --------------------------------------------------------------------------------------------------
 
 
 def _posed(file: "_MotionFile", form: ArrayKeys) -> _Rotations:
-    """Reads the rotations of all joints (m, 55, 3) from the keys of the parts of the body.
+    """Returns the rotations of all joints (m, 55, 3), from the keys of the parts of the body.
 
     The number of frames m is that of the first key.
+
+    Raises: MotionError if an array is wrong.
     """
     rotations: _Rotations | None = None
     for place, key in form.poses.items():
@@ -204,7 +211,8 @@ def _part(
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
 ) -> _Rotations:
-    """Returns the rotations of one part of the body.
+    """Returns the rotations of one part of the body, (m, joints, 3). Hands in coefficients of a
+    model are 0, and a note is added.
 
     place: name of the part in `PLACES`. values: the array under the key. flat: the same array with
     one row for each frame.
@@ -233,10 +241,11 @@ def _all(
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
 ) -> _Rotations:
-    """Returns the rotations of a pose of which all joints are under one key.
+    """Returns the rotations of a pose of which all joints are under one key, (m, joints, 3), from
+    the root on.
 
-    For SMPL these are the joints of the body, for SMPL-H also those of the fingers. values, flat:
-    as in `_part`.
+    Of SMPL's they are the joints of the body, and of SMPL-H's also those of the fingers. values,
+    flat: as in `_part`.
 
     Raises: MotionError if no known layout has that many numbers.
     """
@@ -302,8 +311,10 @@ def _placed(
 ) -> Float[np.ndarray, "m 3"]:
     """Returns the translations (m, 3), metres.
 
-    Where the file has cameras that move, translations and the root's rotations, which are changed
-    in place, become those in the world.
+    Where the file has cameras that move, the translations and the root's rotations become those in
+    the world. The root's rotations are changed in place.
+
+    Raises: MotionError if the positions are missing or wrong.
     """
     # a file may have no positions
     count, key = len(rotations), file.first(form.moves)
@@ -348,9 +359,12 @@ def _placed(
 def _cameras(
     file: "_MotionFile", count: int
 ) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]] | None:
-    """Reads the rotations (m, 3, 3) and positions (m, 3) of the camera in the world.
+    """Returns the rotations (m, 3, 3) and positions (m, 3) of the camera in the world. None if the
+    file has no cameras.
 
-    There is one of each for all frames, or for each frame. None: the file has no cameras.
+    m is 1 if one camera stands for all frames, else the number of frames.
+
+    Raises: MotionError if the cameras do not fit the frames or are no rotations.
     """
     # one camera, or one of each frame
     if "cam2world" in file.values:
@@ -387,7 +401,7 @@ def _cameras(
 
 
 class _MotionFile(ArrayFile):
-    """The arrays of one person, the rate that is asked for, and notes for the user."""
+    """The arrays of one person, the rate that the user gave, and notes for the user."""
 
     def __init__(self, path: Path, person: Person, fps: float | None):
         super().__init__(path, person.values, person.pickled, MotionError)
@@ -399,7 +413,8 @@ class _MotionFile(ArrayFile):
         return next((key for key in keys if key in self.values), keys[0])
 
     def rate(self, form: ArrayKeys) -> float:
-        """Returns frames per second: those asked for, the file's, or the format's default.
+        """Returns the frames per second that the user gave, or else the file's, or else the
+        format's default.
 
         Raises: MotionError if there is none of these, or if the file's rate is not positive.
         """
@@ -450,13 +465,13 @@ RIG = {
     40: ("right_elbow", 39),
     42: ("right_wrist", 40),
 }
-"""Joints of the rig that are used, by index: the name, and the index of the parent."""
+"""Joints of the rig that are used, by index in the rig: the name, and the index of the parent."""
 RIG_JOINTS = 127
 """Number of joints of the rig."""
 
 
 def _clip_of_points(file: Any, fps: float) -> Clip:
-    """Reads a moving skeleton from the points of an `ArrayFile`.
+    """Reads a moving skeleton from the points of a `_MotionFile`. fps: frames per second.
 
     Raises: the file's error, which names the key that is wrong.
     """

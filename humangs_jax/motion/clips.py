@@ -302,8 +302,10 @@ def _joints(
 ) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
     """Returns the nodes that are joints, and the matrices of the joints when the skin was bound.
 
-    The matrices (4, 4) are by node. There are none if the file has no skin with such matrices; all
-    nodes are joints if it has no skin.
+    The joints are those of the skin that has the most, or all nodes if there is no skin. The
+    matrices (4, 4) are by node, and empty if the skin has none.
+
+    Raises: InvalidFileError for a joint that is no node, or for numbers that are not finite.
     """
     skins = [skin for skin in content.get("skins", []) if skin.get("joints")]
     if not skins:
@@ -367,6 +369,8 @@ def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
     """Returns evenly spaced times of frames (m,), seconds, and their rate in frames per second.
 
     The rate is that of the track with most times.
+
+    Raises: InvalidFileError if tracks have very different lengths.
     """
     first, last = (
         pick(times[end] for times, _, _ in tracks.values()) for pick, end in ((min, 0), (max, -1))

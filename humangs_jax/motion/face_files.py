@@ -150,9 +150,12 @@ def _standing(
     frames: np.ndarray | None = None,
     note: str = "",
 ) -> Poses:
-    """Makes poses of a person with this face, who stands with the arms down.
+    """Returns poses of a person with this face, who stands with the arms down.
 
-    values: coefficients of ARKit's shapes. head: rotations, axis-angle, radians.
+    values: coefficients of ARKit's shapes, (m, 52). head: rotations of the head, (m, 3),
+    axis-angle, radians.
+
+    Raises: InvalidFileError if a number is not finite.
     """
     track = FaceTrack(ARKIT, clipped(values))
     checked_track(track, len(values))
@@ -172,7 +175,11 @@ def _standing(
 
 
 def has_scores(path: Path) -> bool:
-    """Whether a JSON file is one of scores. Raises: FileError if it is no JSON."""
+    """Says whether a JSON file is one of scores.
+
+    Raises: FileNotFoundError; FileError if it is not JSON; InvalidFileError for a score that is no
+    number.
+    """
     return _frames_of(read_json(path)) is not None
 
 
@@ -271,8 +278,10 @@ def animated_face(
 ) -> tuple[FaceTrack | None, str]:
     """Returns the expressions of a GLB or VRMA file's animation as ARKit's shapes, and a note.
 
-    The note lists shapes that are not ARKit's, "" for none. The face is None if the animation has
-    no expressions. times: of the frames, seconds.
+    The note lists shapes that are not ARKit's, "" if there are none. The face is None if the
+    animation has no expressions, or none that is known. times: of the frames, (m,), seconds.
+
+    Raises: InvalidFileError if the animation's numbers are wrong.
     """
     tracks = _expression_tracks(content, binary, animation) or _weight_tracks(
         content, binary, animation

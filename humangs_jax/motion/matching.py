@@ -128,7 +128,9 @@ def _ancestors(parents: Sequence[int], joint: int) -> list[int]:
 
 
 def _place_pelvis(source: dict[str, int], parents: Sequence[int], hips: Sequence[int]) -> None:
-    """Sets the pelvis to the joint that both hips hang on, unless the named one is above them."""
+    """Sets the pelvis to the lowest joint above both hips, unless the joint that is named as the
+    pelvis is above both, too.
+    """
     above = [_ancestors(parents, hip)[1:] for hip in hips]
     common = [joint for joint in above[0] if joint in above[1]]
     if common and source.get("pelvis") not in common:
@@ -136,7 +138,7 @@ def _place_pelvis(source: dict[str, int], parents: Sequence[int], hips: Sequence
 
 
 def _descends(source: dict[str, int], parents: Sequence[int]) -> bool:
-    """Whether the joints of limbs hang below each other as they should, see UNDER."""
+    """Says whether the joints of limbs hang below each other as they should, see UNDER."""
     pairs = [(f"{side}_{a}", f"{side}_{b}") for a, b in UNDER for side in SIDES]
     return all(
         source[a] in _ancestors(parents, source[b])[1:]
@@ -208,9 +210,11 @@ def _limbs(
 
 
 def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
-    """Returns the joints where the two longest consecutive bones of a limb begin, meet and end.
+    """Returns the joints where the two long consecutive bones of a limb begin, meet and end, and
+    the next joint if there is one.
 
-    The next joint follows them if there is one. None: the limb has fewer than two bones.
+    The two bones are those of which the shorter one is longest. None: the limb has fewer than two
+    bones, or they have no length.
     """
     bones = lengths[path[1:]]
     if len(bones) < 2:
@@ -256,7 +260,9 @@ def _sided(
 
 
 def _side(plain: Sequence[str], limb: Sequence[int]) -> str:
-    """Returns "left" or "right" if the names of a limb all begin or end so, else ""."""
+    """Returns "left" or "right" if the names of a limb's first three joints all begin or end with
+    this word or its first letter, else "".
+    """
     for side in SIDES:
         if all(
             plain[j].startswith((side, side[0])) or plain[j].endswith((side, side[0]))

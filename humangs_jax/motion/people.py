@@ -40,11 +40,13 @@ _FRAMES = ("frame_ids", "frames", "frame", "frame_id")
 _FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
 """Sub-folders that may hold the files of a motion; "" is the folder itself."""
 _OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
-"""Suffixes of files that each have one person. Files with another suffix each have one frame."""
+"""Suffixes of files that each have the motion of a person, in a folder. Files with other suffixes
+each have one frame.
+"""
 _DEEPEST = 6
 """Number of levels of lists and maps in which people are looked for."""
 SHOWN = 12
-"""Largest number of keys that an error lists."""
+"""Largest number of keys or people that an error lists."""
 
 
 class Person(NamedTuple):
@@ -195,7 +197,11 @@ def _word(value: Any) -> str:
 
 
 def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person]:
-    """Returns the person of some values, or several whose arrays have a first axis of people."""
+    """Returns the people in some values. There are several if the arrays have a first axis of
+    people.
+
+    form: the format of the values. name: of the person if there is one.
+    """
     place, poses = next(iter(form.poses.items()))
     if poses not in values or not _of_several(values[poses], place, form):
         return [Person(name, values)]
@@ -223,7 +229,7 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
 
 
 def _of_several(poses: Any, place: str, form: ArrayKeys) -> bool:
-    """Whether the first axis of an array of roots or of whole poses is one of several people."""
+    """Says whether the first axis of an array of roots or of whole poses counts several people."""
     if place not in ("root", "all") or form.kind != "poses" or isinstance(poses, list):
         return False
     array = as_array(poses)
@@ -239,7 +245,7 @@ def _of_several(poses: Any, place: str, form: ArrayKeys) -> bool:
 
 
 def are_rotations(array: np.ndarray) -> bool:
-    """Whether the last two axes of an array are those of rotation matrices."""
+    """Says whether an array (..., 3, 3) consists of rotation matrices, to within `ORTHONORMAL`."""
     return (
         array.shape[-2:] == (3, 3)
         and _off_rotations(array) < ORTHONORMAL
@@ -292,7 +298,9 @@ def _listed_frames(content: Any) -> list[list[Person]] | None:
 
 
 def _tracked(image: Mapping[str, Any]) -> list[Person]:
-    """Returns the people that PHALP follows in an image, from lists with one entry a track."""
+    """Returns the people that PHALP follows in an image. The image has lists with one entry for
+    each person.
+    """
     lists = {key: objects(image.get(key)) for key in ("smpl", "tid", "camera")}
     tracks, cameras = lists["tid"], lists["camera"]
     people = []
@@ -310,10 +318,12 @@ def _tracked(image: Mapping[str, Any]) -> list[Person]:
 
 
 def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
-    """Reads the people of each frame: (name of the frame's file, people).
+    """Returns the people of each frame: (name of the frame's file, people).
 
-    If all names of files end in two numbers, and the first of these changes, a file has one person
-    in one frame. Otherwise a file has one frame.
+    If all names of files have at least two numbers, and the last but one differs between files, a
+    file has one person in one frame. Otherwise a file has one frame.
+
+    Raises: MotionError or InvalidFileError for a file that is no such frame.
     """
     numbers = [_numbers(file) for file in files]
     apart = all(len(each) > 1 for each in numbers) and len({each[-2] for each in numbers}) > 1

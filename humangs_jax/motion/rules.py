@@ -171,8 +171,8 @@ FEW = 5
 STANDING = -0.5
 """A rest pose is one to stand in if the cosine between legs and spine is less than this."""
 BETTER_TILT = np.radians(10)
-"""Radians. The joints that carry the hips give the rotation of the pelvis if their mean angle to
-the trunk is smaller by this much than that of the pelvis's joint.
+"""Angle in radians. The joints that carry the hips give the rotation of the pelvis if their mean
+angle to the trunk is smaller by this much than that of the pelvis's joint.
 """
 LARGEST_BEND = np.radians(60)
 """Largest mean angle between pelvis and lowest spine over the frames, radians. If it is larger, the
@@ -184,18 +184,20 @@ RATE_ROUNDING = 1e-4
 FLOOR_BAND = 0.05
 """The lowest joint is on the floor if it is within this distance of its usual height, metres."""
 STILL = (0.1, 0.3)
-"""A joint rests on the floor if it is slower than the first number, in metres per second, or than
-the second number times the mean speed of all joints.
+"""A joint rests on the floor if its speed is at most the first number, in metres per second, or at
+most the second number times the mean speed of all joints.
 """
 ON_THE_FLOOR = 0.5
-"""An axis has a floor if a joint rests on it in at least this share of the frames. Another axis has
-none if its share is at most half of that."""
+"""An axis has a floor if a joint rests on it in at least this share of the frames. Another axis
+then has none if its share is smaller than this, and at most half as large as that of the first
+axis.
+"""
 TREADMILL = 0.8
 """Where nothing rests on a floor, an unusual axis has a floor if the lowest joint is at one height
 in at least this share of the frames.
 """
 MOST_FRAMES = 1000
-"""Largest number of frames, evenly spread, in which a floor is looked for."""
+"""Largest number of pairs of successive frames, evenly spread, in which a floor is looked for."""
 HANDS = tuple(
     i for i, name in enumerate(JOINT_NAMES) if any(x in name for x in ("elbow", "wrist", *FINGERS))
 )
@@ -207,9 +209,9 @@ HANDS = tuple(
 
 
 def sampled_frames(count: int) -> np.ndarray:
-    """Returns indices of frames in which a floor is looked for: 0, 1, 40, 41, ...
+    """Returns indices of frames in which a floor is looked for, such as 0, 1, 40, 41, ...
 
-    They are evenly spread pairs of a frame and the next one.
+    They are evenly spread pairs of a frame and the next one, at most `MOST_FRAMES` pairs.
     """
     first = np.unique(
         np.linspace(0, max(count - 2, 0), min(max(count - 1, 1), MOST_FRAMES)).astype(int)
@@ -258,10 +260,10 @@ def up_axis(
 def _floors(
     points: Float[np.ndarray, "pairs s 3"], axes: Sequence[str], fps: float | int
 ) -> list[float]:
-    """Returns, for the usual axis and another one, the share of frames with a joint on a floor.
+    """Returns the share of frames with a joint on a floor, for the usual axis and for another one.
 
     The joint has to rest there. If that is rare for both axes, as on a treadmill, it only has to be
-    at one height, and the other axis needs a share of at least TREADMILL.
+    at one height, and the other axis needs a share of at least TREADMILL. points: as in `up_axis`.
     """
     moves = np.linalg.norm(points[1::2] - points[::2], axis=-1) * fps
     limit = max(STILL[0], STILL[1] * float(moves.mean()))

@@ -72,7 +72,8 @@ def bytes_of_clip(frames: int, joints: int) -> int:
 
 
 def whole_rate(fps: float) -> float:
-    """Rounds frames per second to a whole number where only the rounding of the file is between.
+    """Returns frames per second, rounded to a whole number if they differ from it only by the
+    rounding in files.
 
     A BVH file has 0.0083333 seconds per frame for 120 frames per second.
     """
@@ -140,8 +141,10 @@ _Source = Mapping[str, int]
 
 
 def _up_of(clip: Clip, source: _Source, scale: float, standing: bool) -> tuple[str, str]:
-    """Returns the axis that points up, and a note about it. A BVH file does not say which one it
-    is; a rest pose in which people stand shows it.
+    """Returns the axis that points up, and a note about it. A BVH file does not name this axis, but
+    a rest pose in which people stand shows it.
+
+    scale: metres of our body per unit of the clip. standing: whether people stand in the rest pose.
     """
     usual = "y"
     if standing:
@@ -370,7 +373,10 @@ def _steps_of_body(
     moves: Float[np.ndarray, "m 3"],
     source: _Source,
 ) -> Float[np.ndarray, " m"]:
-    """Returns how high the lowest joint of our feet is above its place in the T-pose, (m,)."""
+    """Returns the height of the lower foot of our body, (m,), metres. A joint of a foot is at
+    height 0 where it would be if the body stood in T-pose with its lowest joint of the feet at y =
+    0.
+    """
     places = {0: moves}
 
     def place(j):

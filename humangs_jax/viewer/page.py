@@ -2,7 +2,7 @@
 
 The page needs no network, and its Content-Security-Policy forbids all connections. Its code is in
 the files of page/ beside this module, which are joined into one file here. The avatar and its
-motion are in the page as 16-bit arrays, see `Packed`.
+motion are in the page as arrays, most of them of 16 bits, see `Packed`.
 """
 
 import base64
@@ -99,8 +99,9 @@ def pack(
     motion: None for a page without motion. body: the model to which the avatar's vertices belong,
     for sliders of shape; None: there are no sliders. motion_name: name that the page shows.
 
-    Raises: ValueError (one line) for numbers that are not finite or out of range, for a motion of
-    other joints, or for a body that does not explain the avatar's vertices.
+    Raises: ValueError (one line) for numbers that are not finite or out of range, for an avatar
+    without Gaussians or with more than 256 joints, for a motion of another number of joints, or for
+    a body that does not explain the avatar's vertices.
     """
     # a page with wrong numbers would show nothing and not say why
     check_values(
@@ -170,8 +171,8 @@ def largest_weights(
     """Returns the joints and the values of the 8 largest weights of each row, both (g, 8), largest
     first.
 
-    A value of 65535 is a weight of 1, and rows sum to 65535. Smaller weights are left out and
-    shared among the others in proportion. The largest one takes the error of rounding.
+    A value of 65535 is a weight of 1, and rows sum to 65535. Smaller weights are left out, and the
+    others are scaled to make up for them. The largest one takes the error of rounding.
     """
     weights = np.pad(
         np.asarray(weights, np.float64), ((0, 0), (0, max(0, WEIGHTS - weights.shape[1])))
@@ -186,7 +187,7 @@ def largest_weights(
 
 
 def _fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | None:
-    """Finds the shape coefficients, (s,), with which the body has the avatar's vertices. Returns
+    """Returns the shape coefficients, (s,), with which the body has the avatar's vertices. Returns
     None if the root-mean-square error is a millimetre or more, or if the numbers of vertices or
     joints differ.
     """
@@ -201,8 +202,8 @@ def _fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | 
 
 
 def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any, Any]]:
-    """Returns the values of avatar and motion that have to be finite, by name. Each comes with the
-    range `FINITE`.
+    """Returns the further arrays of avatar and motion that have to be finite, by name, each with
+    the range `FINITE`.
     """
     values = {
         name: (getattr(avatar, name), FINITE)
@@ -313,8 +314,9 @@ def page_html(
 ) -> str:
     """Returns the page as text.
 
-    motion: None for the walk that comes with the package, if the avatar has as many joints. title,
-    motion_name: names that the page shows.
+    motion: None for the walk that comes with the package, if the avatar has as many joints. The
+    page has at most 60 frames per second, and the person stands on the floor. title, motion_name:
+    names that the page shows.
 
     Raises: ValueError (one line) for an avatar or a motion that cannot be drawn, see `pack`.
     """
@@ -347,7 +349,8 @@ def write_page(
     title: str = "avatar",
     motion_name: str | None = None,
 ) -> int:
-    """Writes the page, whole or not at all. Returns its size in bytes.
+    """Writes the page to a file, and returns its size in bytes. If writing fails, the path stays as
+    it was.
 
     Raises: as `page_html`; OSError.
     """
