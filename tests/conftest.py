@@ -1,14 +1,13 @@
-"""Settings that every test shares: the compile cache, the switches of `.ci/run isa`, the shipped
-body.
+"""Settings that every test shares: the compile cache, switches of `.ci/run isa`, the shipped body.
 
 Environment variables:
 
-JAX_COMPILATION_CACHE_DIR: where compiled programs are kept; default `cache_folder()`.
-HUMANGS_TOLERANCE_SCALE: factor on all float32 bounds, see rounding.py.
-JAX_DISABLE_MOST_OPTIMIZATIONS: default 1: most of the time of a run is compilation; 0: as users
-compile.
-HUMANGS_PLAIN_COMPILER: if set, programs are compiled without `processes.CPU_COMPILER_OPTIONS` (wide
-vectors).
+- JAX_COMPILATION_CACHE_DIR: folder of compiled programs; `cache_folder()` by default.
+- HUMANGS_TOLERANCE_SCALE: factor on all float32 bounds, see rounding.py.
+- JAX_DISABLE_MOST_OPTIMIZATIONS: 1 by default, because most of the time of a run is compilation;
+  0 compiles as users do.
+- HUMANGS_PLAIN_COMPILER: if set, programs are compiled without `processes.CPU_COMPILER_OPTIONS`
+  (wide vectors).
 """
 
 import contextlib
@@ -35,9 +34,8 @@ if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and importlib.metadata.ve
         f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}".strip()
     )
 
-if (
-    signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-):  # in the background of a shell; programs that tests interrupt inherit it
+# in the background of a shell; programs that tests interrupt inherit it
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import jax

@@ -45,7 +45,7 @@ FAULTS = [
     (ATOMIC, "os.path.ismount(folder)", "False"),
     (ATOMIC, "if mark not in entries:", "if False:"),
     (ATOMIC, "if not overwrite:", "if False:"),
-    (ATOMIC, "fcntl.LOCK_EX | (0 if wait", "fcntl.LOCK_SH | (0 if wait"),
+    (ATOMIC, "fcntl.LOCK_EX | at_once", "fcntl.LOCK_SH | at_once"),
     (ATOMIC, "raise OSError(error.errno, error.strerror, str(path)) from error", "raise"),
     (ATOMIC, "tempfile.TemporaryFile(dir=place).close()", "pass"),
     (ATOMIC, "for each in new:  # the innermost first", "for each in ():"),
