@@ -26,9 +26,8 @@ PATCH = 8
 
 @functools.cache
 def small(name: str) -> HumanGSConfig:
-    config = SYSTEMS[name]("bench").with_runtime(
-        scan=True, token_capacity=0
-    )  # scan: compiles in less time
+    # scan: compiles in less time
+    config = SYSTEMS[name]("bench").with_runtime(scan=True, token_capacity=0)
     parts = config.architecture
     change = dataclasses.replace
     if name in PIXELS:

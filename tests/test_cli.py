@@ -90,9 +90,8 @@ def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, mo
     from humangs_jax.training import loop, sources
 
     def interrupted(*arguments, **options):
-        stopped = loop.TrainingInterrupted.__new__(
-            loop.TrainingInterrupted
-        )  # a whole state is not needed
+        # a whole state is not needed
+        stopped = loop.TrainingInterrupted.__new__(loop.TrainingInterrupted)
         stopped.state = SimpleNamespace(step=done)
         raise stopped
 

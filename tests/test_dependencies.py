@@ -21,9 +21,8 @@ NAMES = {
     "jaxlib": "jax",
     "yaml": "PyYAML",
 }
-NAMES |= dict.fromkeys(
-    ("backports", "compression"), "backports.zstd"
-)  # Python 3.14 has it as compression.zstd
+# Python 3.14 has it as compression.zstd
+NAMES |= dict.fromkeys(("backports", "compression"), "backports.zstd")
 """Distributions that are not called like their module."""
 UNTESTED = {"torch", "bpy"}
 """Distributions of scripts that made stored references, and of those that Blender runs."""

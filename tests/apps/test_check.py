@@ -322,6 +322,5 @@ def test_the_points_lie_on_the_body(right):
     points = surface_points(right.body, right.betas, right.poses, right.frames, 6000)[frame]
     vertices = np.asarray(person_vertices(right.body, jnp.asarray(right.betas), right.pose(frame)))
     nearest = np.array([np.linalg.norm(vertices - point, axis=1).min() for point in points[::60]])
-    assert (
-        np.median(nearest) < 0.02 and nearest.max() < 0.06
-    )  # half an edge, and what bends at a joint
+    # half an edge, and what bends at a joint
+    assert np.median(nearest) < 0.02 and nearest.max() < 0.06

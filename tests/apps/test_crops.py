@@ -122,7 +122,6 @@ def test_the_sheet_of_a_check_is_of_the_person(tmp_path):
     )
     sheet, _ = read_image(tmp_path / "check.png")
     assert len(report.views) == 3 and max(sheet.shape[:2]) < 300
-    body = (sheet.max(axis=-1) > 0.05) & (
-        sheet.min(axis=-1) < 0.95
-    )  # the hall is black, what is around tiles white
+    # the hall is black, what is around tiles white
+    body = (sheet.max(axis=-1) > 0.05) & (sheet.min(axis=-1) < 0.95)
     assert body.mean() > 0.1

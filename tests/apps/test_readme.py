@@ -168,9 +168,8 @@ def check_described_capture(text):
     np.testing.assert_array_equal(
         hg.load_capture("me").cameras.cam_from_world[0], capture.cameras.cam_from_world[0]
     )
-    np.testing.assert_allclose(
-        capture.cameras.center[0], [0, 0.9, 2.6], atol=1e-6
-    )  # 2.6 m in front, 0.9 m above the ground
+    # 2.6 m in front, 0.9 m above the ground
+    np.testing.assert_allclose(capture.cameras.center[0], [0, 0.9, 2.6], atol=1e-6)
 
 
 @pytest.mark.parametrize("page", ON_FILES)

@@ -188,9 +188,8 @@ def detected(mine, monkeypatch):
             np.concatenate([points[v], np.ones((33, 1))], axis=1), np.zeros((33, 3)), 1.0
         )
         mask = to_uint8(capture.masks[v])
-        bystander = PersonInPhoto(
-            person, mask[:60, :20], (0, 0), 2e5
-        )  # larger, but nobody's masks or keypoints are there
+        # larger, but nobody's masks or keypoints are there
+        bystander = PersonInPhoto(person, mask[:60, :20], (0, 0), 2e5)
         shown.append(
             PhotoPeople(
                 f"{name}.png",
@@ -371,9 +370,8 @@ def test_a_video_becomes_photos_beside_the_capture(tmp_path, monkeypatch, capsys
     Path("out/me_photos/masks").mkdir()
     shutil.copy(photos[0], "out/me_photos/masks")
     before = {path: path.stat().st_mtime_ns for path in photos}
-    assert (
-        cli.execute([command[0], "clips", *command[2:]]) == cli.BAD_DATA
-    )  # the only video of a folder
+    # the only video of a folder
+    assert cli.execute([command[0], "clips", *command[2:]]) == cli.BAD_DATA
     out = capsys.readouterr().out
     assert "3 of 15 frames" in out and "masks:     out/me_photos/masks" in out
     assert {path: path.stat().st_mtime_ns for path in photos} == before
@@ -530,9 +528,8 @@ def test_one_of_four_photos_is_kept_from_the_network_and_compared_with(body, toy
     given = []
     reconstructed(monkeypatch, body, lambda others: given.append(others.names) or 0.0)
     found = held_out_psnr({}, tiny(), toy, None)
-    assert (
-        set(toy.names) - set(given[0]) == {found.name} and len(given[0]) == 4
-    )  # a copy in its place
+    # a copy in its place
+    assert set(toy.names) - set(given[0]) == {found.name} and len(given[0]) == 4
     assert found.psnr > 25 and found.name in str(found)
     reconstructed(monkeypatch, body, lambda _: 0.15)
     assert held_out_psnr({}, tiny(), toy, None).psnr < found.psnr - 3

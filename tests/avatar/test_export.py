@@ -191,9 +191,8 @@ def test_viewers_that_add_their_own_low_pass_draw_what_we_draw(tmp_path_factory,
     theirs = project(load_gaussians(file), camera)
     for name in ("xx", "yy"):
         ratio = np.asarray(getattr(theirs, name)) / np.asarray(getattr(ours, name))
-        np.testing.assert_allclose(
-            ratio, 1, atol=0.02
-        )  # the viewers' 0.2 lie in the image, ours in the Gaussian
+        # the viewers' 0.2 lie in the image, ours in the Gaussian
+        np.testing.assert_allclose(ratio, 1, atol=0.02)
 
 
 def small_file(folder):
@@ -373,9 +372,8 @@ def test_splat_transform_makes_our_glb_of_our_files(name, tmp_path):
         if attribute == "COLOR_0":  # the tool writes sRGB-encoded values, glTF asks for linear ones
             continue
         other = nearest_ones[attribute]
-        if attribute.endswith(
-            "ROTATION"
-        ):  # half a turn about an axis of the Gaussian makes no other one
+        # half a turn about an axis of the Gaussian makes no other one
+        if attribute.endswith("ROTATION"):
             array, other = (
                 _covariances(q, s[PREFIX + "SCALE"])
                 for q, s in ((array, arrays), (other, nearest_ones))

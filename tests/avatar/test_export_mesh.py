@@ -200,9 +200,8 @@ def test_the_skin_moves_the_mesh_as_we_do(tmp_path, up):
     one, shape = avatar(), mesh()
     joints, kept = strongest(shape.weights)
     four = np.zeros_like(shape.weights)
-    np.put_along_axis(
-        four, joints, kept, axis=1
-    )  # ours with the weights that the file has room for
+    # ours with the weights that the file has room for
+    np.put_along_axis(four, joints, kept, axis=1)
     motion = grounded(dance(), RestBody(one.rest_vertices, one.rest_joints), PARENTS)
     write_mesh_glb(tmp_path / "a.glb", one, shape, motion, up=up)
     turn = np.asarray({"y": np.eye(3), "z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}[up], float)

@@ -122,14 +122,12 @@ def test_the_camera_goes_along_and_does_not_bob():
     still = frames.shot_cameras(shot, points, np.zeros(len(points)), None)
     assert np.ptp(pixels(still, points)[..., 1], axis=1).max() < 50
     middle = 0.5 * (seen.min(axis=1) + seen.max(axis=1))
-    assert (
-        np.abs(middle[:, 0] - 50).max() < 3
-    )  # in the middle of the image, at the ends of the walk, too
+    # in the middle of the image, at the ends of the walk, too
+    assert np.abs(middle[:, 0] - 50).max() < 3
     eyes = np.asarray(cameras.center)
     np.testing.assert_allclose(np.diff(eyes[:, 0]), 3.0 / 90, rtol=1e-2)
-    assert (
-        np.ptp(eyes[:, 1]) < 0.25 * 0.06
-    )  # the head moves by 0.06; at the ends the path is mirrored at a point of that
+    # the head moves by 0.06; at the ends the path is mirrored at a point of that
+    assert np.ptp(eyes[:, 1]) < 0.25 * 0.06
 
 
 def test_distance_and_angles_are_those_that_are_asked_for():
@@ -223,9 +221,8 @@ def test_a_loop_goes_on_where_it_was():
     motion = walk()
     twice = frames.trim_and_resample(motion, loop=3)
     path = np.asarray(twice.translations)
-    np.testing.assert_allclose(
-        np.diff(path[:, 2]), 0.05, atol=1e-5
-    )  # no step back, no step of another length
+    # no step back, no step of another length
+    np.testing.assert_allclose(np.diff(path[:, 2]), 0.05, atol=1e-5)
     np.testing.assert_allclose(path[24:48, 1], path[:24, 1], atol=1e-6)
     np.testing.assert_array_equal(twice.rotations[24:48], motion.rotations)
 

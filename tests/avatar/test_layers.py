@@ -45,9 +45,8 @@ def test_normals_are_turned_with_the_body():
     n = len(avatar.rest_vertices) // 2
     means = np.asarray(frames.posed(avatar, pose).means)
     radial = (means - np.repeat(posed_centres(), n, axis=0)) / RADIUS
-    np.testing.assert_allclose(
-        layers.gaussian_normals(avatar, pose), radial, atol=0.03
-    )  # of 320 flat faces
+    # of 320 flat faces
+    np.testing.assert_allclose(layers.gaussian_normals(avatar, pose), radial, atol=0.03)
     np.testing.assert_array_equal(layers.gaussian_parts(avatar), np.repeat([0, 1], n))
 
 
@@ -153,9 +152,8 @@ def test_layers_of_the_two_balls(tmp_path):
             b = ((eye - centre) * along).sum(-1)
             inside = b**2 - ((eye - centre) ** 2).sum() + RADIUS**2
             steep = inside > (0.6 * RADIUS) ** 2
-            grazed |= ~steep & (
-                inside > RADIUS**2 - (RADIUS + 4 * SPLAT) ** 2
-            )  # the pixel shows what lies behind, too
+            # the pixel shows what lies behind, too
+            grazed |= ~steep & (inside > RADIUS**2 - (RADIUS + 4 * SPLAT) ** 2)
             t = np.where(steep, -b - np.sqrt(np.maximum(inside, 0)), np.inf)
             hit_ball = np.where(t < hit_depth, i + 1, hit_ball)
             hit_depth = np.minimum(t, hit_depth)
@@ -168,9 +166,8 @@ def test_layers_of_the_two_balls(tmp_path):
         )
         radial = (surface - centres[hit_ball[hit] - 1]) / RADIUS
         assert ((normal[hit] * radial).sum(-1)).min() > 1 - NORMAL
-        np.testing.assert_allclose(
-            np.linalg.norm(normal[hit], axis=-1), 1, atol=2e-3
-        )  # half precision
+        # half precision
+        np.testing.assert_allclose(np.linalg.norm(normal[hit], axis=-1), 1, atol=2e-3)
         np.testing.assert_array_equal(view.channels["part"][hit], hit_ball[hit])
         nothing = view.rgba[..., 3] == 0
         assert nothing.any()

@@ -65,12 +65,12 @@ def test_renderers_add_what_the_scales_do_not_contain(draw):
         48,
     )[0]
     plain, less = replace(gaussians, pixel_footprint=None), SplatConfig(eps2d=MIP_EPS2D)
-    of_larger_pixels = replace(
-        gaussians, pixel_footprint=jnp.full_like(gaussians.opacities, 1.0)
-    )  # nothing is dimmed
+    # nothing is dimmed
+    of_larger_pixels = replace(gaussians, pixel_footprint=jnp.full_like(gaussians.opacities, 1.0))
+    # float32
     np.testing.assert_allclose(
         draw(of_larger_pixels, camera).rgb, draw(plain, camera, less).rgb, atol=1e-6
-    )  # float32
+    )
     assert jnp.abs(draw(gaussians, camera).rgb - draw(plain, camera).rgb).max() > 0.01
     none = SplatConfig(eps2d=0.0)
     np.testing.assert_array_equal(draw(gaussians, camera, none).rgb, draw(plain, camera, none).rgb)
@@ -162,9 +162,8 @@ def test_dimmed_splats_are_drawn_as_defined():
         48,
     )[0]
     drawn, exact = render(gaussians, camera), render_reference(gaussians, camera)
-    np.testing.assert_allclose(
-        drawn.rgb, exact.rgb, atol=1e-4
-    )  # float32; another order of operations
+    # float32; another order of operations
+    np.testing.assert_allclose(drawn.rgb, exact.rgb, atol=1e-4)
     undimmed = replace(gaussians, pixel_footprint=jnp.ones_like(gaussians.opacities))
     assert jnp.abs(render(undimmed, camera).alpha - drawn.alpha).max() > 0.05
 

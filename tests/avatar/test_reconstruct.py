@@ -263,9 +263,8 @@ def test_pose_correctives_move_what_the_network_reads_and_not_gaussians(body, ne
     assert np.abs(read - plain).max() > 0.01
     for x, expected in ((corrected, read), (body, plain)):
         own = jax.vmap(lambda r, t, x=x: person_vertices(x, views.betas, BodyPose(r, t)))
-        np.testing.assert_allclose(
-            own(views.rotations, views.translations), expected, atol=1e-5
-        )  # float32
+        # float32
+        np.testing.assert_allclose(own(views.rotations, views.translations), expected, atol=1e-5)
     pose = BodyPose(views.rotations[0], views.translations[0])
     moved = [skin(made(x, body.template, 0.01, views.betas), pose) for x in (corrected, body)]
     np.testing.assert_array_equal(moved[0].means, moved[1].means)
@@ -308,10 +307,11 @@ def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
     """The pixel at which a camera sees a point has the same color before and after cutting."""
     photos = capture(body, 48, 36)
     photos.masks[:] = 0
+    # the second reaches the border
     photos.masks[0, 10:26, 4:12], photos.masks[1, 20:48, 20:30] = (
         1,
         1,
-    )  # the second reaches the border
+    )
     photos.images[0, 16:20, 6:10] = [0.2, 0.4, 0.6]
     cut = cropped(photos, 18)
     assert cut.images.shape == (2, 18, 18, 3) and cut.cameras.width == cut.cameras.height == 18
@@ -345,9 +345,10 @@ def test_bodies_of_fewer_vertices_have_wider_gaussians(body):
     np.testing.assert_allclose(
         fewer.relative_vertex_spacing, np.sqrt(len(usual.template) / len(fewer.template)), rtol=1e-6
     )
+    # no fewer than usual
     assert (
         gaussian_body(body, config.with_runtime(body_vertices=900)).relative_vertex_spacing is None
-    )  # no fewer than usual
+    )
     with pytest.raises(
         ValueError, match="body_vertices asks for fewer vertices, max_edge_length for more"
     ):
@@ -406,9 +407,8 @@ def test_captures_made_by_hand_are_checked(body, change, message):
 @pytest.mark.slow
 def test_the_token_capacity_follows_the_photos(body, network):
     variables, config = network
-    photos = capture(
-        body, SIZE, SIZE, views=4
-    )  # full masks: 4 x 16 patches, more than the configuration's 48
+    # full masks: 4 x 16 patches, more than the configuration's 48
+    photos = capture(body, SIZE, SIZE, views=4)
     views = to_network_views(photos, SIZE)
     _, dropped = jax.jit(reconstruct_views, static_argnames="config")(
         variables, config, body, views
@@ -515,9 +515,8 @@ def test_the_body_is_displaced_by_the_capture_or_its_masks_if_the_network_looks_
     full = dataclasses.replace(photos, masks=np.ones_like(photos.masks))
     moved = lambda photos, config: prepare_capture(photos, config).displacement
     assert not moved(full, config).any()  # no body sticks out of masks that are full
-    assert (
-        moved(dataclasses.replace(full, masks=None), on) is None
-    )  # then the result is what it was, bit for bit
+    # then the result is what it was, bit for bit
+    assert moved(dataclasses.replace(full, masks=None), on) is None
     assert moved(full, on.with_conventions(**all_pixels)) is None and moved(full, off) is None
     given = outward(photos)
     for each in (given, dataclasses.replace(given, masks=None)):
@@ -560,15 +559,13 @@ def test_a_known_displacement_moves_the_skin_and_no_joint_alone_and_in_a_batch(b
     )
     bare = [capture_of(body, seed, views) for seed, views in enumerate((2, 1))]
     captures = [outward(bare[0]), dataclasses.replace(bare[1], masks=None)]  # with and without
-    still = dataclasses.replace(
-        bare[0], displacement=0 * captures[0].displacement
-    )  # whatever the masks say
+    # whatever the masks say
+    still = dataclasses.replace(bare[0], displacement=0 * captures[0].displacement)
     before, after = (reconstruct(variables, config, photos) for photos in (still, captures[0]))
     moved = np.asarray(after.rest_vertices - before.rest_vertices)
     np.testing.assert_allclose(moved[: len(body.template)], captures[0].displacement, atol=1e-6)
-    assert (
-        len(moved) > len(body.template) and np.median(np.linalg.norm(moved, axis=1)) > 0.009
-    )  # midpoints, too
+    # midpoints, too
+    assert len(moved) > len(body.template) and np.median(np.linalg.norm(moved, axis=1)) > 0.009
     np.testing.assert_array_equal(after.rest_joints, before.rest_joints)
     together = avatars_of(reconstruct_batch(variables, config, captures))
     for avatar, photos in zip(together, captures, strict=True):
@@ -657,9 +654,8 @@ def test_stacked_captures_are_a_batch_for_vmap(body, network):
     alone, _ = jax.jit(reconstruct_views)(
         variables, fitted, made, jax.tree.map(lambda x: x[0], views)
     )
-    assert (
-        alone.gaussians.means.shape == expected[0].gaussians.means.shape
-    )  # the configuration needs no static_argnums
+    # the configuration needs no static_argnums
+    assert alone.gaussians.means.shape == expected[0].gaussians.means.shape
 
 
 def test_views_and_bodies_of_another_configuration_are_refused(body, network):

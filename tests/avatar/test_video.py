@@ -57,9 +57,8 @@ def test_frames_come_back(tmp_path, name):
     back = read_back(tmp_path / name)
     assert back.shape == frames.shape
     assert np.abs(back - frames).mean() < (PALETTE_ERROR if name.endswith("gif") else H264_ERROR)
-    red = back[5, 12:20, 14:22].mean(
-        (0, 1)
-    )  # inside the square: the colors of the matrix that the file names
+    # inside the square: the colors of the matrix that the file names
+    red = back[5, 12:20, 14:22].mean((0, 1))
     np.testing.assert_allclose(red, [0.9, 0.1, 0.1], atol=0.03)
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
@@ -204,9 +203,8 @@ def test_mp4_says_its_speed_and_pixel_format(tmp_path):
     assert "Duration: 00:00:01.0" in message
     back = read_back(tmp_path / "a.mp4")
     assert back.shape[0] == 30
-    assert (
-        np.abs(back[:, :47, :63] - moving_square(30, 47, 63)).mean() < H264_ERROR
-    )  # padded, not resized
+    # padded, not resized
+    assert np.abs(back[:, :47, :63] - moving_square(30, 47, 63)).mean() < H264_ERROR
 
 
 @pytest.mark.parametrize(("fps", "count"), [(24, 24), (10, 24), (60, 12), (7.5, 24)])

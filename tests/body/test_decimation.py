@@ -38,9 +38,8 @@ def test_the_surface_stays_closed_and_solid(small, body):
     faces, vertices = np.asarray(small.faces), np.asarray(small.template)
     assert is_closed(faces)
     assert np.unique(faces).size == len(vertices)
-    assert len(faces) == 2 * len(vertices) - (
-        2 * body.template.shape[0] - body.faces.shape[0]
-    )  # Euler's formula
+    # Euler's formula
+    assert len(faces) == 2 * len(vertices) - (2 * body.template.shape[0] - body.faces.shape[0])
     assert areas(vertices, faces).min() > 1e-9
     full = signed_volume(body.template, body.faces)
     assert abs(signed_volume(vertices, faces) / full - 1) < 0.04
@@ -156,9 +155,8 @@ def test_a_body_without_collapses_finds_them():
     assert small.template.shape == (60, 3) and small.pose_directions.shape[0] == 60
     assert small.uvs is None and is_closed(np.asarray(small.faces))
     assert signed_volume(small.template, small.faces) > 0.9 * signed_volume(vertices, faces) > 0
-    assert np.array_equal(
-        decimate(small, 40).template, decimate(body, 40).template
-    )  # the result carries its own
+    # the result carries its own
+    assert np.array_equal(decimate(small, 40).template, decimate(body, 40).template)
 
 
 @pytest.mark.slow
@@ -172,9 +170,8 @@ def test_a_rim_stays_a_rim():
     assert np.allclose(
         np.asarray(small.template)[np.asarray(sorted(edges))][..., 1], lowest, atol=1e-6
     )
-    assert len({a for a, _ in edges}) == len(
-        edges
-    )  # one closed loop, each corner entered and left once
+    # one closed loop, each corner entered and left once
+    assert len({a for a, _ in edges}) == len(edges)
 
 
 @pytest.mark.slow

@@ -145,16 +145,14 @@ def test_limbs_bend_the_way_smplx_limbs_do(body, joints):
     assert (
         wrist[2] > joints["left_elbow"][2] + 0.15 and abs(wrist[0] - joints["left_elbow"][0]) < 0.02
     )
-    assert (
-        posed(right_knee=(np.pi / 2, 0, 0)).joints[8, 2] < joints["right_knee"][2] - 0.3
-    )  # the heel goes back
+    # the heel goes back
+    assert posed(right_knee=(np.pi / 2, 0, 0)).joints[8, 2] < joints["right_knee"][2] - 0.3
     arms = posed(left_shoulder=(0, 0, -1.2), right_shoulder=(0, 0, 1.2))
     assert np.asarray(arms.joints)[[20, 21], 1].max() < joints["left_shoulder"][1] - 0.3
     turned, template = posed(head=(0, 0.8, 0)), np.asarray(body.template)
     face = np.where(np.asarray(body.skinning_weights)[:, 15] > 0.9, template[:, 2], -1)
-    assert (
-        turned.vertices[int(np.argmax(face)), 0] > 0.04
-    )  # the nose goes towards the person's left
+    # the nose goes towards the person's left
+    assert turned.vertices[int(np.argmax(face)), 0] > 0.04
     assert np.allclose(turned.vertices[template[:, 1] < 0], template[template[:, 1] < 0], atol=1e-5)
 
 

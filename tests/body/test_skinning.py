@@ -30,9 +30,10 @@ def test_points_between_two_limbs_go_with_both_and_points_on_them_with_their_own
     np.testing.assert_allclose(found[:100], 0.5, atol=ATOL)
     np.testing.assert_array_equal(found[100:], own[100:])
     np.testing.assert_allclose(np.sum(found, axis=1), 1, atol=ATOL)
+    # two limbs that are no legs
     np.testing.assert_array_equal(
         blend_leg_weights(*arrays, legs[:1].repeat(2, 0) & False, 0.04), own
-    )  # two limbs that are no legs
+    )
 
 
 @pytest.mark.parametrize("distance", [0.05, 0.1])
@@ -46,13 +47,11 @@ def test_the_kernel_of_blended_leg_weights_is_as_wide_as_the_distance(distance):
         np.stack([x <= 0, x > 0], axis=1).astype(float),
     )
     at = distance * np.asarray([-0.8, -0.3, 0.0, 0.6])
-    points = np.stack([at, 0 * at, 0 * at], axis=1).repeat(
-        4, axis=0
-    )  # a quarter of the points change
+    # a quarter of the points change
+    points = np.stack([at, 0 * at, 0 * at], axis=1).repeat(4, axis=0)
     distances = np.where(np.arange(16) % 4 == 0, distance, 0.0)
     own = np.tile([1.0, 0.0], (16, 1))
     arrays = [jnp.asarray(each, jnp.float32) for each in (points, distances, own, vertices, of)]
     found = blend_leg_weights(*arrays, jnp.eye(2, dtype=bool), 0.04)
-    np.testing.assert_allclose(
-        found[::4, 1], ndtr(at / distance), atol=0.02
-    )  # every eighth vertex: steps of 2 mm
+    # every eighth vertex: steps of 2 mm
+    np.testing.assert_allclose(found[::4, 1], ndtr(at / distance), atol=0.02)

@@ -26,9 +26,8 @@ def test_edges_are_short_and_the_surface_is_the_same(coarse):
     x, corners = np.asarray(fine.template), np.asarray(fine.template)[np.asarray(fine.faces)]
     assert np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max() <= LONGEST
     assert len(x) > len(coarse.template)
-    assert is_closed(np.asarray(coarse.faces)) and is_closed(
-        np.asarray(fine.faces)
-    )  # no T-junction, no crack
+    # no T-junction, no crack
+    assert is_closed(np.asarray(coarse.faces)) and is_closed(np.asarray(fine.faces))
     for of in (area, signed_volume):
         np.testing.assert_allclose(
             of(fine.template, fine.faces), of(coarse.template, coarse.faces), rtol=1e-5

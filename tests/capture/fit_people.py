@@ -322,9 +322,8 @@ def seen_by(landmarks, matrices, *, seed=0, pixels=0.0, world=0.0, turn=0.0, siz
     own = []
     for each, middle in zip(local, hips, strict=True):
         x, y, z = middle
-        look = turned([0, np.arctan2(x, z), 0]) @ turned(
-            [-np.arctan2(y, np.hypot(x, z)), 0, 0]
-        )  # z to the ray
+        # z to the ray
+        look = turned([0, np.arctan2(x, z), 0]) @ turned([-np.arctan2(y, np.hypot(x, z)), 0, 0])
         own.append((each - middle) @ look @ turned(np.deg2rad(turn) * rng.normal(0, 1, 3)))
     own = size * np.asarray(own) + world * rng.normal(0, 1, local.shape)
     return PersonViews(

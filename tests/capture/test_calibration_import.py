@@ -94,9 +94,8 @@ def test_masks_of_avatarrex_and_colmap(rig, tmp_path):
     written.write_photos(images, [f"{c}/00000001.png" for c in NAMES])
     written.write_photos(images, [f"{c}/mask/pha/00000001.png" for c in NAMES], grey=True)
     import_cameras(rig[0], images, rig[2], masks=images, up="+y")
-    for view, name in zip(
-        views_of(rig[2]), NAMES, strict=True
-    ):  # not the photo of that name itself
+    # not the photo of that name itself
+    for view, name in zip(views_of(rig[2]), NAMES, strict=True):
         assert (rig[2] / view["mask"]).read_bytes() == (
             images / name / "mask/pha/00000001.png"
         ).read_bytes()

@@ -144,9 +144,8 @@ def test_dots_land_where_the_pinhole_says():
     for where in pinhole:
         near = straight * (np.hypot(columns - where[0], rows - where[1]) < 5)
         centroid = np.asarray([(near * columns).sum(), (near * rows).sum()]) / near.sum()
-        np.testing.assert_allclose(
-            centroid, where, atol=0.06
-        )  # of bilinear lookups; the dots move by up to 4.9 px
+        # of bilinear lookups; the dots move by up to 4.9 px
+        np.testing.assert_allclose(centroid, where, atol=0.06)
 
 
 @pytest.mark.parametrize(

@@ -57,9 +57,8 @@ def test_frames_of_several_videos_become_a_capture(tmp_path):
             photos.images[view], grey(view % 2, 2 * (view // 2)), atol=LEVELS
         )
     assert photos.masks is not None and photos.masks.min() > 0.98
-    assert sorted(p.name for p in rig[2].parent.iterdir()) == [
-        "out"
-    ]  # nothing is left of the frames
+    # nothing is left of the frames
+    assert sorted(p.name for p in rig[2].parent.iterdir()) == ["out"]
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
     report = import_cameras(*rig, masks=tmp_path / "masks", up="+y", frames=1, overwrite=True)
     assert (report.frames, report.views) == (1, 2)
@@ -69,10 +68,11 @@ def test_what_is_wrong_with_a_video_is_one_line(tmp_path):
     rig = write_rig(tmp_path)
     video = rig[1] / "b.mp4"
     whole = video.read_bytes()
+    # of a video
     playlists = (
         b"#EXTM3U\n#EXTINF:1,\na.mp4\n",
         b"ffconcat version 1.0\nfile a.mp4\n",
-    )  # of a video
+    )
     for content in (b"", whole[: len(whole) // 2], bytes(range(256)) * 40, *playlists):
         video.write_bytes(content)
         for read in (lambda: import_cameras(*rig, up="+y"), lambda: list(grey_frames(video, 480))):

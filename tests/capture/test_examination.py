@@ -142,9 +142,8 @@ def test_joints_that_turn_too_far(good):
     assert found[0, "right_elbow", "y"] == pytest.approx(np.rad2deg(0.27 - 0.15), abs=0.01)
     assert (1, "right_knee", "x") in found and (1, "left_knee", "x") not in found
     (warning,) = [warning for warning in examination.report.warnings if "beyond" in warning]
-    assert (
-        warning == "left_knee is 43 degrees beyond its limit about x, in frame 2"
-    )  # the elbow by 7 is no matter
+    # the elbow by 7 is no matter
+    assert warning == "left_knee is 43 degrees beyond its limit about x, in frame 2"
 
 
 def test_frames_and_views_without_keypoints(good):

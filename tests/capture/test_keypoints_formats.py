@@ -330,9 +330,8 @@ def test_a_person_of_our_detector_is_read_by_number(tmp_path, where):
         read(tmp_path / where)
     found = read(tmp_path / where, person=1)
     assert found.set is MEDIAPIPE_33 and found.missing == ("back",)
-    np.testing.assert_array_equal(
-        found.points[0], images[0].people[1].points[:, :2]
-    )  # no half pixel is added
+    # no half pixel is added
+    np.testing.assert_array_equal(found.points[0], images[0].people[1].points[:, :2])
     np.testing.assert_array_equal(found.confidences[2], images[2].people[1].points[:, 2])
 
 

@@ -121,9 +121,8 @@ def test_predicted_deviations_are_of_the_size_of_the_errors(noisy):
     found = fit_uncertainty(model_of(), seen, fit)
     errors = np.linalg.norm(np.asarray(fit.joints) - joints, axis=-1)
     ratio = np.sqrt((errors**2).mean() / (found.joint_std**2).mean())
-    assert (
-        0.3 < ratio < 1.5
-    )  # landmarks of hips and shoulders are trusted less than these true ones deserve
+    # landmarks of hips and shoulders are trusted less than these true ones deserve
+    assert 0.3 < ratio < 1.5
     names = model_of().joint_names
     share = {
         name: found.determined[:, names.index(name)].mean()
@@ -209,9 +208,8 @@ def test_a_fit_that_knows_the_places_recovers_the_body_and_one_that_does_not_is_
     plain = landmark_model(default_body(), MEDIAPIPE_33.names)
     joints, _, seen = observe(("standing",), noise=1.0, model=knowing)
     common = np.asarray(plain.known, np.float32)
-    seen = replace(
-        seen, confidences=seen.confidences * common
-    )  # without the points of the face that only places have
+    # without the points of the face that only places have
+    seen = replace(seen, confidences=seen.confidences * common)
     errors = {}
     for name, model in (("knowing", knowing), ("plain", plain)):
         fit = fit_landmarks(model, seen)
@@ -404,14 +402,14 @@ def test_landmarks_of_a_file_come_into_the_axes_of_the_camera(tmp_path):
     )
     keypoints = read_keypoints(tmp_path / "keypoints.json", capture.names, 64, 64)
     observations, _ = group_by_frame(capture, keypoints)
-    np.testing.assert_allclose(
-        observations.world[:, 0], points, atol=1e-3
-    )  # the file has tenths of a millimetre
+    # the file has tenths of a millimetre
+    np.testing.assert_allclose(observations.world[:, 0], points, atol=1e-3)
     few = [i for i, name in enumerate(MEDIAPIPE_33.names) if not name.endswith("hip")]
+    # one hip is enough; without any it is the middle of what is seen
     for rows in (
         [hips[0], few[0]],
         few,
-    ):  # one hip is enough; without any it is the middle of what is seen
+    ):
         confidences = np.zeros((2, 33))
         confidences[:, rows] = 1
         own = group_by_frame(capture, dataclasses.replace(keypoints, confidences=confidences))[

@@ -265,9 +265,8 @@ def test_landmarks_move_to_the_centroid_of_their_peak_only():
     heatmaps[6, 8, 0], heatmaps[6, 9, 0] = 0.6, 0.2
     heatmaps[6, 8, 1] = 0.4  # too low
     heatmaps[0, 15, 3] = 0.9  # at the border
-    points = (
-        np.asarray([[7.5, 5.5], [7.5, 5.5], [20.0, 3.0], [15.9, 0.1]]) / 16
-    )  # the third: outside of the heatmap
+    # the third: outside of the heatmap
+    points = np.asarray([[7.5, 5.5], [7.5, 5.5], [20.0, 3.0], [15.9, 0.1]]) / 16
     moved = refined(points, heatmaps) * 16
     np.testing.assert_allclose(
         moved, [[8.25, 6.0], [7.5, 5.5], [20.0, 3.0], [15.0, 0.0]], atol=ROUNDING

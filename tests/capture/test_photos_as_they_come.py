@@ -230,9 +230,8 @@ def spot(K, pose, lens, size):
 
 def centroid(image, near):
     columns, rows = np.meshgrid(np.arange(image.shape[1]) + 0.5, np.arange(image.shape[0]) + 0.5)
-    weights = image * (
-        np.hypot(columns - near[0], rows - near[1]) < 7
-    )  # a lens leaves white corners
+    # a lens leaves white corners
+    weights = image * (np.hypot(columns - near[0], rows - near[1]) < 7)
     return np.asarray([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
 
 

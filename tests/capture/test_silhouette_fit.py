@@ -351,9 +351,8 @@ def test_an_edge_before_the_body_is_no_boundary():
     vertices = np.concatenate([square, 0.3 * square - [0, 0, 0.5]]).astype(np.float32)
     faces = np.asarray([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
     image = view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera())
-    outwards = np.concatenate([square[:, :2]] * 2) / np.sqrt(
-        2
-    )  # normals of a flat mesh do not show its border
+    # normals of a flat mesh do not show its border
+    outwards = np.concatenate([square[:, :2]] * 2) / np.sqrt(2)
     image = BodyView(image.pixels, image.depths, outwards.astype(np.float32), image.covered)
     boundary = body_boundary(image, faces, body_edges(faces), COUNT)
     assert len(boundary.positions) == COUNT and boundary.ends.max() < 4
@@ -380,9 +379,8 @@ def test_points_find_the_mask_in_reach_and_tell_how_far_outside_they_are(sphere)
     matches = match(boundary, mask, other, 10.0, COUNT)
     assert matches.weights.shape == (2 * COUNT,) and float(matches.weights.mean()) == 1.0
     off = distances(matches, jnp.asarray(boundary.positions, jnp.float32))
-    np.testing.assert_allclose(
-        off, -gap, atol=0.35
-    )  # inside; polygons and the nearest of 90 points make up the rest
+    # inside; polygons and the nearest of 90 points make up the rest
+    np.testing.assert_allclose(off, -gap, atol=0.35)
     assert float(match(boundary, mask, other, 2.0, COUNT).weights.sum()) == 0, "out of reach"
     empty = np.zeros((SIDE, SIDE), np.float32)
     assert (

@@ -349,9 +349,8 @@ def test_frames_of_other_videos_are_as_stored_to_the_bit(filters, tmp_path):
     with Image.open(tmp_path / "one.png") as stored:
         expected = np.asarray(stored).astype(np.float32) / np.float32(255)
     np.testing.assert_array_equal(read_image(tmp_path / "all" / "00000000.png")[0], expected)
-    np.testing.assert_array_equal(
-        read_image(tmp_path / "one.png")[0], expected
-    )  # of a user who took the frames out
+    # of a user who took the frames out
+    np.testing.assert_array_equal(read_image(tmp_path / "one.png")[0], expected)
 
 
 @pytest.mark.parametrize(

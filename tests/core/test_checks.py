@@ -297,9 +297,8 @@ def test_what_is_natural_is_accepted():
         np.testing.assert_array_equal(hg.render(GAUSSIANS, CAMERA, background=name).rgb, black)
     fast = hg.render(GAUSSIANS, CAMERA, hg.SPLAT_PRESETS["fast"]).rgb
     np.testing.assert_array_equal(hg.render(GAUSSIANS, CAMERA, "fast").rgb, fast)
-    drawn = jax.jit(hg.render)(
-        GAUSSIANS, CAMERA, hg.SPLAT_PRESETS["fast"]
-    )  # a configuration needs no static_argnums
+    # a configuration needs no static_argnums
+    drawn = jax.jit(hg.render)(GAUSSIANS, CAMERA, hg.SPLAT_PRESETS["fast"])
     np.testing.assert_allclose(drawn.rgb, fast, atol=1e-6)
 
 

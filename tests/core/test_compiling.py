@@ -89,9 +89,8 @@ def test_the_environment_turns_it_off_or_moves_it(tmp_path, monkeypatch):
     assert folder is not None and folder.parent == tmp_path / "there"
     jax.config.update("jax_compilation_cache_dir", None)
     monkeypatch.delenv(OF_JAX)
-    assert (
-        enable_compile_cache(tmp_path / "here").parent == tmp_path / "here"
-    )  # an argument comes first
+    # an argument comes first
+    assert enable_compile_cache(tmp_path / "here").parent == tmp_path / "here"
 
 
 def test_a_cache_that_jax_has_already_stays(tmp_path):

@@ -20,9 +20,10 @@ def test_directions_over_many_decades(scale, seed):
 
 
 @pytest.mark.parametrize("largest", [1e-37, 1e-30, 1e25, 1e37])
+# denormals (also of 1 / x) are flushed to 0
 def test_directions_at_the_extremes_of_float32(
     largest,
-):  # denormals (also of 1 / x) are flushed to 0
+):
     x = jnp.asarray([largest, 0.5 * largest, 0.0], jnp.float32)
     unit = numerics.safe_normalize(x, jnp.asarray([0.0, 0, 1]))
     np.testing.assert_allclose(unit, np.asarray([1, 0.5, 0]) / np.sqrt(1.25), rtol=1e-5)

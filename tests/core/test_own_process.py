@@ -79,9 +79,8 @@ def test_an_interrupt_waits_for_the_end_of_the_block():
     assert done == ["all of it"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
     with undisturbed():
         pass
-    thread = threading.Thread(
-        target=lambda: undisturbed().__enter__()
-    )  # only the main thread may set handlers
+    # only the main thread may set handlers
+    thread = threading.Thread(target=lambda: undisturbed().__enter__())
     thread.start()
     thread.join()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -410,9 +410,8 @@ def test_betas_are_of_a_known_kind(kind, tmp_path):
     capture = capture_from_arrays(**given)
     np.testing.assert_array_equal(capture.betas, expected)
     save_capture(tmp_path / "me", capture)
-    again = load_capture(
-        tmp_path / "me", body=named(names[::-1])
-    )  # the file names them: their order is free
+    # the file names them: their order is free
+    again = load_capture(tmp_path / "me", body=named(names[::-1]))
     full = np.pad(capture.betas, (0, len(names) - len(capture.betas)))
     np.testing.assert_array_equal(
         np.pad(again.betas, (0, len(names) - len(again.betas))), full[::-1]

@@ -220,6 +220,5 @@ def test_the_border_of_a_photo_is_no_edge_of_the_person(body, dressed):
         for x in (fit_vertex_offsets(body, upper, inset=(0.0, 0.0)), coat)
     )
     errors = np.abs(found - true)
-    assert (
-        np.percentile(errors[free(body) > 0.99], 95) < COAT + FOUND
-    )  # what no photo shows stays where it was
+    # what no photo shows stays where it was
+    assert np.percentile(errors[free(body) > 0.99], 95) < COAT + FOUND

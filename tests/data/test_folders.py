@@ -47,9 +47,8 @@ def test_photos_win_over_the_clips_beside_them(suffix, rig):
         " and 1 more)" in str(report)
     )
     assert "not used: 4 videos" in str(inspect_folder(rig[1]))
-    assert (
-        imported(rig, frames=2, overwrite=True).frames == 2
-    )  # frames are asked for: of the videos
+    # frames are asked for: of the videos
+    assert imported(rig, frames=2, overwrite=True).frames == 2
     assert "4 photos beside the videos" in str(imported(rig, frames=2, overwrite=True))
 
 

@@ -159,9 +159,8 @@ def test_inputs_of_one_pose_stand_around_the_subject():
         inputs, _ = sample_views(np.random.default_rng(seed), subject, 4, sampling)
         assert len(set(subject.frames[inputs])) == 1
         gaps = np.diff(np.sort(azimuths[inputs]))
-        np.testing.assert_allclose(
-            gaps, np.pi / 2, atol=0.3
-        )  # cameras of a pose stand pi / 6 apart
+        # cameras of a pose stand pi / 6 apart
+        np.testing.assert_allclose(gaps, np.pi / 2, atol=0.3)
 
 
 def test_mixed_poses_are_mixed():
@@ -247,9 +246,8 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(
     read = []
 
     def reading(*arguments):
-        if (
-            threading.current_thread() is threading.main_thread()
-        ):  # threads of tests before this one may still be at it
+        # threads of tests before this one may still be at it
+        if threading.current_thread() is threading.main_thread():
             read.append(arguments)
         return read_view(*arguments)
 

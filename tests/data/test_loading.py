@@ -253,10 +253,11 @@ def test_people_of_another_split_are_refused(tmp_path):
         (tmp_path / f"{seed:07d}" / "capture.json").write_text("{}")
     (tmp_path / ".0000006.123").mkdir()
     (tmp_path / ".0000006.123" / "capture.json").write_text("{}")  # half written
+    # no manifest: not ours
     assert [f.name for f in find_people(tmp_path)] == [
         "0000005",
         "2000003",
-    ]  # no manifest: not ours
+    ]
     begin_set(
         tmp_path,
         SYNTHETIC,

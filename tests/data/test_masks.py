@@ -73,9 +73,8 @@ def grown(mask, pixels):
 
 
 @settings(max_examples=12, deadline=None)
-@given(
-    st.floats(1.3, 3.5), st.booleans(), st.integers(0, 1000)
-)  # below, what is found may be under the least that is moved
+# below, what is found may be under the least that is moved
+@given(st.floats(1.3, 3.5), st.booleans(), st.integers(0, 1000))
 def test_a_boundary_that_is_off_is_moved_back(pixels, larger, seed):
     mask = figure()
     wrong = grown(mask, pixels if larger else -pixels)

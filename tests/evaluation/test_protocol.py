@@ -122,8 +122,9 @@ def test_the_centred_window(seed):
 def test_the_centred_window_is_of_the_published_size():
     image, mask = blob(1, 256, 256)
     assert PROTOCOLS["ghg"].crop.cut(image, mask, 0.0).shape == (1000, 500, 3)
+    # narrower than the window
     assert CentredWindow().cut(image[:, :100], mask[:, :100] + 1, 0.0).shape == (
         1000,
         400,
         3,
-    )  # narrower than the window
+    )

@@ -118,9 +118,8 @@ def test_backgrounds_masks_and_crops_of_every_protocol():
     weight = masks[..., None]
     for name, protocol in PROTOCOLS.items():
         protocol = dataclasses.replace(protocol, lpips=("alex",))
-        if (
-            name == "ghg"
-        ):  # the window of a smaller image: programs are those of the other protocols
+        # the window of a smaller image: programs are those of the other protocols
+        if name == "ghg":
             protocol = dataclasses.replace(protocol, crop=CentredWindow(110, 70, 128))
         white = protocol.background != "black"
         ours = predicted if white else np.clip(predicted - (1 - weight), 0, 1)

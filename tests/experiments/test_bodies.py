@@ -42,9 +42,8 @@ def test_no_inner_edge_is_left_and_the_surface_stays(body):
     assert faces_at.max() == new_faces_at.max() == 2 and int(np.sum(new_faces_at == 1)) == rim
     kept = {tuple(edge) for edge in edges} & {tuple(edge) for edge in new_edges}
     assert len(kept) == rim  # an open edge of the old mesh is one of the new one
-    assert n - len(edges) + len(old) == len(other.template) - len(new_edges) + len(
-        new
-    )  # Euler's characteristic
+    # Euler's characteristic
+    assert n - len(edges) + len(old) == len(other.template) - len(new_edges) + len(new)
     assert np.isclose(volume(other.template, new), volume(body.template, old), rtol=0.05)
 
 

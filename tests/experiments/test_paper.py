@@ -34,9 +34,8 @@ PEOPLE = 20
 
 def run(psnr, photos=4, done=True, seed=0, counts=(), curve=(10.0, 12.0, 12.1)):
     """Returns the row of a run whose test people have a mean PSNR of `psnr`."""
-    spread = np.random.default_rng(0).normal(
-        0, 2, PEOPLE
-    )  # shared by all runs: people differ more than variants
+    # shared by all runs: people differ more than variants
+    spread = np.random.default_rng(0).normal(0, 2, PEOPLE)
     noise = np.random.default_rng(seed + 1).normal(0, 0.05, PEOPLE)
     values = (psnr + spread + noise).tolist()
     scores = {
@@ -120,9 +119,8 @@ def test_variants_differ_from_the_reference_in_what_they_are_about():
         {bench.folder_of(name) for name in queue}
     ) == len(queue)
     back, cross = queue["back_projection"].model, queue["cross_attention"].model
-    assert (
-        back.with_parts(reader=cross.architecture.reader) == cross
-    )  # they differ in the reader alone
+    # they differ in the reader alone
+    assert back.with_parts(reader=cross.architecture.reader) == cross
     assert all(bench.configuration(x, 0, 8).loss.squared == 1 for x in queue.values())
     order = train_all.queue(3)
     assert order[0] == ("paper", 0) and len(set(order)) == len(order) == 3 * len(queue)
@@ -140,9 +138,8 @@ def test_variants_differ_from_the_reference_in_what_they_are_about():
 
 def test_a_run_ends_when_a_round_gains_nothing_and_counts_if_it_beats_the_painted_body():
     enough = lambda *curve: bench.enough(list(curve), 8.0)
-    assert (
-        not enough() and not enough(9.0) and not enough(9.0, 9.5) and not enough(5.0, 5.1)
-    )  # below the painted body
+    # below the painted body
+    assert not enough() and not enough(9.0) and not enough(9.0, 9.5) and not enough(5.0, 5.1)
     assert (
         enough(10.0)
         and enough(9.0, 9.1)
@@ -283,9 +280,8 @@ def test_the_queue_trains_and_goes_on(tmp_path, monkeypatch):
         and len(row["scores"]["4"]["reconstruction"]["lpips_alex"]) == 2
     )
     before = (out / "results.json").stat().st_mtime_ns
-    assert (
-        call(train_all.paper, [str(out), "--quick", "--only", "gps"]) == 0
-    )  # nothing is left to do
+    # nothing is left to do
+    assert call(train_all.paper, [str(out), "--quick", "--only", "gps"]) == 0
     assert (out / "results.json").stat().st_mtime_ns == before
 
 

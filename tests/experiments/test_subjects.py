@@ -32,9 +32,8 @@ def test_photos_are_evenly_spaced_and_shared(person):
     away = np.asarray(four.cameras.center)[:, [0, 2]] - middle
     azimuths = np.arctan2(away[:, 0], away[:, 1])
     turns = np.diff(np.unwrap(azimuths))
-    assert np.all(
-        np.abs(np.rad2deg(turns) - 90) < 30
-    )  # jitter, and the middle is not quite what cameras look at
+    # jitter, and the middle is not quite what cameras look at
+    assert np.all(np.abs(np.rad2deg(turns) - 90) < 30)
     with pytest.raises(ValueError, match=r"\[1, 5, 7, 11\]"):
         person.inputs(12)
     with pytest.raises(ValueError, match="12 cameras"):

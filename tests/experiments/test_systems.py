@@ -40,9 +40,8 @@ PER_VIEW = (
 def photos(name, **changes):
     inputs = random_inputs(views=1 if name in ONE_PHOTO else 2, vertices=VERTICES, **changes)
     rng = np.random.default_rng(2)
-    weights = (
-        rng.dirichlet([1, 1, 1], (TEXELS, TEXELS)) * (np.arange(TEXELS) > 0)[:, None, None]
-    )  # a row shows nothing
+    # a row shows nothing
+    weights = rng.dirichlet([1, 1, 1], (TEXELS, TEXELS)) * (np.arange(TEXELS) > 0)[:, None, None]
     corners = rng.integers(0, VERTICES, (TEXELS, TEXELS, 3))
     texels = Texels(jnp.asarray(corners, jnp.int32), jnp.asarray(weights, jnp.float32))
     skinning = jnp.asarray(rng.dirichlet([1] * JOINTS, VERTICES), jnp.float32)
@@ -130,9 +129,8 @@ def test_background_tokens_are_left_out_alike_by_encoder_and_reader():
     inputs = replace(inputs, foreground=inputs.foreground.at[:, :16].set(False))
     packed = config.with_conventions(tokens="foreground")
     roomy = outputs_of("", inputs, packed)
-    close(
-        roomy, outputs_of("", inputs, packed.with_runtime(token_capacity=16))
-    )  # 2 views, 2 of 4 rows of 4 patches
+    # 2 views, 2 of 4 rows of 4 patches
+    close(roomy, outputs_of("", inputs, packed.with_runtime(token_capacity=16)))
     dropped = outputs_of("", inputs, packed.with_runtime(token_capacity=15))
     assert np.abs(dropped.colors - roomy.colors).max() > 1e-5
 
@@ -221,9 +219,8 @@ def test_a_seen_texel_has_the_color_of_the_pixel_that_sees_it_best_and_every_mea
     steps = np.broadcast_to(np.asarray(DISTANCES)[:, None, None], distances.shape)
     np.testing.assert_allclose(distances[shown], steps[shown], atol=1e-5)
     opaque = np.asarray(gaussians.opacities).reshape(distances.shape) > 0
-    np.testing.assert_array_equal(
-        opaque[0], texels.covered
-    )  # filled from neighbours where no photo sees it
+    # filled from neighbours where no photo sees it
+    np.testing.assert_array_equal(opaque[0], texels.covered)
     np.testing.assert_array_equal(opaque[1:], seen[1:])
 
 

@@ -167,9 +167,8 @@ def test_targets_ask_by_rays_and_their_pose_and_their_photos_are_not_read():
     assert np.abs(moved[..., 6:] - asked[..., 6:]).max() > 0.1
     blank = replace(TARGETS, images=0 * TARGETS.images, masks=0 * TARGETS.masks)
     others = ask(tube(), blank, config.with_conventions(pixels="person"))
-    np.testing.assert_allclose(
-        others, asked, atol=1e-6
-    )  # float32 rounding differs between two compiled programs
+    # float32 rounding differs between two compiled programs
+    np.testing.assert_allclose(others, asked, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -242,9 +241,8 @@ def test_a_frame_has_its_own_gaussians_and_untrained_corrections_are_none(name):
     frame, outputs = driven(name, variables=fresh)
     shown = jnp.clip(outputs.gaussians.colors, COLOR_MARGIN, 1 - COLOR_MARGIN)
     close(frame.gaussians, replace(outputs.gaussians, colors=shown), bound=2e-6)
-    assert (
-        np.abs(frame.tight_offsets[:, -1]).max() == 0
-    )  # the driver's; those of the decoder come first
+    # the driver's; those of the decoder come first
+    assert np.abs(frame.tight_offsets[:, -1]).max() == 0
 
 
 @pytest.mark.slow
@@ -332,9 +330,8 @@ def test_corrections_turn_gaussians_about_the_axes_of_the_body():
         opacities=jnp.asarray([0.5]),
         colors=jnp.full((1, 3), 0.5),
     )
-    raw = (
-        jnp.zeros((1, 14)).at[0, 3:7].set(jnp.asarray([half - 1, 0, 0, half]))
-    )  # added to the identity
+    # added to the identity
+    raw = jnp.zeros((1, 14)).at[0, 3:7].set(jnp.asarray([half - 1, 0, 0, half]))
     turned = apply_corrections(gaussians, raw, 0.1).gaussians
     long = quaternion.to_matrix(turned.quats)[0, :, 2]
     np.testing.assert_allclose(jnp.abs(long), [1, 0, 0], atol=1e-6)

@@ -141,9 +141,8 @@ def test_the_field_of_view_is_an_argument_of_transformations_too():
         return cameras.intrinsics_from_fov(angle, 64, 48)[1, 1]
 
     assert np.isclose(jax.jit(focal)(0.7), focal(0.7), rtol=1e-6)
-    assert np.isclose(
-        jax.grad(focal)(0.7), (focal(0.701) - focal(0.699)) / 0.002, rtol=1e-2
-    )  # of float32 differences
+    # of float32 differences
+    assert np.isclose(jax.grad(focal)(0.7), (focal(0.701) - focal(0.699)) / 0.002, rtol=1e-2)
 
 
 def test_neighbours_along_the_curve_are_neighbours_in_space():

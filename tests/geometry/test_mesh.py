@@ -27,9 +27,8 @@ directions = (
 def test_a_sphere_has_its_area_and_its_normals_point_outwards():
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=2.0)
     vertices, faces = np.asarray(sphere.vertices), np.asarray(sphere.faces)
-    assert face_areas(vertices, faces).sum() == pytest.approx(
-        16 * np.pi, rel=0.01
-    )  # of the polyhedron in it
+    # of the polyhedron in it
+    assert face_areas(vertices, faces).sum() == pytest.approx(16 * np.pi, rel=0.01)
     assert vertex_areas(vertices, faces).sum() == pytest.approx(sphere.area)
     crosses = face_crosses(vertices, faces)
     np.testing.assert_allclose(np.linalg.norm(crosses, axis=1), 2 * sphere.area_faces, atol=EXACT)
@@ -44,9 +43,8 @@ def test_the_smallest_turn_takes_one_direction_to_the_other(a, b):
     np.testing.assert_allclose(turn @ a, b, atol=1e-7)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=EXACT)
     angle = 2 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))
-    assert np.trace(turn) == pytest.approx(
-        1 + 2 * np.cos(angle), abs=1e-7
-    )  # no more than that angle
+    # no more than that angle
+    assert np.trace(turn) == pytest.approx(1 + 2 * np.cos(angle), abs=1e-7)
 
 
 def test_opposite_directions_are_half_a_turn_apart_and_nothing_turns_nothing():
@@ -65,9 +63,8 @@ def test_directions_are_spread_and_what_is_behind_is_not_seen():
     nearest = np.sort(directions @ directions.T, axis=1)[:, -2]
     assert np.degrees(np.arccos(nearest)).min() > 15
     start = [np.arctan2(x[2], x[0]) for x in (directions_around(48, turned=0.0)[0], directions[0])]
-    np.testing.assert_allclose(
-        start, [0, np.pi * (3 - np.sqrt(5)) / 2], atol=EXACT
-    )  # half a golden angle
+    # half a golden angle
+    np.testing.assert_allclose(start, [0, np.pi * (3 - np.sqrt(5)) / 2], atol=EXACT)
     x, y = np.meshgrid(np.arange(8.0), np.arange(5.0))
     wall = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
     for forward in (np.asarray([0, 0, 1.0]), np.asarray([0, 0, -1.0])):

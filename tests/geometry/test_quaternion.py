@@ -53,9 +53,8 @@ def test_between_turns_one_direction_into_the_other_the_short_way(seed, batch, c
     b = b / jnp.linalg.norm(b, axis=-1, keepdims=True)
     q = quaternion.between(a, b)
     turned = jnp.einsum("...ij,...j->...i", quaternion.to_matrix(q), a)
-    assert close(
-        turned, b, atol=1e-4 if case == "almost opposite" else 1e-5
-    )  # a + b, 0.01 long, has five digits
+    # a + b, 0.01 long, has five digits
+    assert close(turned, b, atol=1e-4 if case == "almost opposite" else 1e-5)
     assert close(jnp.linalg.norm(q, axis=-1), jnp.ones(batch))
     assert np.all(q[..., 0] >= 0)  # at most half a turn
     if case == "same":

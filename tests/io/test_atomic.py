@@ -175,9 +175,8 @@ def test_an_interrupt_while_the_old_folder_is_deleted_leaves_nothing_of_it(tmp_p
         remove(path, **options)
 
     monkeypatch.setattr(atomic.shutil, "rmtree", interrupted)
-    before = signal.signal(
-        signal.SIGINT, signal.default_int_handler
-    )  # shells start what runs in the background without it
+    # shells start what runs in the background without it
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
             atomic.replace_folder(folder, writes("new"), mark=MARK)
@@ -343,9 +342,8 @@ def test_only_folders_of_the_kind_are_replaced_and_none_that_holds_an_input(tmp_
         with pytest.raises(ValueError, match="lies in it and would be deleted"):
             atomic.check_replaceable(folder, mark=MARK, inputs=(None, given))
     (tmp_path / "loop").symlink_to("loop")
-    atomic.check_replaceable(
-        folder, mark=MARK, inputs=(tmp_path / "loop",)
-    )  # whoever reads it says what is wrong
+    # whoever reads it says what is wrong
+    atomic.check_replaceable(folder, mark=MARK, inputs=(tmp_path / "loop",))
     assert thesis.read_text() == "dear"
 
 

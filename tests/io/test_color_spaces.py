@@ -138,9 +138,8 @@ def test_sixteen_bits_are_converted_with_all_their_bits(tmp_path):
         srgb_to_light(deep / 65535) @ (np.linalg.inv(profiles.SRGB_TO_XYZ) @ profiles.P3_TO_XYZ).T
     )
     expected = light_to_srgb(np.clip(light, 0, 1))
-    np.testing.assert_allclose(
-        read_image(tmp_path / "a.png")[0], expected, atol=4e-4
-    )  # a tenth of a level of 8 bits
+    # a tenth of a level of 8 bits
+    np.testing.assert_allclose(read_image(tmp_path / "a.png")[0], expected, atol=4e-4)
 
 
 # A printer of yellow, magenta and cyan light, and one of inks

@@ -88,9 +88,8 @@ def test_enlarging_is_bicubic(size):
     """Pillow gives the same, but at the rim and outside of the image's range."""
     image = np.random.default_rng(0).random((31, 40), np.float32)
     theirs = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BICUBIC))
-    y, x = (
-        2 * new // old + 1 for new, old in zip(size[::-1], image.shape, strict=True)
-    )  # where a pixel beyond the rim counts
+    # where a pixel beyond the rim counts
+    y, x = (2 * new // old + 1 for new, old in zip(size[::-1], image.shape, strict=True))
     assert theirs.max() > 1
     inside = np.s_[y : size[1] - y, x : size[0] - x]
     np.testing.assert_allclose(
@@ -173,9 +172,8 @@ def test_heic_is_read_upright(tmp_path):
     pytest.importorskip("pi_heif")
     colors, alpha = read_image(HEIC)
     assert is_heic(HEIC) and colors.shape == (24, 32, 3) and alpha is None
-    np.testing.assert_allclose(
-        colors[0, 0], np.asarray([20, 40, 220]) / 255, atol=0.03
-    )  # compressed
+    # compressed
+    np.testing.assert_allclose(colors[0, 0], np.asarray([20, 40, 220]) / 255, atol=0.03)
     np.testing.assert_allclose(colors[-1, -1], np.asarray([200, 120, 40]) / 255, atol=0.03)
     assert orientation(HEIC) == 1 and focal_length(HEIC) == pytest.approx(26 * 40 / 43.27)
     try:

@@ -75,9 +75,8 @@ def test_without_tight_gaussians_there_is_no_tightness():
 def test_surfaces_are_compared_where_both_are_the_persons():
     rows = [[2.05, 2.05, 2.05, 5.0, 2.05], [1, 0, 0.5, 1, 1], [2, 2, 2, 2, 0], [1, 1, 0, 1, 1]]
     distance = surface_distance(*jnp.asarray(rows))
-    np.testing.assert_allclose(
-        distance, [0.05, 0, 0, FAR_SURFACE, 0], atol=FLOAT32
-    )  # a depth of 0 is unknown
+    # a depth of 0 is unknown
+    np.testing.assert_allclose(distance, [0.05, 0, 0, FAR_SURFACE, 0], atol=FLOAT32)
 
 
 def test_translucency_vanishes_for_opacities_of_0_and_1():

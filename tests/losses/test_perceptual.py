@@ -236,9 +236,8 @@ def test_equal_images_have_no_loss_and_a_finite_gradient(name):
     for x in (image, jnp.ones_like(image), jnp.zeros_like(image)):
         (value, _), gradient = with_gradient(weights, x, x)
         assert value < bound(EQUAL) and np.isfinite(gradient).all()
-        assert name == "vgg19" or np.abs(gradient).max() < bound(
-            EQUAL
-        )  # squares, which have no kink
+        # squares, which have no kink
+        assert name == "vgg19" or np.abs(gradient).max() < bound(EQUAL)
 
 
 def test_no_gradient_reaches_the_target_of_the_perceptual_loss():

@@ -62,9 +62,8 @@ def test_blur_has_the_gradient_of_its_definition():
     with jax.enable_x64(True):
         blurred, transpose = jax.vjp(blur, jnp.asarray(x))
         (back,) = transpose(jnp.asarray(y))
-    assert (
-        abs(np.vdot(blurred, y) - np.vdot(x, back)) < 1e-10
-    )  # <Ax, y> = <x, A^T y> of some hundred numbers
+    # <Ax, y> = <x, A^T y> of some hundred numbers
+    assert abs(np.vdot(blurred, y) - np.vdot(x, back)) < 1e-10
 
 
 def test_equal_images_have_no_dissimilarity_and_no_gradient():

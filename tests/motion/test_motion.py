@@ -365,9 +365,8 @@ def test_grounded_stands_on_the_floor_at_the_origin():
     )
     placed = grounded(motion, rest, PARENTS)
     shift = np.asarray(motion.translations - placed.translations)
-    np.testing.assert_allclose(
-        shift, np.broadcast_to(shift[0], shift.shape), atol=FLOAT32
-    )  # by a constant
+    # by a constant
+    np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=FLOAT32)
     joints = []
     move = jax.jit(joint_transforms, static_argnums=1)
     for i in range(FRAMES):
@@ -433,6 +432,5 @@ def test_the_shipped_walk(tmp_path):
     assert (joints["right_wrist"][:, 1] > joints["right_shoulder"][:, 1]).any()  # the wave
     step = np.diff(np.concatenate([motion.rotations, motion.rotations[:1]]), axis=0)
     steps = np.linalg.norm(step, axis=-1).max(axis=1)
-    assert (
-        steps[-1] <= steps[:-1].max() and steps.max() < 0.5
-    )  # the way back to the start is a step like the others
+    # the way back to the start is a step like the others
+    assert steps[-1] <= steps[:-1].max() and steps.max() < 0.5

@@ -296,9 +296,8 @@ class Network:
         d = np.einsum(
             "vab,vhwb->vhwa", c2w[:, :3, :3], d / np.linalg.norm(d, axis=-1, keepdims=True)
         )
-        o_ = np.broadcast_to(
-            c2w[:, None, None, :3, 3] / s, d.shape
-        )  # the release divides ray origins once more
+        # the release divides ray origins once more
+        o_ = np.broadcast_to(c2w[:, None, None, :3, 3] / s, d.shape)
         stages["out_ray_d"] = np.moveaxis(d, -1, 1)
 
         texture, position = self.state["neural_texture"], arrays["in_position_map"]

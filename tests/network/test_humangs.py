@@ -191,9 +191,8 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     roomy, exact, tight = TINY, *(TINY.with_runtime(token_capacity=n) for n in (5, 3))
     encoding, outputs = run(variables, inputs, roomy)
     exactly, same = run(variables, inputs, exact)
-    assert outputs.dropped_tokens == 0 and close(
-        (encoding.maps, outputs), (exactly.maps, same)
-    )  # padding is nothing
+    # padding is nothing
+    assert outputs.dropped_tokens == 0 and close((encoding.maps, outputs), (exactly.maps, same))
     touched = np.kron(foreground.reshape(2, 4, 8, 4, 8).any((2, 4)), np.ones((8, 8), bool))
     noise = jnp.where(touched[..., None], inputs.images, 0.123)
     assert close(encoding, run(variables, replace(inputs, images=noise), roomy)[0])
@@ -300,12 +299,10 @@ def gradients(variables, continuous, inputs, config):
 def test_gradients_are_finite_and_reach_every_parameter():
     inputs = random_inputs()
     cameras = inputs.cameras
-    posed = (
-        inputs.posed_vertices.at[:, 0].set(cameras.center).at[:, 1].set(2 * cameras.center)
-    )  # in and behind the camera
-    inputs = replace(
-        inputs, depth_maps=inputs.depth_maps.at[:, :16].set(-1.0)
-    )  # some vertices are seen by none
+    # in and behind the camera
+    posed = inputs.posed_vertices.at[:, 0].set(cameras.center).at[:, 1].set(2 * cameras.center)
+    # some vertices are seen by none
+    inputs = replace(inputs, depth_maps=inputs.depth_maps.at[:, :16].set(-1.0))
     continuous = {
         "posed_vertices": posed,
         "images": inputs.images,

@@ -94,9 +94,8 @@ def test_conventions():
     mixed = texel_indices(pixels, (16, 8), (4, 2), "mixed")
     ndc = pixels / jnp.asarray([16, 8]) * 2 - 1
     assert np.allclose(mixed, (ndc + 1) / 2 * jnp.asarray([3, 1]))
-    assert np.allclose(
-        mixed[1], texel_indices(pixels, (16, 8), (4, 2), "half_pixel")[1]
-    )  # equal in the middle only
+    # equal in the middle only
+    assert np.allclose(mixed[1], texel_indices(pixels, (16, 8), (4, 2), "half_pixel")[1])
 
 
 def test_half_pixel_sampling_reproduces_a_ramp_at_any_resolution():

@@ -35,9 +35,8 @@ def test_projection_is_the_cameras():
     )
     pixels, depths = project_vertices(AXIS_CAMERA, points)
     expected, z = project(AXIS_CAMERA, points)
-    assert np.allclose(pixels, expected, atol=1e-3) and np.allclose(
-        depths, z
-    )  # 1e-6 in z moves a pixel by 1e-5
+    # 1e-6 in z moves a pixel by 1e-5
+    assert np.allclose(pixels, expected, atol=1e-3) and np.allclose(depths, z)
 
 
 @pytest.mark.parametrize("z", [0.0, -1e-6, 1e-6, -2e-6, 1e-30, -1.0, -1e-3])
@@ -51,9 +50,9 @@ def test_projection_is_finite_in_and_behind_the_camera_plane(z):
 def test_visibility(convention):
     depth_map = jnp.full(SIZE[::-1], -1.0).at[4:12, 8:24].set(2.0)
     pixels = jnp.asarray([[16.0, 8], [16, 8], [16, 8], [2, 2], [40, 8], [16, -1], [16, 8]])
-    depths = jnp.asarray(
-        [2.0, 2.045, 2.055, 2, 2, 2, -1]
-    )  # units: 5 cm behind the surface is hidden
+    # units: 5 cm behind the surface is hidden
+    depths = jnp.asarray([2.0, 2.045, 2.055, 2, 2, 2, -1])
+    # seen, just so, hidden, background, outside x 2, behind
     expected = [
         True,
         True,
@@ -62,7 +61,7 @@ def test_visibility(convention):
         False,
         False,
         False,
-    ]  # seen, just so, hidden, background, outside x 2, behind
+    ]
     assert np.array_equal(visible_vertices(pixels, depths, depth_map, SIZE, convention), expected)
 
 
@@ -154,10 +153,11 @@ def test_at_the_edge_of_a_mask_a_shell_has_the_color_of_the_person_alone():
         jnp.where(mask[:, None], images, 1.0),
         jnp.broadcast_to(mask, (1, *SIZE[::-1])),
     )
+    # at the middle: the mask's edge
     vertex, normal = (
         jnp.asarray([[[0.0, 0.0, 2.0]]]),
         jnp.asarray([[[0.0, 0.0, -1.0]]]),
-    )  # at the middle: the mask's edge
+    )
     nothing = jnp.full((1, *SIZE[::-1]), -1.0)
     read_one = jax.jit(
         lambda *arrays: sample_shells(*arrays, (0.0,), jnp.ones(1, bool), "half_pixel")
@@ -193,9 +193,8 @@ def scene(views=VIEWS):
     centre = (np.stack(np.meshgrid(np.arange(SIDE), np.arange(SIDE)), -1) + 0.5 - SIDE / 2) / float(
         cameras.K[0, 0, 0]
     )
-    sine = np.linalg.norm(centre, axis=-1) / np.sqrt(
-        1 + np.sum(centre**2, -1)
-    )  # of the angle off the axis
+    # of the angle off the axis
+    sine = np.linalg.norm(centre, axis=-1) / np.sqrt(1 + np.sum(centre**2, -1))
     ray = lambda radius: 4 * sine < radius
     depth = 4 / (1 + np.sum(centre**2, -1)) - np.sqrt(
         np.maximum(BODY**2 - (4 * sine) ** 2, 0)
@@ -244,9 +243,8 @@ def test_hull_and_share_tell_how_far_the_coat_reaches():
     away = lateral(points, arguments[3])
     certain = np.all(np.abs(away - COAT) > 2 * LATERAL, axis=0)
     inside = away < COAT
-    assert (
-        np.sum(certain) > 20 and np.sum(~inside.all(0) & certain) > 20
-    )  # the test tests something
+    # the test tests something
+    assert np.sum(certain) > 20 and np.sum(~inside.all(0) & certain) > 20
     assert np.allclose(shells.inside[certain, 3], inside.mean(0)[certain], atol=1e-5)
     assert np.allclose(shells.hull[certain, 3], inside.all(0)[certain], atol=1e-5)
 
@@ -257,9 +255,8 @@ def test_colors_are_of_the_views_that_face_the_point():
     shells = read(arguments)
     first = np.asarray(arguments[3].center[0]) / 4
     front = np.asarray(arguments[-1]) @ first > 0.95
-    assert np.sum(front) > 2 and np.all(
-        shells.colors[front, :3, 0] > 0.8
-    )  # neighbouring views see it at a slant
+    # neighbouring views see it at a slant
+    assert np.sum(front) > 2 and np.all(shells.colors[front, :3, 0] > 0.8)
     back = np.asarray(arguments[-1]) @ first < -0.3
     assert np.allclose(shells.colors[back, :3], [0, 1, 0], atol=1e-5)
     level = np.abs(np.asarray(arguments[-1])[:, 1]) < 0.9
@@ -317,9 +314,8 @@ def test_the_background_lends_no_color():
     assert np.allclose(shells.colors[outside, 3], UNSEEN_COLOR) and not np.any(
         shells.seen[outside, 3]
     )
-    assert np.sum(known) > 20 and np.allclose(
-        shells.colors[known, 3, 2], 0, atol=1e-5
-    )  # red and green, never white
+    # red and green, never white
+    assert np.sum(known) > 20 and np.allclose(shells.colors[known, 3, 2], 0, atol=1e-5)
 
 
 def test_a_vertex_is_on_the_person_if_any_photo_shows_the_person_at_any_distance():

@@ -221,9 +221,8 @@ def test_every_damaged_byte_is_noticed_or_harmless(tmp_path):
     numbers = np.arange(40, dtype=np.float32)
     path = write_checkpoint(tmp_path / "a.pt", {"model": {"w": FakeTensor(numbers)}})
     states, noticed, size = damaged(path)
-    assert all(
-        np.array_equal(state["w"], numbers) for state in states
-    )  # a time stamp, an unused field
+    # a time stamp, an unused field
+    assert all(np.array_equal(state["w"], numbers) for state in states)
     assert noticed > size / 6
 
 

@@ -166,9 +166,8 @@ def test_outputs_are_those_of_the_quarters():
 
     rest = {k: VARIABLES["params"][k] for k in ("input_norm", "norm")}
     short = network(dataclasses.replace(CONFIG, layers=4))
-    quarters = short.apply(
-        {"params": {**blocks(4), **rest}}, TOKENS
-    )  # 1, 2, 3, 4 of 6: here 1, 3, 4, 6
+    # 1, 2, 3, 4 of 6: here 1, 3, 4, 6
+    quarters = short.apply({"params": {**blocks(4), **rest}}, TOKENS)
     assert np.allclose(outputs[0], quarters[0], atol=BLOCKS_TOLERANCE) and np.allclose(
         outputs[1], quarters[2], atol=BLOCKS_TOLERANCE
     )

@@ -221,9 +221,8 @@ def test_a_person_twice_as_large_has_gaussians_twice_as_large():
         np.testing.assert_allclose(
             getattr(two.gaussians, name), factor * getattr(one.gaussians, name), rtol=1e-5
         )
-    np.testing.assert_allclose(
-        two.tight_offsets, one.tight_offsets, rtol=1e-5
-    )  # in normalised units
+    # in normalised units
+    np.testing.assert_allclose(two.tight_offsets, one.tight_offsets, rtol=1e-5)
     height = float(jnp.ptp(inputs.canonical_vertices[:, 1]))
     np.testing.assert_allclose(
         one.gaussians.scales, jax.nn.softplus(-3.0) * height / 1.8, rtol=0.02

@@ -160,9 +160,8 @@ def test_gradients_are_those_of_the_squared_error(scene):
 
 
 def test_the_background_says_nothing_of_colors_but_something_of_the_rest(scene):
-    photo = replace(
-        scene[1], mask=jnp.round(scene[1].mask)
-    )  # the rims of Gaussians stand before the background
+    # the rims of Gaussians stand before the background
+    photo = replace(scene[1], mask=jnp.round(scene[1].mask))
     black = replace(photo, image=photo.mask[..., None] * photo.image)
     before, after = (np.asarray(signals_of(scene, x).gradients) for x in (photo, black))
     np.testing.assert_allclose(

@@ -123,9 +123,8 @@ def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
     views_alone, _ = refine_views(
         own, views, STEPS, SplatConfig(max_pairs=1 << 14, max_rows=1 << 13), 0
     )
-    np.testing.assert_allclose(
-        squared_error(views_alone, capture), errors[0], rtol=0.01
-    )  # dimmed, as above
+    # dimmed, as above
+    np.testing.assert_allclose(squared_error(views_alone, capture), errors[0], rtol=0.01)
 
 
 @pytest.mark.slow
@@ -139,9 +138,8 @@ def test_photos_from_near_and_far_are_fitted_together(body, person):
     )
     nearest = pixel_sizes(avatar, crop_to_person(prepare_capture(photos)))
     np.testing.assert_array_equal(report.avatar.gaussians.pixel_footprint, nearest)
-    assert jnp.median(nearest) < 0.5 * 12.0 / float(
-        photos.cameras.K[0, 0, 0]
-    )  # heads and feet are not in all frames
+    # heads and feet are not in all frames
+    assert jnp.median(nearest) < 0.5 * 12.0 / float(photos.cameras.K[0, 0, 0])
 
 
 def test_what_no_photo_has_in_its_frame_has_the_pixels_of_the_rest(person):

@@ -97,9 +97,8 @@ def check_sweep(scene):
     exact = cases.reference_in_float64(scene)
     outcome = cases.compare(scene, cases.tiled(scene), exact)
     assert outcome.finite
-    if outcome.image >= bound(
-        DECISION
-    ):  # then it must be a decision: with more digits the same program is right
+    # then it must be a decision: with more digits the same program is right
+    if outcome.image >= bound(DECISION):
         assert cases.compare(scene, cases.tiled_in_float64(scene), exact).image <= cases.FLOAT64, (
             outcome
         )

@@ -95,9 +95,8 @@ def assert_lengths(ours, expected, counts):
 
 def assert_rounded(found, exact):
     """Checks float32 results against the bounds of their float64 analysis."""
-    assert (
-        exact.decided
-    )  # no alpha at its threshold, no pixel at its stop: float32 decides as float64
+    # no alpha at its threshold, no pixel at its stop: float32 decides as float64
+    assert exact.decided
     for name, a, b, most in zip(
         ("features", "transmittance", "sums", "peaks"), found, exact, exact.bounds, strict=False
     ):
@@ -122,9 +121,8 @@ def assert_equal_in_float32(splats, lists, grid, config, per_step=1024):
     for found in (ours, expected):
         assert_rounded(found, exact)
     assert_lengths(ours[-1], expected[-1], lists.counts)
-    for values, most in zip(
-        exact[:2], exact.bounds, strict=False
-    ):  # so tight that a wrong decision, 4e-3, would show
+    # so tight that a wrong decision, 4e-3, would show
+    for values, most in zip(exact[:2], exact.bounds, strict=False):
         assert np.median(most[values != 0] / values[values != 0]) < 1e-4
     return ours, expected
 
@@ -147,9 +145,8 @@ def test_equals_the_other_schedule(dtype, tile_size, per_step):
             )
             assert_equal(ours, expected, lists.counts)
         ended = np.asarray(expected[-1])
-        assert (
-            K < ended[1] < 3 * K and ended[1] % K != 0
-        )  # the whole tile ends inside a chunk that is not its first
+        # the whole tile ends inside a chunk that is not its first
+        assert K < ended[1] < 3 * K and ended[1] % K != 0
         assert not ours[0][0].any() and (ours[1][0] == 1).all()  # the empty list
 
 
@@ -226,9 +223,8 @@ def test_steps_are_bounded_in_memory():
         b = accelerators._chunks_per_step(TileGrid(512, 512, tile_size), dtype, 1 << 20, 1024)
         assert 1 <= b <= accelerators.STEP_CHUNKS
         assert b * K * tile_size**2 * np.dtype(dtype).itemsize <= accelerators.STEP_BYTES
-    assert (
-        accelerators._chunks_per_step(GRID, np.float32, 2 * K, 6) == 8
-    )  # no more than there can be
+    # no more than there can be
+    assert accelerators._chunks_per_step(GRID, np.float32, 2 * K, 6) == 8
 
 
 @pytest.mark.parametrize("platform", ["cuda", "tpu"])

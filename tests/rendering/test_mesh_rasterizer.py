@@ -257,9 +257,8 @@ def test_of_equal_depths_the_lowest_face_wins_whatever_the_step():
 def test_edges_belong_to_the_face():
     vertices = np.array([[0.5, 0.5, 1], [4.5, 0.5, 1], [0.5, 4.5, 1]], np.float32)
     ids = np.asarray(draw(vertices, np.array([[0, 1, 2]]), flat_camera()).face_ids)
-    expected = (
-        np.add.outer(np.arange(HEIGHT), np.arange(WIDTH)) <= 4
-    )  # the centres on both axes and on the diagonal too
+    # the centres on both axes and on the diagonal too
+    expected = np.add.outer(np.arange(HEIGHT), np.arange(WIDTH)) <= 4
     np.testing.assert_array_equal(ids == 0, expected)
 
 
@@ -359,9 +358,8 @@ def test_vmap_equals_loop_and_steps_do_not_matter():
         WIDTH,
         HEIGHT,
     )
-    moved = (
-        jnp.asarray(vertices) * jnp.asarray([1.0, 0.3, 1.2])[:, None, None]
-    )  # different numbers of steps
+    # different numbers of steps
+    moved = jnp.asarray(vertices) * jnp.asarray([1.0, 0.3, 1.2])[:, None, None]
     batch = jax.vmap(lambda v, camera: draw(v, faces, camera))(moved, cameras)
     for i in range(3):
         one = draw(moved[i], faces, cameras[i], RasterConfig())
@@ -419,9 +417,8 @@ def test_gradients_reach_attributes_and_nothing_else():
     ids = np.asarray(fragments.face_ids)
     np.add.at(expected, SQUARE_FACES[ids[ids >= 0]], np.asarray(fragments.barycentrics)[ids >= 0])
     np.testing.assert_allclose(to_attributes[:, 0], expected, rtol=1e-5)
-    np.testing.assert_allclose(
-        to_attributes.sum(), 100, rtol=1e-5
-    )  # the square holds 10 x 10 pixel centres
+    # the square holds 10 x 10 pixel centres
+    np.testing.assert_allclose(to_attributes.sum(), 100, rtol=1e-5)
 
 
 TEXEL_ROUNDING = 2e-6

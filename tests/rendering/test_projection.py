@@ -89,9 +89,8 @@ def test_determinant_of_a_needle_is_accurate_in_float32():
     rounded = project(gaussians(np.float32), camera(np.float32))
     np.testing.assert_allclose(rounded.determinant, exact.determinant, rtol=FLOAT32)
     xx, xy, yy = (np.asarray(plane) for plane in (rounded.xx, rounded.xy, rounded.yy))
-    assert (
-        np.abs((xx * yy - xy * xy) / np.asarray(exact.determinant) - 1).max() > 0.01
-    )  # what this guards against
+    # what this guards against
+    assert np.abs((xx * yy - xy * xy) / np.asarray(exact.determinant) - 1).max() > 0.01
 
 
 def test_what_is_not_drawn_is_finite_and_passes_no_gradient():

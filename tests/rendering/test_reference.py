@@ -60,20 +60,20 @@ def test_one_isotropic_gaussian_is_a_round_blob():
 def test_nearer_covers_farther_whatever_the_order():
     gaussians = on_axis([3.0, 2.0], [0.6, 0.5], [[1.0, 0, 0], [0, 1.0, 0]])
     rendering = render_reference(gaussians, axis_camera())
-    np.testing.assert_allclose(
-        rendering.rgb[4, 4], [0.3 + 0.2, 0.5 + 0.2, 0.2], atol=EXACT
-    )  # on white
+    # on white
+    np.testing.assert_allclose(rendering.rgb[4, 4], [0.3 + 0.2, 0.5 + 0.2, 0.2], atol=EXACT)
     np.testing.assert_allclose(rendering.alpha[4, 4], 0.8, atol=EXACT)
     np.testing.assert_allclose(rendering.depth[4, 4], (0.5 * 2 + 0.3 * 3) / 0.8, atol=EXACT)
 
 
 def test_a_pixel_ends_before_the_splat_that_would_exhaust_it():
+    # T: 1e-2, 2e-4, then 8e-5 <= 1e-4: neither the third nor anything after it counts
     opacities = [
         0.99,
         0.98,
         0.6,
         0.5,
-    ]  # T: 1e-2, 2e-4, then 8e-5 <= 1e-4: neither the third nor anything after it counts
+    ]
     rendering = render_reference(
         on_axis([1.0, 2.0, 3.0, 4.0], opacities, [[0.0] * 3] * 4), axis_camera()
     )

@@ -224,9 +224,8 @@ def test_float32_differs_only_by_rounding_and_by_decisions():
         )
         expected = reference(*exact)
     error = np.abs(np.asarray(ours[0].rgb) - np.asarray(expected[0].rgb)).max(axis=-1)
-    assert (
-        np.sum(error > bound(FLOAT32)) <= 2
-    )  # pixels at which alpha = 1/255, the stop or the order fell the other way
+    # pixels at which alpha = 1/255, the stop or the order fell the other way
+    assert np.sum(error > bound(FLOAT32)) <= 2
     assert error.max() < 2 / 255
     assert_close(ours[1], jax.tree.map(np.asarray, expected[1]), FLOAT32_GRADIENT)
     assert ours[0].rgb.dtype == np.float32
@@ -242,9 +241,8 @@ def test_coincident_depths_are_drawn_by_index():
             tiled(g, level, background())[0] for g in (flat, few(flat, np.arange(COUNT)[::-1]))
         )
         assert_close(image, reference(flat, level, background())[0], FLOAT64)
-        assert (
-            np.abs(image.rgb - reverse.rgb).max() > 0.01
-        )  # the order is visible, and is that of the index
+        # the order is visible, and is that of the index
+        assert np.abs(image.rgb - reverse.rgb).max() > 0.01
 
 
 def views(dtype=np.float32):
@@ -348,9 +346,8 @@ def test_fitted_buffers_hold_every_view():
     config = plan_buffers(gaussians, cameras, CHUNKS, margin=1.0)
     most = max(needed(gaussians, cameras[i]) for i in range(3))
     assert most <= config.max_pairs < 1.5 * most
-    assert (
-        default_pairs(COUNT, WIDTH, HEIGHT) == COUNT * 6
-    )  # never more than every Gaussian in every tile
+    # never more than every Gaussian in every tile
+    assert default_pairs(COUNT, WIDTH, HEIGHT) == COUNT * 6
     assert default_pairs(50_000, 512, 512) == 12 * 50_000 + 16 * 4096
 
 

@@ -65,9 +65,8 @@ def test_charts_stay_apart_and_belong_to_one_piece(person, baked, shown):
     charts = of_face[shown[0]]
     for axis in (0, 1):
         near, far = (np.take(charts, range(i, SIZE - 1 + i), axis) for i in (0, 1))
-        assert not np.any(
-            (near != far) & (near >= 0) & (far >= 0)
-        )  # a texel at least between two of them
+        # a texel at least between two of them
+        assert not np.any((near != far) & (near >= 0) & (far >= 0))
     pieces = [
         np.unique(baked.atlas.charts[person.face_materials == k])
         for k in range(len(person.materials))

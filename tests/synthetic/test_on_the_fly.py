@@ -181,9 +181,8 @@ def test_masks_are_the_share_of_covered_samples_and_depths_their_mean(bank, scen
     by_pixel = lambda x: x.reshape(SIZE, 2, SIZE, 2).mean((1, 3))
     np.testing.assert_array_equal(mask, by_pixel(covered))
     share = np.where(mask > 0, mask, 1)
-    np.testing.assert_allclose(
-        depth, by_pixel(np.where(covered, z, 0)) / share, rtol=1e-6
-    )  # float32
+    # float32
+    np.testing.assert_allclose(depth, by_pixel(np.where(covered, z, 0)) / share, rtol=1e-6)
 
 
 def draw(scene, bank, seed, close_share, size):
@@ -354,9 +353,8 @@ def test_openness_is_how_empty_a_blurred_grid_is(bank, scene):
     at = [(vertices + away * normals - low) / surroundings.CELL - 0.5 for away in (0.045, 0.11)]
     dark = np.mean([map_coordinates(grid, points.T, order=1) for points in at], axis=0)
     expected = np.clip(1.08 - 2.6 * dark, 0.35, 1.0)
-    assert (
-        np.mean(np.abs(openness - expected) > 1e-4) < 0.01
-    )  # a vertex on the edge of a voxel may mark the next one
+    # a vertex on the edge of a voxel may mark the next one
+    assert np.mean(np.abs(openness - expected) > 1e-4) < 0.01
     used = np.unique(np.asarray(faces))
     for arriving in (
         exact,
@@ -365,9 +363,8 @@ def test_openness_is_how_empty_a_blurred_grid_is(bank, scene):
         lit = arriving[used]
         assert lit.min() >= surroundings.DARKEST and lit.max() <= 1
         high, low_down = vertices[used, 1] > vertices[:, 1].max() - 0.03, vertices[used, 1] < 0.05
-        assert (
-            lit[high].mean() > lit[low_down].mean() + 0.15
-        )  # from above: the head is lit, the feet are not
+        # from above: the head is lit, the feet are not
+        assert lit[high].mean() > lit[low_down].mean() + 0.15
 
 
 def test_a_bank_is_a_source_of_its_split(bank, example):

@@ -19,9 +19,8 @@ MILLIMETRES = 4e-3
 
 @pytest.fixture(scope="module")
 def people(body):
-    return [
-        describe(DEMO[i], body) for i in range(150)
-    ]  # the first 148 wear everything that there is
+    # the first 148 wear everything that there is
+    return [describe(DEMO[i], body) for i in range(150)]
 
 
 def test_people_are_as_tall_as_they_are_described(body, people):

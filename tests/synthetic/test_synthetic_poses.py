@@ -153,9 +153,8 @@ def test_both_soles_are_on_the_ground(body, build, posed):
                 low = [posed(rotations)[sole, 1].min() for sole in soles]
                 gaps.setdefault(name, []).append(abs(low[0] - low[1]))
     assert set(gaps) == set(STANCES) - {"one leg"}
-    assert (
-        max(max(values) for values in gaps.values()) < 0.012
-    )  # a sole is round where the model of a foot has corners
+    # a sole is round where the model of a foot has corners
+    assert max(max(values) for values in gaps.values()) < 0.012
     assert np.mean(gaps["stand"]) < 1e-3
 
 

@@ -53,9 +53,8 @@ def test_a_cut_is_exact(slope, level, expected):
     x, y, _ = surface.vertices.T
     kept = cut(surface, level - slope * x - y)
     assert area(kept) == pytest.approx(expected, abs=ROUNDING)
-    np.testing.assert_allclose(
-        kept.attributes["copy"], kept.vertices, atol=ROUNDING
-    )  # attributes move along
+    # attributes move along
+    np.testing.assert_allclose(kept.attributes["copy"], kept.vertices, atol=ROUNDING)
     np.testing.assert_allclose(kept.weights.sum(1), 1, atol=ROUNDING)
     a, b, c = (kept.vertices[kept.faces[:, i], :2] for i in range(3))
     assert (np.linalg.det(np.stack([b - a, c - a], -1)) > -ROUNDING).all()  # no face turned over
@@ -63,9 +62,8 @@ def test_a_cut_is_exact(slope, level, expected):
     corners = kept.vertices[np.unique(boundary_edges(kept.faces))]
     inner = (corners[:, 0] > 0.01) & (corners[:, 0] < 0.99) & (corners[:, 1] > 0.01)
     on_line = corners[inner, 1] + slope * corners[inner, 0]
-    np.testing.assert_allclose(
-        on_line, level, atol=ROUNDING
-    )  # no cracks: all inner borders are the cut
+    # no cracks: all inner borders are the cut
+    np.testing.assert_allclose(on_line, level, atol=ROUNDING)
 
 
 def test_both_halves_of_a_cut_make_the_whole_without_gaps():

@@ -73,9 +73,8 @@ def test_a_written_person_has_all_views_in_all_forms(folder, body):
     held_out = load_capture(person / "held_out", body=body)
     assert held_out.names == ("0_00", "1_00")
     np.testing.assert_array_equal(held_out.pose(0).rotations, capture.pose(0).rotations)
-    assert (
-        np.abs(held_out.pose(1).rotations - capture.pose(1).rotations).max() > 0.05
-    )  # a novel pose
+    # a novel pose
+    assert np.abs(held_out.pose(1).rotations - capture.pose(1).rotations).max() > 0.05
     gap = np.linalg.norm(
         np.asarray(capture.cameras.center)[:3] - np.asarray(held_out.cameras.center)[0], axis=-1
     )
@@ -251,9 +250,8 @@ def test_the_splits_share_no_seed():
     """Splits are intervals: after sorting, overlaps are not in order."""
     ranges = sorted(SPLITS.values(), key=lambda r: r.start)
     assert all(a.stop <= b.start for a, b in itertools.pairwise(ranges))
-    assert all(
-        r.step == 1 and 0 <= r.start < r.stop <= 2**32 for r in ranges
-    )  # seeds are words of keys
+    # seeds are words of keys
+    assert all(r.step == 1 and 0 <= r.start < r.stop <= 2**32 for r in ranges)
     assert all(split_of(r[0]) == name == split_of(r[-1]) for name, r in SPLITS.items())
     with pytest.raises(ValueError, match="no range"):
         split_of(SPLITS["demo"].stop)

@@ -53,9 +53,8 @@ def test_a_restored_state_has_the_same_bits_and_can_be_donated(checkpoints, same
     assert same(restored, state_at(3))
     double = jax.jit(lambda state: jax.tree.map(lambda x: 2 * x, state), donate_argnums=0)
     assert int(double(restored).step) == 6
-    checkpoints.save(
-        dataclasses.replace(state_at(5), step=jnp.asarray(3, jnp.int32))
-    )  # is there: the first one stays
+    # is there: the first one stays
+    checkpoints.save(dataclasses.replace(state_at(5), step=jnp.asarray(3, jnp.int32)))
     assert same(checkpoints.restore(state_at(0)), state_at(3))
     with pytest.raises(FileNotFoundError, match="no checkpoint of step 7"):
         checkpoints.restore(state_at(0), 7)
@@ -192,9 +191,8 @@ def test_a_folder_belongs_to_one_configuration(tmp_path):
     save_config(tmp_path, dataclasses.replace(tiny(), log_every=7))
     with pytest.raises(ValueError, match=r"started with steps = 60, not 5"):
         save_config(tmp_path, dataclasses.replace(tiny(), steps=5))
-    with pytest.raises(
-        ValueError, match="steps = 60, not 90"
-    ):  # not finished: its learning rate would change on the way
+    # not finished: its learning rate would change on the way
+    with pytest.raises(ValueError, match="steps = 60, not 90"):
         save_config(tmp_path, dataclasses.replace(tiny(), steps=90))
     (tmp_path / "checkpoints" / "60").mkdir(parents=True)
     with pytest.raises(ValueError, match="steps = 60, not 5"):
@@ -204,9 +202,8 @@ def test_a_folder_belongs_to_one_configuration(tmp_path):
     other = dataclasses.replace(tiny(), loss=dataclasses.replace(tiny().loss, structural=9.0))
     with pytest.raises(ValueError, match=r"loss\.structural = "):
         save_config(tmp_path, other)
-    with pytest.raises(
-        ValueError, match=r"model\.architecture\.encoder\.upsampler.* not None"
-    ):  # a part is gone
+    # a part is gone
+    with pytest.raises(ValueError, match=r"model\.architecture\.encoder\.upsampler.* not None"):
         save_config(
             tmp_path, dataclasses.replace(tiny(), steps=90, model=without_upsampler(tiny().model))
         )

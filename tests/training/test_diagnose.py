@@ -73,9 +73,8 @@ def test_the_numbers_are_those_of_the_step(body, batch, variables):
         diagnosis.stages
     )
     spike = dataclasses.replace(diagnosis, skip_norm=1e-9)
-    assert re.search(
-        "of its square is of stage 'decoder.[a-z]*_out'", spike.verdict
-    )  # at the start it has nearly all
+    # at the start it has nearly all
+    assert re.search("of its square is of stage 'decoder.[a-z]*_out'", spike.verdict)
 
 
 TOKENS = "encoder.tokenizer.linear"
@@ -98,9 +97,8 @@ IN_BATCH = {
 @pytest.mark.parametrize("path", IN_BATCH)
 def test_a_bad_number_in_the_batch_is_named_and_where_it_enters(body, batch, variables, path):
     index, stage = IN_BATCH[path]
-    value = (
-        np.nan if "camera" in path else np.inf
-    )  # an infinite camera may show nothing at all, which is finite
+    # an infinite camera may show nothing at all, which is finite
+    value = np.nan if "camera" in path else np.inf
     diagnosis = diagnose_step(
         init_state(CONFIG, variables), with_leaf(batch, path, planted(value, *index)), body, CONFIG
     )

@@ -56,9 +56,8 @@ def test_resume_after_two_steps_ends_bit_for_bit_where_four_steps_end(run, tmp_p
     assert same(run(tmp_path, stop_at=4), whole[0]) and losses(tmp_path) == losses(whole[1])
     assert len(losses(tmp_path)) == 4
     before = len(lines(tmp_path))
-    assert (
-        same(run(tmp_path, stop_at=4), whole[0]) and len(lines(tmp_path)) == before
-    )  # there is nothing left to do
+    # there is nothing left to do
+    assert same(run(tmp_path, stop_at=4), whole[0]) and len(lines(tmp_path)) == before
 
 
 @pytest.mark.slow
@@ -143,9 +142,8 @@ def test_a_signal_ends_a_run_when_all_is_saved(at, number, run, tmp_path, monkey
         pytest.raises(loop.TrainingInterrupted, match=f"after {at} of 3 steps") as stopped,
     ):
         run(tmp_path, dataclasses.replace(CONFIG, steps=3, validate_every=4), validation=())
-    assert signal.getsignal(number) is handler and isinstance(
-        stopped.value, KeyboardInterrupt
-    )  # ends a loop of runs, too
+    # ends a loop of runs, too
+    assert signal.getsignal(number) is handler and isinstance(stopped.value, KeyboardInterrupt)
     assert int(stopped.value.state.step) == at and "stopping after this step" in caplog.text
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     assert checkpoints.steps[-1] == at and (tmp_path / "weights.safetensors").is_file()

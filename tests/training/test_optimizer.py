@@ -59,9 +59,8 @@ def test_moments_see_clipped_gradients_and_the_first_step_is_adams(size):
     unclipped = size * np.sqrt(sum(x.size for x in PARAMS.values()))
     assert float(state.norm) == pytest.approx(unclipped, rel=bound(FLOAT32))
     assert norm == pytest.approx(min(unclipped, CONFIG.clip_norm), rel=1e-4)
-    np.testing.assert_allclose(
-        params["bias"], 1 - CONFIG.learning_rate, rtol=1e-5
-    )  # eps of Adam against the clipped
+    # eps of Adam against the clipped
+    np.testing.assert_allclose(params["bias"], 1 - CONFIG.learning_rate, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -48,9 +48,8 @@ def test_a_mesh_of_what_does_not_divide_is_refused():
 
 def test_gradients_are_means_over_all_devices_whichever_hold_the_parts():
     """Four devices, two by two, are nested maps with the names of a mesh's axes."""
-    gradients = jnp.asarray(
-        np.random.default_rng(0).normal(size=(2, 2, 3, 4)), jnp.float32
-    )  # data, fsdp, rows, columns
+    # data, fsdp, rows, columns
+    gradients = jnp.asarray(np.random.default_rng(0).normal(size=(2, 2, 3, 4)), jnp.float32)
     mesh = SimpleNamespace(size=4)
 
     def parts(spec):

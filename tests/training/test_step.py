@@ -324,9 +324,8 @@ def test_a_gradient_is_the_mean_over_subjects_whatever_the_microbatch(monkeypatc
     value, gradients, _, metrics = inspect.unwrap(step.local_gradients)(
         {"x": jnp.asarray(3.0)}, {}, None, weights, keys, config
     )
-    assert (
-        float(gradients["x"]) == 4.0 and float(value) == float(metrics["loss"]) == 12.0
-    )  # means of weights, times 3
+    # means of weights, times 3
+    assert float(gradients["x"]) == 4.0 and float(value) == float(metrics["loss"]) == 12.0
     assert float(metrics["dropped_tokens"]) == float(metrics["overflow"]) == 16.0  # sums
 
 

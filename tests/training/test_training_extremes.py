@@ -76,9 +76,8 @@ def test_views_of_background_alone(body, batch, variables, which):
     )
     _, metrics = step_without_harm(init_state(CONFIG, variables), seen, body)
     if which.get("targets") == EVERY:
-        assert (
-            metrics["squared"] < 1e-9 and metrics["silhouette"] < 1e-9
-        )  # background is drawn as it was in the photo
+        # background is drawn as it was in the photo
+        assert metrics["squared"] < 1e-9 and metrics["silhouette"] < 1e-9
 
 
 @pytest.mark.parametrize("offset", [(OUTSIDE, 0, 0), (0, 0, OUTSIDE), (0, 0, 1e6)], ids=str)

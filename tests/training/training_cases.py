@@ -136,9 +136,10 @@ def batch_of(body, captures, config, step=0):
 
 def random_networks():
     """Returns random loss networks: VGG-19, and LPIPS over VGG-16."""
+    # not on the path of the programs that tests start
     from experiments.training import (
         random_weights,
-    )  # not on the path of the programs that tests start
+    )
 
     keys = jax.random.split(jax.random.key(0))
     heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))

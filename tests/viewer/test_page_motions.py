@@ -557,9 +557,8 @@ def test_an_avatar_may_have_joints_of_any_name(name):
     )
     (usual,) = page_reads([("dance.bvh", skeletons()["A-pose"].encode())])
     np.testing.assert_allclose(np.asarray(page["quats"])[:, :55], usual["quats"], atol=EXACT)
-    np.testing.assert_allclose(
-        np.abs(np.asarray(page["quats"])[:, 55, 0]), 1, atol=EXACT
-    )  # as its parent
+    # as its parent
+    np.testing.assert_allclose(np.abs(np.asarray(page["quats"])[:, 55, 0]), 1, atol=EXACT)
 
 
 def test_pictures_of_the_page_are_marked_as_ours(tmp_path):

@@ -40,9 +40,8 @@ def write_body(path, people, body, hand_poses):
 
     Person i has the betas e_i. `hand_poses` (people, 2, 45) are in the span of 12 components.
     """
-    directions = np.zeros(
-        (len(body.template), 3, 2 * COLUMNS), np.float32
-    )  # shapes, no expressions
+    # shapes, no expressions
+    directions = np.zeros((len(body.template), 3, 2 * COLUMNS), np.float32)
     for i, person in enumerate(people):
         directions[..., i] = np.asarray(body.shape_directions) @ person.betas
     rng = np.random.default_rng(7)

@@ -388,8 +388,7 @@ def test_preprocessing_names_all_damage_and_makes_the_rest(honest, body, tmp_pat
         "a photo of another size",
         "the sizes exchanged",
     }
-    assert set(report.skipped) == set(AVATARREX) - of_photos - {
-        "calibration missing"
-    }  # without one it is no subject
+    # without one it is no subject
+    assert set(report.skipped) == set(AVATARREX) - of_photos - {"calibration missing"}
     for name, line in report.skipped.items():
         assert name in line and all(word in line for word in AVATARREX[name][1:])

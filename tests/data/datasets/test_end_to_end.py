@@ -68,9 +68,8 @@ def test_a_person_goes_all_the_way(layout, tmp_path):
     moved = animate(avatar, last)
     middle = np.asarray(moved.means).mean(axis=0)
     assert np.isfinite(np.asarray(moved.means)).all()
-    assert (
-        np.linalg.norm(middle - np.asarray(last.translation)) < 1
-    )  # an untrained network, in its place
+    # an untrained network, in its place
+    assert np.linalg.norm(middle - np.asarray(last.translation)) < 1
 
 
 FIT_ERROR = 0.015

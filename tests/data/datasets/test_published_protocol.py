@@ -104,9 +104,8 @@ def test_preprocessing_reproduces_the_published_arrays(tmp_path):
         # upright
         T, R = np.eye(4), np.eye(4)
         T[:3, 3] = -(mesh.min(0) + mesh.max(0)) / 2
-        posed_joints = np.stack(
-            [(transforms[j] @ [*rest[j], 1])[:3] for j in (0, 12)]
-        )  # joint j is vertex j here
+        # joint j is vertex j here
+        posed_joints = np.stack([(transforms[j] @ [*rest[j], 1])[:3] for j in (0, 12)])
         spine = posed_joints[1] - posed_joints[0]
         axis, angle = np.cross(spine, UP), np.arccos(spine[1] / np.linalg.norm(spine))
         x, y, z = axis / np.linalg.norm(axis)

@@ -136,9 +136,8 @@ def test_hdf5_is_read_as_it_was_written(tmp_path, body):
     np.testing.assert_allclose(subject.cam_from_world[1, :3, 3], made.T[1], atol=FLOAT32)
     np.testing.assert_allclose(subject.K[0, :2, 2], made.K[:2, 2] + 0.5)
     _, rotations, translations = subject.parameters([1])
-    hands = (
-        made.parameters["right_hand_pose"][1] + model_arrays()["hands_meanr"]
-    )  # flat_hand_mean is False
+    # flat_hand_mean is False
+    hands = made.parameters["right_hand_pose"][1] + model_arrays()["hands_meanr"]
     np.testing.assert_allclose(rotations[0, 40:].reshape(-1), hands, atol=FLOAT32)
     np.testing.assert_allclose(translations[0], made.parameters["transl"][1], atol=FLOAT32)
     image, mask = subject.photo(3, SIZE)
