@@ -1,3 +1,3 @@
-"""The network `humangs`, one module over exchangeable `parts`. Also presets, weights files, and
-conversion.
+"""The network: `humangs`, one module made of exchangeable `parts`. Also has presets, weights files,
+and the conversion of the released checkpoint.
 """

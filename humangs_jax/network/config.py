@@ -1,5 +1,5 @@
-"""The configuration of a network, in three parts: what its weights are, what they were trained
-with, and how it runs.
+"""Defines the configuration of a network, in three parts: what its weights are, what they were
+trained with, and how it runs.
 
 Weights files record `Architecture` and `Conventions`. `Runtime` belongs to the user and the
 machine.
@@ -30,9 +30,9 @@ class Architecture:
     reader: Reader = PixelAlignedReader()
     """Reads the features at the body's vertices."""
     decoder: Decoder = VertexDecoder()
-    """Makes Gaussians of the features."""
+    """Makes Gaussians from the features."""
     driver: TargetDecoder | None = None
-    """Draws every target anew; None: skinning alone moves the Gaussians."""
+    """Runs again for every target and draws it. None: skinning alone moves the Gaussians."""
 
     def __post_init__(self):
         """Raises ValueError for parts that do not fit together."""
@@ -55,8 +55,8 @@ class Architecture:
 
     @property
     def surface_map(self) -> Any:
-        """The map of the body's surface that parts work on, see `network.parts`; None: they work on
-        none.
+        """The map of the body's surface that parts work on, see `network.parts`. None: no part
+        works on a map.
         """
         return next(iter(self._surface_maps), None)
 
@@ -71,7 +71,7 @@ def paper_parts(
 ) -> tuple[PatchTransformer, PixelAlignedReader, VertexDecoder]:
     """Returns the three parts of the paper's network.
 
-    Raises: ValueError if one has been exchanged, naming its class.
+    Raises: ValueError, which names the classes of all three, if a part has been exchanged.
     """
     encoder, reader, decoder = architecture.encoder, architecture.reader, architecture.decoder
     if (
@@ -87,9 +87,10 @@ def paper_parts(
 @jax.tree_util.register_static
 @configuration
 class HumanGSConfig:
-    """A network: see `Architecture`, `Conventions`, `Runtime`, and `network.presets`.
+    """The configuration of a network, see `Architecture`, `Conventions`, `Runtime`, and
+    `network.presets`.
 
-    For JAX a pytree without leaves.
+    For JAX it is a pytree without leaves.
     """
 
     architecture: Architecture = dataclasses.field(default_factory=Architecture)
@@ -100,9 +101,7 @@ class HumanGSConfig:
     """How the network runs here."""
 
     def __post_init__(self):
-        """Raises ValueError for photos that the encoder cannot cut into patches, and for fields of
-        other types.
-        """
+        """Raises ValueError if an image size is no multiple of the encoder's patch size."""
         patch = self.architecture.encoder.patch_size
         for size in (self.conventions.image_size, self.image_size):
             if size % patch:
@@ -110,21 +109,27 @@ class HumanGSConfig:
 
     @property
     def tokens(self) -> TokenSelection:
-        """The selection of tokens in force."""
+        """The selection of tokens that is used: the runtime's, or that of the conventions if it is
+        None.
+        """
         return self.forward_context().tokens
 
     def forward_context(self, train: bool = False, axis_name: Any = None) -> ForwardContext:
-        """Returns the record of how one pass runs, which all parts get."""
+        """Returns the record of how one pass runs, which all parts get. train, axis_name: see
+        `ForwardContext`.
+        """
         return ForwardContext(self.conventions, self.runtime, train, axis_name)
 
     @property
     def image_size(self) -> int:
-        """Side of the photos in force, pixels."""
+        """Side of the photos that is used, pixels: the runtime's, or that of the conventions if it
+        is None.
+        """
         return self.runtime.image_size or self.conventions.image_size
 
     @property
     def trained(self) -> "HumanGSConfig":
-        """What a weights file records: this network with default runtime."""
+        """This configuration with the default runtime. Weights files record no more."""
         return dataclasses.replace(self, runtime=Runtime())
 
     def with_runtime(self, **changes: Any) -> "HumanGSConfig":

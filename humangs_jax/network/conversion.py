@@ -1,9 +1,10 @@
-"""Converts the authors' released checkpoint to our variables and back: names, layouts, and the
-configuration that follows from the shapes.
+"""Converts the authors' released checkpoint to our variables and back. This concerns names,
+layouts, and the configuration that follows from the shapes.
 
-`io.tensors` reads the files, without torch. Layouts: linear (out, in) -> (in, out); convolution
-(out, in, kh, kw) -> (kh, kw, in, out); 1x1 convolution (out, in, 1, 1) -> (in, out); transposed
-convolution (in, out, kh, kw) -> (kh, kw, in, out), unflipped (see `upsampler.UpConvolution`).
+`io.tensors` reads the files, without torch. From the release to here, layouts change so: linear
+(out, in) -> (in, out); convolution (out, in, kh, kw) -> (kh, kw, in, out); 1x1 convolution (out,
+in, 1, 1) -> (in, out); transposed convolution (in, out, kh, kw) -> (kh, kw, in, out), unflipped
+(see `upsampler.UpConvolution`).
 """
 
 import dataclasses
@@ -63,9 +64,9 @@ class Layout(NamedTuple):
     """A conversion of a tensor from the release's layout to ours, and its inverse."""
 
     from_release: Callable[[np.ndarray], np.ndarray]
-    """Returns our array of an array of the release."""
+    """Returns the array in our layout of an array in the release's layout."""
     to_release: Callable[[np.ndarray], np.ndarray]
-    """Returns the release's array of an array of ours."""
+    """Returns the array in the release's layout of an array in our layout."""
 
 
 SAME = Layout(lambda x: x, lambda x: x)
@@ -125,7 +126,7 @@ FIELDS = {
 
 
 def _release_name(path: str) -> tuple[str, Layout]:
-    """Returns the release's name of one of our variables ("params/encoder/..."), and its layout.
+    """Returns the release's name of the variable at a path ("params/encoder/..."), and its layout.
 
     Raises: KeyError if the release has no such variable.
     """
@@ -144,7 +145,8 @@ def _release_name(path: str) -> tuple[str, Layout]:
 
 
 def to_release(variables: Variables) -> StateDict:
-    """Returns the release's state dict of variables, without the body's skinning weights.
+    """Returns variables as a state dict of the release, without the body's skinning weights. The
+    counters of torch's batch norms are 0.
 
     Raises: KeyError for a part of a network that the release does not have.
     """
@@ -159,8 +161,8 @@ def to_release(variables: Variables) -> StateDict:
 
 
 def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
-    """Returns the shapes of the release's state dict for a configuration, by name, without the
-    body's skinning weights.
+    """Returns the shapes of the tensors in the release's state dict for a configuration, by name,
+    without the body's skinning weights.
     """
     empty = jax.tree.map(
         lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), expected_variables(config)
@@ -172,8 +174,8 @@ def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
     """Returns the tensors of a checkpoint in any format of `io.tensors`, and the number of skipped
     tensors of loss networks.
 
-    Raises: OSError; ValueError if the file is damaged, is no checkpoint, or holds anything but
-    tensors.
+    Raises: OSError; ValueError if the file is damaged, is no checkpoint but a weights file of this
+    package, or holds anything but tensors.
     """
     if is_safetensors(path) and read_safetensors(path, lambda _: False)[2].get("format") == FORMAT:
         raise ValueError(f"{path} is a weights file already: nothing to convert")
@@ -181,13 +183,12 @@ def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
 
 
 def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConfig:
-    """Returns the configuration whose sizes are those of the tensors. Settings that shapes do not
-    show are those of `presets.published`.
+    """Returns the configuration with the sizes of the tensors. Settings that shapes do not show are
+    taken from `presets.published`.
 
     head_width: width of a head, for a network without normalised queries and keys, where no shape
-    shows it. One Gaussian of each vertex counts as tight.
-    Raises: ValueError for a variant that is not supported, or if a tensor that determines a size is
-    missing or has another number of axes.
+    shows it. One Gaussian of each vertex counts as tight. Raises: ValueError for a variant that is
+    not supported, or if a tensor that determines a size is missing or has another number of axes.
     """
     if UNSUPPORTED in state:
         raise ValueError(
@@ -248,8 +249,8 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
 
 
 def _shape(state: StateDict, key: str, axes: int) -> tuple[int, ...]:
-    """Returns the shape of a tensor. Raises: ValueError if it is missing or has another number of
-    axes.
+    """Returns the shape of a tensor. Raises: ValueError if it is missing, empty, or has another
+    number of axes.
     """
     if key not in state:
         raise ValueError(f"tensor {key!r} is missing")
@@ -268,8 +269,12 @@ def _count_layers(state: StateDict) -> int:
 
 
 def _infer_heads(state: StateDict, head_width: int | None) -> dict[str, Any]:
-    """Returns the width of a head, which is that of its norms, and whether there are norms, as
-    arguments of `TransformerConfig`.
+    """Returns two arguments of `TransformerConfig` by name: the width of a head, and whether
+    queries and keys have norms. The shape of the norms gives the width; without norms it is
+    `head_width`.
+
+    Raises: ValueError without norms if `head_width` is None or below 1, or if norms have another
+    width.
     """
     if not any(key.endswith((".attn.q_norm.weight", ".attn.k_norm.weight")) for key in state):
         if head_width is None:
@@ -290,7 +295,7 @@ def _infer_heads(state: StateDict, head_width: int | None) -> dict[str, Any]:
 
 
 def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
-    """Checks that the tensors are exactly those expected, and finite.
+    """Checks that the tensors are exactly the expected ones, and finite.
 
     Raises: ValueError, which names the tensor as in the release.
     """

@@ -7,8 +7,8 @@ view, views in their order.
 
 The neural texture is three feature planes over the canonical body, read at canonical positions. The
 first named axis of a plane is the horizontal texture coordinate. Positions in [-1, 1] span a plane
-from the centre of its first texel to the centre of its last one (`align_corners=True`); outside are
-zeros.
+from the centre of its first texel to the centre of its last texel (`align_corners=True`). Outside
+of the texels the features are 0.
 """
 
 import functools
@@ -38,8 +38,8 @@ from humangs_jax.rendering.mesh.rasterizer import BACKGROUND
 TEXTURE_STD = 0.1
 """Standard deviation of the neural texture before training."""
 NOWHERE = 3.0
-"""Number in the pixels of slots without a patch. As positions these lie outside of the neural
-texture, whose gradient then costs nothing.
+"""Value of all channels of the pixels in slots without a patch. As a position it lies outside of
+the neural texture, whose gradient then costs nothing.
 """
 
 
@@ -56,8 +56,8 @@ class TriplaneConfig:
 def sample_triplane(
     texture: Float[Array, "3 r r c"], positions: Float[Array, "*p 3"]
 ) -> Float[Array, "*p 3*c"]:
-    """Returns the features of the neural texture at canonical positions (normalised units): those
-    of plane xy, then xz, then yz.
+    """Returns the features of the neural texture at canonical positions, (..., 3 c): the features
+    of plane xy, then of xz, then of yz. positions: (..., 3), normalised units.
     """
     # indices from the middle have a third of the rounding of (positions + 1) * middle
     middle = (texture.shape[1] - 1) / 2
@@ -92,8 +92,8 @@ def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p pixel
 
 
 def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
-    """Returns the foreground patches in `capacity` slots. Patches beyond the capacity are
-    left out.
+    """Returns which patch each of `capacity` slots gets: the foreground patches in their order.
+    Patches beyond the capacity are left out.
     """
     indices = jnp.nonzero(foreground, size=capacity, fill_value=foreground.shape[0])[0]
     return Packing(indices, jnp.minimum(jnp.sum(foreground), capacity))
@@ -102,7 +102,7 @@ def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
 def _unpack_tokens(
     tokens: Float[Array, "l d"], packing: Packing, patches: int
 ) -> Float[Array, "p d"]:
-    """Returns tokens at their patches, (p, d), and zeros at patches without a token."""
+    """Returns the tokens at their patches, (p, d), and zeros at patches without a token."""
     return (
         jnp.zeros((patches, tokens.shape[1]), tokens.dtype)
         .at[packing.indices]
@@ -137,8 +137,8 @@ class Tokenizer(nn.Module):
 
 @part
 class PatchTransformer(Encoder):
-    """The paper's encoder: one token per patch of every view, attention over all tokens, and an
-    upsampler.
+    """The paper's encoder: one token per patch of every view (or per patch in the foreground),
+    attention over all tokens, and an upsampler.
     """
 
     patch_size: Patch = 8
@@ -158,7 +158,9 @@ class PatchTransformer(Encoder):
         gain="440 GFLOP of the published network at 512",
         measured="performance.md",
     )
-    """None: the maps are those of the last layer (ablation)."""
+    """Sizes of the upsampler. None: there is no upsampler, and the maps are the tokens of the last
+    layer.
+    """
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
@@ -170,9 +172,10 @@ class PatchTransformer(Encoder):
 
     @nn.compact
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
-        """Returns feature maps and a global token of the photos, see `parts.Encoder`.
+        """Returns feature maps and a global token of the photos, see `parts.Encoding`.
 
-        Raises: ValueError if images and cameras differ in size, or are not made of whole patches.
+        Raises: ValueError if images are not made of whole patches, or if the encoder looks at rays,
+        and images and cameras differ in size.
         """
         # every patch of every view
         see = _photo_pixels
@@ -252,8 +255,8 @@ def encoder_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "
 def _photo_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
     """Returns the input at every pixel, (v, h, w, 12), of an encoder without cameras and poses.
 
-    It is rgb, then the pixel's place (x, y) in [-1, 1] and waves of it in place of rays, then zeros
-    in place of the canonical position.
+    The channels are rgb, then in place of rays the pixel's place (x, y) in [-1, 1] and its sines
+    and cosines, then zeros in place of the canonical position.
     """
     height, width = inputs.images.shape[1:3]
 
@@ -270,7 +273,7 @@ def touched_patches(
     foreground: Bool[Array, "v h w"], view_count: Int[Array, ""] | None, patch_size: int
 ) -> Bool[Array, " p"]:
     """Returns which patches of all views the foreground touches, (p,). Views beyond `view_count`
-    are padding.
+    are padding, and their patches count as untouched.
     """
     if view_count is not None:
         foreground = foreground & (jnp.arange(len(foreground)) < view_count)[:, None, None]

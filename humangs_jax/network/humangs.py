@@ -1,12 +1,12 @@
-"""The network: photos with poses in, canonical 3D Gaussians out, in one forward pass.
+"""Runs the network, which makes canonical 3D Gaussians from photos with poses in one forward pass.
 
     encode   photos -> feature maps and a global token
     read     feature maps -> features of every body vertex
     decode   features -> K Gaussians per vertex of the canonical body
 
-Each is a part that the configuration chooses (`network.parts`); the pass itself is written here and
-nowhere else. Everything is written for ONE subject; batch with `jax.vmap` over `inputs` (variables
-unbatched). Callers jit, with `config` static.
+Each step is a part that the configuration chooses (`network.parts`). The pass itself is written
+only here. All functions take ONE subject. For a batch, use `jax.vmap` over `inputs`, with variables
+unbatched. `apply_humangs` is not compiled; compile it with `config` static.
 """
 
 import functools
@@ -49,9 +49,9 @@ class HumanGS(nn.Module):
     reader: Reader
     """Reads the features at the vertices."""
     decoder: Decoder
-    """Makes Gaussians of the features."""
+    """Makes Gaussians from the features."""
     keeps_features: bool = False
-    """Whether a driver works from the features."""
+    """Whether the outputs keep the features in `scene`, for a driver."""
 
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> HumanGSOutputs:
         """Returns the Gaussians of one subject."""
@@ -77,11 +77,13 @@ def apply_humangs(
     train: bool = False,
     axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[HumanGSOutputs, Parameters]:
-    """Returns the outputs of the whole network for one subject, and its batch statistics.
+    """Returns the outputs of encoder, reader and decoder for one subject, and the running batch
+    statistics.
 
-    train: normalise by this subject's statistics and return updated running ones. Under a vmap over
+    train: whether to normalise by this subject's statistics, and to return updated running
+    statistics. Otherwise the running statistics are used, and returned unchanged. Under a vmap over
     subjects, give the vmap's `axis_name` to share the statistics over the batch. Without it each
-    subject has separate statistics, to be averaged.
+    subject has separate statistics, which the caller has to average.
 
     Raises: ValueError if images and cameras differ in size, the patch size does not divide it, or
     inputs lack normals that the configuration needs.
@@ -100,8 +102,8 @@ def apply_humangs(
 def intermediates(
     variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> dict[str, Any]:
-    """Returns the results of every module of the network by its path, such as
-    "encoder.transformer.block_0", in the order of the computation.
+    """Returns the result of every module of the network by its path, such as
+    "encoder.transformer.block_0", in the order in which they finish. The path of the network is "".
     """
     found = {}
 
@@ -126,8 +128,8 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
         config: of the network.
 
     Returns:
-        {"params": {"encoder", "reader", "decoder", "driver"}, "batch_stats": {"encoder"}}; a part
-        without parameters or running statistics is absent.
+        {"params": {"encoder", "reader", "decoder", "driver"}, "batch_stats": {"encoder"}}. A part
+        without parameters or running statistics is absent there.
 
     Examples:
         >>> variables = hg.init_humangs(jax.random.key(0), config)
@@ -166,9 +168,8 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
 
 @functools.partial(jax.jit, static_argnames="config")
 def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -> Encoding:
-    """Returns the encoding of photos, the first step of `apply_humangs`, with the running batch
-    statistics.
-    Raises: as `apply_humangs`.
+    """Returns the encoding of photos, which is the first step of `apply_humangs`. It uses the
+    running batch statistics. Raises: as `apply_humangs`.
     """
     return cast(
         Encoding,
@@ -182,7 +183,7 @@ def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -
 def read(
     variables: Variables, encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> PyTree:
-    """Returns features of the body, the second step of `apply_humangs`. Raises: as
+    """Returns the features of the body, which is the second step of `apply_humangs`. Raises: as
     `apply_humangs`.
     """
     return config.architecture.reader.apply(
@@ -194,8 +195,8 @@ def read(
 def decode(
     variables: Variables, features: PyTree, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> HumanGSOutputs:
-    """Returns canonical Gaussians, metres, the third step of `apply_humangs`. `dropped_tokens` is
-    0, because it belongs to the encoding.
+    """Returns the outputs with canonical Gaussians, metres, which is the third step of
+    `apply_humangs`. `dropped_tokens` is 0, because it belongs to the encoding.
     """
     own = part_variables(variables, "decoder")
     return cast(
@@ -205,8 +206,8 @@ def decode(
 
 
 def part_variables(variables: Variables, part: str) -> Variables:
-    """Returns the variables {"params": ..., "batch_stats": ...} of one part. A kind that the part
-    does not have is absent.
+    """Returns the variables {"params": ..., "batch_stats": ...} of one part. A kind of variables
+    that the part does not have is absent.
     """
     return {kind: cast(Parameters, tree[part]) for kind, tree in variables.items() if part in tree}
 

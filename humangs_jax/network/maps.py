@@ -1,4 +1,5 @@
-"""Feature maps: sampling at fractional positions, and 3x3 convolutions; both with zeros outside.
+"""Samples feature maps at fractional positions, and convolves them with 3x3 kernels. Outside of a
+map there are zeros.
 
 Positions are texel indices (x, y): (0, 0) is the CENTRE of the first texel, x runs along the width.
 Two conventions lead there from pixels u in [0, W] (pixel centres at +0.5) of an image that a
@@ -11,7 +12,7 @@ w-texel grid covers:
 Convolving a grid and then sampling it bilinearly is linear, so the two may change places: sample
 the 3x3 neighbourhood, then apply the kernel, once per position instead of once per texel. With K_ab
 the kernel's taps, x the grid (zeros outside) and w the bilinear weights of the four texels c around
-a position (none for texels that do not exist),
+a position (0 for texels that do not exist),
 
     sum_c w_c (bias + sum_ab K_ab x[c + (a, b) - 1])
         = bias * sum_c w_c + sum_ab K_ab (sum_c w_c x[c + (a, b) - 1]).
@@ -35,12 +36,12 @@ from humangs_jax.core.array_types import Array, Float
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 KERNEL = 3
 REACH = KERNEL // 2 + 1
-"""Texels of padding around a map. A position may lie half a texel outside, and its neighbours one
-texel further.
+"""Texels of padding around a map. A texel that weighs on a position may lie one texel outside, and
+its neighbours one texel further.
 """
 OUTSIDE = -4.0
-"""A texel index outside of every map, also with its neighbourhood. Reading there gives zeros, and
-its gradient costs nothing.
+"""A texel index outside of every map, together with its neighbourhood. Reading there gives zeros,
+and the gradient costs nothing.
 """
 PixelGrid = Literal["half_pixel", "mixed"]
 
@@ -51,8 +52,8 @@ def texel_indices(
     grid_size: tuple[int, int],
     convention: PixelGrid,
 ) -> Float[Array, "*p 2"]:
-    """Returns texel indices in a grid that covers an image, of positions in pixels of the image.
-    Sizes are (width, height).
+    """Returns texel indices (x, y) in a grid that covers an image. pixels: positions (x, y) on the
+    image, pixels. Sizes are (width, height).
     """
     image, grid = jnp.asarray(image_size, pixels.dtype), jnp.asarray(grid_size, pixels.dtype)
     if convention == "half_pixel":
@@ -66,9 +67,9 @@ def sample_bilinear(
     """Returns the grid's values at texel indices, interpolated bilinearly between texel centres.
     Texels outside of the grid count as zeros.
 
-    origin: texel index, in both axes, that `indices` are relative to. Relative to the middle,
-    float32 positions keep more digits of their fractions. Positions that are outside by a texel or
-    more, infinite or NaN give zero with zero gradient.
+    origin: texel index, of both axes, that is added to `indices`. If `indices` are relative to the
+    middle of the grid, float32 keeps more digits of their fractions. Positions that are outside by
+    a texel or more, infinite or NaN give zero with zero gradient.
     """
     height, width, channels = grid.shape
     size = jnp.asarray([width, height], indices.dtype)
@@ -112,9 +113,9 @@ def sample_nearest(grid: Float[Array, "h w"], indices: Float[Array, "*p 2"]) -> 
 def sample_neighborhoods(
     grid: Float[Array, "h w c"], indices: Float[Array, "p 2"]
 ) -> tuple[Float[Array, "p 3*3*c"], Float[Array, " p"]]:
-    """Samples the 3 x 3 texels around each position: the two sums over c in the module's docstring.
-
-    Returns the neighbourhoods, taps row-major with channels fastest, and the coverage sum_c w_c.
+    """Returns the 3 x 3 texels around each position, interpolated, (p, 9 c), and the coverage sum_c
+    w_c of each position, (p,). These are the two sums over c in the module's docstring. Texels are
+    in rows, and channels run fastest.
 
     indices: texel indices (x, y), see `network.maps`. Positions that are outside by a texel or
     more, infinite or NaN give zeros with zero gradient.
@@ -160,9 +161,9 @@ def convolve_neighborhoods(
     bias: Float[Array, " d"],
     dtype: Any = None,
 ) -> Float[Array, "n d"]:
-    """Returns the products of the kernel and the neighbourhoods of n positions, or of means of
-    several neighbourhoods, (n, d). The products are in `dtype`, the result in the type of the
-    coverages.
+    """Returns the convolution at n positions, (n, d): the kernel times each neighbourhood, plus the
+    bias times the coverage. Neighbourhoods may be means of several. The products are in `dtype`,
+    the result in the type of the coverages.
     """
     x, kernel = promote_dtype(neighborhoods, kernel, dtype=dtype)
     products = jnp.matmul(
@@ -174,9 +175,7 @@ def convolve_neighborhoods(
 def convolve(
     x: Float[Array, "v h w c"], kernel: Float[Array, "k k c d"]
 ) -> Float[Array, "v h w d"]:
-    """Returns the product of every pixel's 3x3 neighbourhood, with zeros outside of the map, and
-    the kernel.
-    """
+    """Returns the convolution of maps with a 3x3 kernel, with zeros outside of the maps."""
     return lax.platform_dependent(x, kernel, cpu=_convolve_on_cpu, default=_convolve)
 
 
@@ -212,8 +211,8 @@ _convolve_on_cpu.defvjp(lambda x, kernel: (_convolve(x, kernel), (x, kernel)), _
 
 
 class Convolution(nn.Module):
-    """3x3 convolution with a bias: (v, h, w, c) -> (v, h, w, features); the parameters are those of
-    `nn.Conv`.
+    """A 3x3 convolution with a bias, from (v, h, w, c) to (v, h, w, features). Its parameters are
+    those of `nn.Conv`.
     """
 
     features: int

@@ -1,5 +1,5 @@
-"""Encoder, reader, decoder and driver: what each of these parts takes and returns, so that it can
-be exchanged.
+"""Defines what the exchangeable parts of a network take and return: encoder, reader, decoder and
+driver.
 
     encoding = encoder(photos)
     features = reader(encoding)
@@ -7,7 +7,7 @@ be exchanged.
 
 A part is a Linen module. Its fields are its configuration, and weights files record them with the
 name of the class. A part gets the result of the part before it, the inputs, and a record of how
-this pass runs; it knows no other part. A new part is a new file with a class that derives from
+this pass runs. It knows no other part. A new part is a new file with a class that derives from
 `Encoder`, `Reader`, `Decoder` or `TargetDecoder` and has the decorator `core.configuration.part`,
 and one line of a preset that names it: see `experiments/systems`.
 
@@ -58,11 +58,13 @@ class HumanGSInputs:
     canonical_vertices: Float[Array, "n 3"]
     """The body in the T-pose, (n, 3), metres."""
     position_maps: Float[Array, "v h w 3"]
-    """Canonical position that each pixel shows, (v, h, w, 3), normalised units; 1 on background."""
+    """Canonical position that each pixel shows, (v, h, w, 3), normalised units. Every coordinate is
+    1 on background.
+    """
     depth_maps: Float[Array, "v h w"]
     """Rasterized z of the body, (v, h, w), normalised units; -1 on background."""
     foreground: Bool[Array, "v h w"]
-    """Pixels of the person, (v, h, w), used where tokens are "foreground"."""
+    """Pixels of the person, (v, h, w), used for "foreground" tokens and for shells."""
     view_count: Int[Array, ""] | None = None
     """Number of real views, which come first. The others are padding and change nothing. None: all
     views are real.
@@ -74,8 +76,8 @@ class HumanGSInputs:
     "normal".
     """
     relative_vertex_spacing: Float[Array, " n"] | None = None
-    """Distance between vertices relative to the mesh that the weights were trained with, (n,);
-    None: 1.
+    """Distance between vertices, relative to that in the mesh with which the weights were trained,
+    (n,). None: 1 everywhere.
     """
     skinning_weights: Float[Array, "n j"] | None = None
     """Skinning weights of the body, (n, j), for decoders whose Gaussians are not those of
@@ -113,7 +115,9 @@ class ForwardContext(NamedTuple):
 
     @property
     def tokens(self) -> TokenSelection:
-        """The selection of tokens in force."""
+        """The selection of tokens that is used: the runtime's, or that of the conventions if it is
+        None.
+        """
         return self.runtime.tokens or self.conventions.tokens
 
 
@@ -122,11 +126,11 @@ class Packing:
     """The patches that became tokens."""
 
     indices: Int[Array, " l"]
-    """Patch of each token, (l,), in the order of the patches. A token that is padding has the
+    """Index of the patch of each token, (l,), ascending. For tokens that are padding, it is the
     number of patches.
     """
     count: Int[Array, ""]
-    """Number of real tokens, which come first. The rest is padding."""
+    """Number of real tokens, which come first. The others are padding."""
 
 
 @pytree_dataclass
@@ -140,7 +144,7 @@ class Encoding:
     dropped_tokens: Int[Array, ""]
     """Number of foreground patches for which the token capacity had no room."""
     packing: Packing | None = None
-    """The patches that the maps have features of; None: all patches."""
+    """The patches of which the maps have features. None: all patches."""
     patch_size: int = static_field(default=1)
     """Side of a patch, pixels."""
 
@@ -159,11 +163,11 @@ class Shells:
     foreground, weighted by how much the posed normal faces the view. Grey without such a view.
     """
     seen: Float[Array, "n s"]
-    """Sum of the weights of these views in the foreground, divided by the number of views,
-    (n, s).
-    """
+    """Sum of the weights of these views, divided by the number of all views, (n, s)."""
     inside: Float[Array, "n s"]
-    """Mean mask at the point over the views that contain it, (n, s); 1 if there is none."""
+    """Mean mask at the point over the views that contain it, (n, s). It is 1 if no view contains
+    the point.
+    """
     hull: Float[Array, "n s"]
     """Smallest mask at the point over the views that contain it, (n, s). It is 0 outside of the
     visual hull, and 1 if no view contains the point.
@@ -196,7 +200,7 @@ class HumanGSOutputs:
     """The Gaussians, metres. Without `skinning_weights` they are g = n * k, ordered by vertex."""
     tight_offsets: Float[Array, "n t 3"] | None = None
     """Offsets of the tight Gaussians from their vertex, or of each Gaussian from its place, (n, t,
-    3), normalised units. The tightness loss keeps them small; it is 0 for None.
+    3), normalised units. The tightness loss keeps them small. None: that loss is 0.
     """
     skinning_offsets: Float[Array, "g j"] | None = None
     """Logits of the skinning head, (n * k, j), or None (see
@@ -211,7 +215,9 @@ class HumanGSOutputs:
     vertex each. None: the body's weights.
     """
     scene: PyTree = None
-    """What a driver draws every target from: the features, unless a decoder sets it."""
+    """The data from which a driver draws every target: the features, unless the decoder sets it.
+    None without a driver, unless the decoder sets it.
+    """
 
     @property
     def is_empty(self) -> bool:
@@ -318,14 +324,15 @@ class TargetDecoder(Part, nn.Module):
         targets: PyTree,
         background: float,
     ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
-        """Returns images and alpha of a person from the photos of one capture, in the views of
-        another, for evaluations. variables, config: those of the network.
+        """Returns images (v, h, w, 3) and alpha (v, h, w), or None for alpha, of a person in the
+        target views, for evaluations. variables, config: of the network. inputs: the photos of the
+        person.
         """
         raise NotImplementedError
 
 
 class Tap(nn.Module):
-    """The module behind `tap`, which makes a step visible to interceptors of Linen."""
+    """The module that `tap` calls. It makes a step visible to interceptors of Linen."""
 
     apart: bool = False
     """Whether each entry of the dict that the function returns is a separate stage."""

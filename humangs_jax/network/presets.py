@@ -1,5 +1,5 @@
-"""Named configurations: `published` runs the released weights, `paper` is as described, `small` is
-what we ship.
+"""Named configurations: `published` is for the released weights, `paper` is the network that the
+paper describes, `small` is the shipped network, and `tiny` is for tests.
 """
 
 from humangs_jax.core.configuration import Presets
@@ -40,8 +40,8 @@ def paper() -> HumanGSConfig:
 
 
 def small() -> HumanGSConfig:
-    """Returns the configuration of the shipped network, which was trained on a CPU. Tokens are of
-    the foreground only, and colors are read from the photos.
+    """Returns the configuration of the shipped network, which was trained on a CPU. Only patches of
+    the foreground are tokens, and colors are read from the photos.
 
     It has no upsampler, because of its cost on a CPU (docs/training.md).
     """
@@ -79,8 +79,8 @@ def small() -> HumanGSConfig:
 
 
 def tiny() -> HumanGSConfig:
-    """Returns a configuration for tests: the published parts with what `small` reads from the
-    photos, in the smallest sizes.
+    """Returns a configuration for tests. It has the published parts, reads from the photos what
+    `small` reads, and has the smallest sizes.
     """
     decoder = paper_parts(small().architecture)[2]
     return HumanGSConfig(

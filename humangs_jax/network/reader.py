@@ -1,4 +1,4 @@
-"""The paper's reader: it projects posed vertices into the photos, reads features there and pools
+"""The paper's reader. It projects posed vertices into the photos, reads features there and pools
 the views.
 
 Vertices can also read the photos themselves, at the surface and on shells. Shells are points off
@@ -52,8 +52,8 @@ units.
 UNSEEN_COLOR = 0.5
 """Photo color of a vertex that no view sees."""
 WEIGHT_EPSILON = 1e-6
-"""Smallest total weight of the views at which a point counts as seen. A view's weight is how much
-the surface faces it.
+"""Total weight of the views above which a point counts as seen. The weight of a view is the cosine
+of the angle at which the surface faces it.
 """
 
 
@@ -68,12 +68,12 @@ class PixelAlignedReader(Reader):
     None: no convolution.
     """
     sample_rgb: bool = False
-    """Whether to read also the mean photo color of each vertex over the views that see it, and the
+    """Whether vertices also read their mean photo color over the views that see them, and the
     fraction of such views.
     """
     shells: tuple[Spread, ...] = ()
-    """Ascending distances along the vertex normals at which the photos are read, too, normalised
-    units; (): none.
+    """Ascending distances along the vertex normals at which vertices also read the photos,
+    normalised units. Empty: vertices do not read there.
     """
 
     def __post_init__(self):
@@ -155,7 +155,7 @@ def project_and_test(
     grid: PixelGrid,
 ) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
     """Returns the pixels of the posed vertices in every view, (v, n, 2), and whether each view sees
-    them, (v, n). Padding sees none.
+    them, (v, n). Views that are padding see no vertex.
     """
     pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
 
@@ -168,8 +168,8 @@ def project_and_test(
 def project_vertices(
     camera: Camera, vertices: Float[Array, "n 3"]
 ) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
-    """Returns pixels (n, 2) and depths z (n,) of vertices in one camera. They and their gradients
-    are finite, also for vertices in the camera's plane or behind it.
+    """Returns the pixels (n, 2) and depths z (n,) of vertices in one camera. The results and their
+    gradients are finite, also for vertices in the camera's plane or behind it.
     """
     p = transform.apply(camera.cam_from_world, vertices)
     depth = p[:, 2]
@@ -186,8 +186,8 @@ def visible_vertices(
     image_size: tuple[int, int],
     grid: PixelGrid,
 ) -> Bool[Array, " n"]:
-    """Returns which projected vertices lie inside the image, in front of the camera and not behind
-    the rasterized surface, (n,).
+    """Returns which projected vertices lie inside the image, in front of the camera, and no more
+    than `DEPTH_TOLERANCE` behind the rasterized surface, (n,).
 
     depth_map: rasterized z, -1 on background, so that a vertex over background is unseen.
     image_size: (width, height).
@@ -206,7 +206,7 @@ def sum_over_views(
     weights: Float[Array, "v n"],
 ) -> PyTree:
     """Returns the sum over the views of weight * read(map of the view, texel indices). A CPU takes
-    one view after the other, with memory for one.
+    one view after the other, with memory for one view.
 
     read: (h, w, c), (n, 2) -> a pytree of (n, ...).
     """
@@ -236,8 +236,8 @@ def photo_colors(
     visible: Bool[Array, "v n"],
     grid: PixelGrid,
 ) -> Float[Array, "n 3"]:
-    """Returns the mean photo color of each vertex over the views that see it, (n, 3); grey where
-    none does.
+    """Returns the mean photo color of each vertex over the views that see it, (n, 3). It is grey if
+    no view does.
     """
     size = (images.shape[2], images.shape[1])
     colors = jax.vmap(sample_bilinear)(images, texel_indices(pixels, size, size, grid))
@@ -248,7 +248,7 @@ def photo_colors(
 
 def on_the_person(shells: Shells) -> Bool[Array, " n"]:
     """Returns whether any photo shows the person at any distance along the normal of each vertex,
-    (n,). True where no photo contains the points.
+    (n,). True also if no photo contains one of the points.
     """
     return jnp.any(shells.inside > 0, axis=1)
 

@@ -1,5 +1,5 @@
-"""How the network runs (`Runtime`), which weights files do not record, and how its weights were
-trained (`Conventions`).
+"""Settings of how the network runs (`Runtime`), which weights files do not record, and of how its
+weights were trained (`Conventions`).
 """
 
 from typing import Any, ClassVar, Literal
@@ -54,8 +54,8 @@ class Runtime:
         gain="time on accelerators; none on CPUs",
         measured="stability.md",
     )
-    """Number type of the encoder's products. Parameters, norms, softmax statistics and the decoder
-    are float32 or wider.
+    """Number type of the products of the encoder and of the reader's convolution. Parameters, the
+    statistics of norms and softmax, and the decoder are float32 or wider.
     """
     attention: Literal["auto"] | AttentionKernel = knob(
         "auto",
@@ -97,7 +97,7 @@ class Runtime:
         measured="tradeoff.md",
     )
     """Number of vertices to which the body is decimated, fewer than the weights were trained with.
-    None: no further decimation. Gaussians shrink or grow with the distance between vertices, so
+    None: no further decimation. Gaussians are scaled as the distance between vertices changes, so
     that they cover as much as before.
     """
     image_size: InputSide | None = knob(
@@ -106,8 +106,8 @@ class Runtime:
         gain="tokens grow with its square",
         measured="tradeoff.md",
     )
-    """Side of the photos, pixels, a multiple of the patch size. None: as the weights were
-    trained.
+    """Side of the photos, pixels, a multiple of the patch size. None: the side with which the
+    weights were trained.
     """
     crop: bool = knob(
         False,
@@ -125,12 +125,13 @@ class Runtime:
         measured="benchmarks/quality.md",
     )
     """Whether the body is first moved to the edges of the masks (`data.vertex_offsets`), for
-    weights whose `pixels` are "person". None: if a part of it sticks out of the masks. True:
-    always, which costs PSNR where the body is right. False: never, and a displacement of the
-    capture, which otherwise comes first, and a skirt (`data.skirt`) are left out, too.
+    weights whose `pixels` are "person". None: it is moved if a part of it sticks out of the masks.
+    True: it is always moved, which costs PSNR where the body is right. False: it is never moved,
+    and has no skirt (`data.skirt`). With None or True, a displacement of the capture is used
+    instead if there is one.
     """
     raster: RasterConfig = RasterConfig()
-    """Buffers of the mesh rasterizer."""
+    """Settings of the mesh rasterizer."""
     renamed_fields: ClassVar[dict[str, str]] = {"longest_edge": "max_edge_length"}
 
     @property
@@ -161,20 +162,22 @@ class Conventions:
     """Patches that became tokens."""
     pixels: Literal["all", "person"] = "all"
     """Pixels that count. "person": only those of the masks, if there are masks. A photo then does
-    not see the body where the body covers background, and Gaussians of vertices that lie off the
-    person in all photos are dropped.
+    not see the body where the body covers background. With shells, Gaussians of vertices that lie
+    off the person in all photos get opacity 0.
     """
     position_map: Literal["plain", "gouraud"] = "plain"
     """How position maps are drawn: canonical positions that are interpolated ("plain"), or lit by a
     point light as in the release ("gouraud").
     """
     ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
-    """How ray origins are normalized: divided by the unit of the subject once or twice. The release
-    divides camera centres by the unit, and divides ray origins that it takes from them once more
-    ("twice_normalized"), so that the moments of its rays fit no camera.
+    """How ray origins are normalized: they are divided by the unit of the subject once or twice.
+    The release divides camera centres by the unit, and divides ray origins that it takes from them
+    once more ("twice_normalized"), so that the moments of its rays fit no camera.
     """
     pool: Literal["visible", "all"] = "visible"
-    """Views that are averaged for a vertex: those that see the vertex (paper), or all (release)."""
+    """Views that are averaged for a vertex: those that see the vertex ("visible", as in the paper),
+    or all views ("all", as in the release).
+    """
     pixel_grid: PixelGrid = "half_pixel"
     """How pixels become positions on feature maps, see `network.maps`."""
     skinning: Literal["affine", "rotation"] = "affine"

@@ -6,13 +6,13 @@
 LayerNorms of the blocks have a weight and no bias, the final one has both (eps 1e-5). Norms and
 softmax run in float32 at least, and so does the residual stream; products run in `dtype`. Attention
 over the tokens of all views is softmax(q k^T / sqrt(e)) v per head, with normalised q and k. Tokens
-that are padding stand at the end; the first `count` ones are attended to. Three exact
-implementations:
+that are padding stand at the end, and only the first `count` tokens are attended to. There are
+three exact implementations:
 
 - "chunked": matrix products over blocks of one head's queries, recomputed in the backward pass, so
   that memory grows with L and not with L^2;
 - "xla": `jax.nn.dot_product_attention`, which materialises L x L logits;
-- "cudnn": its fused flash attention (NVIDIA, half precision only).
+- "cudnn": the fused flash attention of this function (NVIDIA, half precision only).
 
 "auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens
 (not in float64: its softmax is always float32), and "chunked" otherwise. On a CPU of two cores,
@@ -37,8 +37,8 @@ PRODUCT = "product"
 QUERIES = 1024
 """Number of queries that "chunked" takes at once."""
 XLA_TOKENS = 8192
-"""Largest number of tokens for "xla": the L x L logits of all heads fit beside a model on any
-accelerator (12 heads, float32: 3 GB a layer).
+"""Largest number of tokens for which "auto" takes "xla". The L x L logits of all heads then fit
+beside a model on any accelerator (12 heads, float32: 3 GB a layer).
 """
 
 
@@ -123,7 +123,7 @@ def attention(
 
 
 class Attention(nn.Module):
-    """Multi-head self-attention without biases; tokens (l, d) -> (l, d)."""
+    """Multi-head self-attention without biases, from tokens (l, d) to (l, d)."""
 
     head_width: int
     """Features of a head."""
@@ -187,14 +187,16 @@ class TransformerConfig:
 
 
 def layer_norm(dtype: Any, name: str, use_bias: bool = False) -> nn.LayerNorm:
-    """Makes the LayerNorm of the published network; its two-pass variance does not cancel."""
+    """Returns the LayerNorm of the published network. Its two-pass variance does not lose digits to
+    cancellation.
+    """
     return nn.LayerNorm(
         epsilon=NORM_EPSILON, use_bias=use_bias, use_fast_variance=False, dtype=dtype, name=name
     )
 
 
 class Block(nn.Module):
-    """One pre-norm block; tokens (l, d) -> (l, d)."""
+    """One pre-norm block, from tokens (l, d) to (l, d)."""
 
     config: TransformerConfig
     """Sizes of the transformer."""

@@ -4,7 +4,7 @@ With hidden width H, each map goes through a 1x1 convolution to H channels. All 
 and a 3x3 convolution to 2H, norm and LeakyReLU follow. Then a 4x4 transposed convolution of stride
 2 is applied twice, from 2H to H and from H to H/2, each with norm and LeakyReLU. The first is
 followed by a 3x3 convolution to H with norm and LeakyReLU, the second by a 3x3 convolution to the
-output, without them. Maps are (v, h, w, c).
+output, without norm and LeakyReLU. Maps are (v, h, w, c).
 
 The last convolution takes half of the arithmetic, and only body vertices read its output, at
 positions between its pixels. So it is not in this module. The reader applies it to values of its
@@ -37,14 +37,14 @@ class UpsamplerConfig:
     hidden: Annotated[int, Range(2, 16_384)] = 256
     """Width H of the hidden layers."""
     features: Literal["intermediate", "final"] = "intermediate"
-    """Whether all four depths are fused ("intermediate"), or only the last one is upsampled
-    ("final", an ablation).
+    """Whether the maps of all four depths are fused ("intermediate"), or only the last map is
+    upsampled ("final", an ablation).
     """
 
 
 class UpConvolution(nn.Module):
-    """4x4 transposed convolution with stride 2 and padding 1, from (v, h, w, c) to
-    (v, 2h, 2w, features).
+    """A 4x4 transposed convolution with stride 2 and padding 1, from (v, h, w, c) to (v, 2h, 2w,
+    features).
 
     Output row 2i needs input rows i - 1 and i, under kernel rows 3 and 1. Output row 2i + 1 needs
     input rows i and i + 1, under kernel rows 2 and 0. The same holds for columns. So it is computed
@@ -100,7 +100,7 @@ class Upsampler(nn.Module):
         train: bool = False,
         present: Bool[Array, " v"] | None = None,
     ) -> Float[Array, "v 4*h 4*w c"]:
-        """Fuses and upsamples the maps.
+        """Returns the fused and upsampled maps, (v, 4h, 4w, hidden / 2).
 
         train: whether norms use the statistics of the batch. present: views that count in these
         statistics, (v,); None: all.

@@ -1,9 +1,9 @@
-"""The decoder: makes K Gaussians from the features of a body vertex.
+"""The paper's decoder, which makes K Gaussians from the features of each body vertex.
 
 The input of a vertex is its pooled local feature, the global token, and a positional encoding of
 the canonical position. Optional inputs are its photo color, the fraction of views that see it, and
-the photos' colors and masks at distances along its normal. The first `tight` Gaussians of a vertex
-are those whose offsets a loss keeps small.
+the photos' colors and masks at distances along its normal. A loss keeps the offsets of the first
+`tight` Gaussians of a vertex small.
 """
 
 from typing import Annotated, Literal
@@ -41,8 +41,8 @@ can still be corrected.
 WEIGHT_EPSILON = 1e-9
 """Number added to skinning weights before their logarithm, as published."""
 THINNER = 1.2
-"""Number subtracted from the bias of the scale along the normal. It makes a third of the thickness,
-so that silhouettes are sharp.
+"""Number that is subtracted from the bias of the scale along the normal. The thickness becomes a
+third, so that silhouettes are sharp.
 """
 OBLIQUE = (0.36, 0.48, 0.8)
 """A unit vector along no axis of a body. Where normals are opposite to it, frames turn quickly
@@ -54,8 +54,8 @@ between vertices.
 class VertexDecoder(Decoder):
     """The paper's decoder: a light MLP from the features of a vertex to its Gaussians.
 
-    It computes in float32 at least: it is a thousandth of the published network's arithmetic, and
-    bfloat16 here would double the error of its Gaussians.
+    It computes in float32 at least. It is a thousandth of the published network's arithmetic, and
+    in bfloat16 it would double the error of the Gaussians.
     """
 
     hidden: Width = 256
@@ -78,8 +78,9 @@ class VertexDecoder(Decoder):
     initial_log_scale: Bias = -3.0
     """Initial bias of the scales, before the softplus."""
     frame: Literal["canonical", "normal"] = "canonical"
-    """Axes of offsets and rotations: those of the canonical body (published), or axes whose z is
-    the vertex's normal. Along the normal Gaussians start thinner (`THINNER`).
+    """Axes of offsets and rotations: the axes of the canonical body ("canonical", as published), or
+    axes whose z is the vertex's normal ("normal"). Along the normal Gaussians start thinner
+    (`THINNER`).
     """
     residual_color: bool = False
     """Whether colors are predicted relative to the photo color."""
@@ -99,9 +100,10 @@ class VertexDecoder(Decoder):
     def __call__(
         self, features: VertexFeatures, inputs: HumanGSInputs, ctx: ForwardContext
     ) -> HumanGSOutputs:
-        """Returns Gaussians of the n vertices, vertex-major, metres.
+        """Returns the Gaussians of the n vertices, ordered by vertex, metres.
 
-        Raises ValueError for features that lack the normals.
+        Raises ValueError for features that lack the normals or the photo colors that the
+        configuration needs.
         """
         if self.frame == "normal" and features.normals is None:
             raise ValueError(
@@ -140,8 +142,8 @@ class VertexDecoder(Decoder):
         )
 
     def _heads(self, x: Float[Array, "n c"], shells: int) -> "RawGaussians":
-        """Returns the outputs of the MLP: a trunk, then a head for each kind of output. shells:
-        number of shells.
+        """Returns the outputs of the MLP for the inputs x of each vertex. It has a trunk and a head
+        for each kind of output. shells: number of shells.
         """
         k = self.gaussians_per_vertex
 
@@ -179,7 +181,7 @@ class VertexDecoder(Decoder):
 
 @pytree_dataclass
 class RawGaussians:
-    """Outputs of the heads before their activations."""
+    """The outputs of the heads before their activations, for n vertices and k Gaussians of each."""
 
     geometry: Float[Array, "n k 10"]
     """Offset, quaternion and scale, (n, k, 10)."""
@@ -208,14 +210,14 @@ class VertexGaussians:
 
 
 def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
-    """Returns x, then sin(f pi x), cos(f pi x) for f = 1, 2, 4, 8, 16, 32."""
+    """Returns x, then sin(f pi x) and cos(f pi x) for f = 1, 2, 4, 8, 16, 32, (n, 39)."""
     waves = [wave(f * np.pi * x) for f in (1, 2, 4, 8, 16, 32) for wave in (jnp.sin, jnp.cos)]
     return jnp.concatenate([x, *waves], axis=-1)
 
 
 def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> Float[Array, "n c"]:
     """Returns the inputs of the decoder, (n, c): local feature, global token, encoded position,
-    photo color as 2 rgb - 1, visible fraction, normal and shells, in this order. Missing ones are
+    photo color as 2 rgb - 1, visible fraction, normal and shells, in this order. Missing inputs are
     left out.
     """
     vertices = canonical.shape[0]
@@ -253,8 +255,10 @@ def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
 def activate(
     raw: RawGaussians, config: VertexDecoder, features: VertexFeatures | None = None
 ) -> VertexGaussians:
-    """Returns the Gaussians of the heads' outputs. Quaternions are normalised, scales go through a
-    softplus, colors and opacities through a sigmoid. Offsets are bounded if so configured.
+    """Returns the Gaussians that the heads' outputs stand for. Quaternions are normalised, scales
+    go through a softplus, colors and opacities through a sigmoid. Offsets are bounded if
+    `config.offset_scale` is not None, and are turned to the axes of the canonical body, as are
+    rotations.
 
     With shells, each Gaussian has weights of the shells that sum to 1. Its offset and color correct
     the weighted mean of the distances along the normal and of the photo colors.
@@ -301,8 +305,8 @@ def _mean(weights: Float[Array, "n k s"], values: Float[Array, " s"]) -> Float[A
 def corrected_skinning_weights(
     weights: Float[Array, "n j"], offsets: Float[Array, "g j"] | None, gaussians_per_vertex: int
 ) -> Float[Array, "g j"]:
-    """Returns the skinning weights of every Gaussian, (g, j): those of its vertex, or with a
-    skinning head softmax(log(w + 1e-9) + offsets).
+    """Returns the skinning weights of every Gaussian, (g, j): the weights w of its vertex, or
+    softmax(log(w + 1e-9) + offsets) with the offsets of a skinning head.
     """
     weights = jnp.repeat(weights, gaussians_per_vertex, axis=0)
     if offsets is None:

@@ -1,9 +1,9 @@
-"""Weights on disk: one safetensors file, tensors under their path in the variables, their
-description in its header.
+"""Writes and reads weights files. A weights file is a safetensors file, with tensors under their
+path in the variables, and a description of the network in its header.
 
 Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format":
-"humangs-weights", "version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256};
-the first files have no checksum. float16 halves the file (and rounds to 11 bits); loading gives
+"humangs-weights", "version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}.
+The first files have no checksum. float16 halves the file, and rounds to 11 bits. Loading gives
 float32.
 """
 
@@ -50,13 +50,14 @@ def save_weights(
     config: HumanGSConfig,
     dtype: Literal["float32", "float16"] = "float32",
 ) -> None:
-    """Write variables and configuration; the file appears whole or not at all.
+    """Write variables and configuration to a weights file. If writing fails, the path stays as it
+    was.
 
     Args:
         path: the .safetensors file to write or replace.
         variables: of the network.
-        config: of the network; its `Runtime` is not written.
-        dtype: of the stored numbers; float16 halves the file.
+        config: of the network. Its `Runtime` is not written.
+        dtype: type of the stored numbers. float16 halves the file.
 
     Raises:
         ValueError: naming its key, if a tensor does not fit the configuration, is not finite, or
@@ -144,7 +145,7 @@ def _load_weights(path: str | os.PathLike[str]) -> tuple[Variables, HumanGSConfi
 def variables_from_tensors(
     tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str
 ) -> Variables:
-    """Returns float32 variables made from flat tensors by path.
+    """Returns float32 variables made from tensors by path. where: name of the file, for errors.
 
     Raises: ValueError, which names the key, unless the tensors are exactly those of the
     configuration.
@@ -157,8 +158,8 @@ def variables_from_tensors(
 
 
 def _check(tensors: dict[str, Any], variables: Variables, where: str) -> dict[str, np.ndarray]:
-    """Returns the tensors as numpy arrays in the order of the leaves, after a check that they are
-    exactly the variables.
+    """Returns the tensors as numpy arrays in the order of the leaves, after a check that they have
+    exactly the names and shapes of the variables and are finite.
 
     Raises: ValueError, which names the tensor.
     """

@@ -484,8 +484,8 @@ def refiner_iteration(
 
 
 def save_refiner(path: str | os.PathLike[str], variables: PyTree) -> None:
-    """Writes the variables of a `Refiner` as a safetensors file. If writing fails, no file
-    appears.
+    """Writes the variables of a `Refiner` as a safetensors file. If writing fails, the path stays
+    as it was.
     """
     from safetensors.numpy import save
 
