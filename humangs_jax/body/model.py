@@ -98,7 +98,9 @@ def _product(a: Float[Array, "*b i j"], b: Float[Array, "*b j k"]) -> Float[Arra
 def blend_transforms(
     weights: Float[Array, "n j"], transforms: Float[Array, "j 4 4"]
 ) -> Float[Array, "n 4 4"]:
-    """Returns T_n = sum_j w_nj G_j. Its linear part is in general no rotation."""
+    """Returns T_n = sum_j w_nj G_j for each vertex, (n, 4, 4). Its linear part is in general no
+    rotation.
+    """
     return jnp.einsum("nj,jab->nab", weights, transforms, precision=EXACT)
 
 
@@ -318,7 +320,7 @@ class PosedBody(Batchable):
 
 @checked_arguments
 def rest_pose(body: BodyModel) -> BodyPose:
-    """Returns the T-pose: no rotation, no translation."""
+    """Returns the pose of a T-pose: no rotation, no translation, no expression."""
     dtype = body.template.dtype
     return BodyPose(jnp.zeros((len(body.parents), 3), dtype), jnp.zeros(3, dtype))
 

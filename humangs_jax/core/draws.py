@@ -1,4 +1,4 @@
-"""Random numbers by name, drawn all at once.
+"""Draws random numbers by name, all at once.
 
 Each draw of another shape puts a function of some 230 lines into a program and costs time to
 compile. So code that needs many numbers draws them once, uniform in [0, 1).

@@ -81,7 +81,8 @@ def memory_status(name: str) -> float:
 @contextlib.contextmanager
 def undisturbed() -> Generator[None]:
     """Makes Ctrl-C wait until the end of the block. Use it for short work that must not be left
-    half-done.
+    half-done. It does nothing in a thread other than the main one, because Ctrl-C reaches only that
+    one.
     """
     if threading.current_thread() is not threading.main_thread():  # only that one gets it
         yield
@@ -384,9 +385,9 @@ class Ahead:
     further compilation begins.
 
     Args:
-        at_once: programs that are compiled at once, each of which takes up to a gigabyte. With 0
-            nothing is compiled ahead. None: one where the machine has a core to spare, two where
-            it has more.
+        at_once: number of programs that are compiled at the same time, each of which takes up to a
+            gigabyte. With 0 nothing is compiled ahead. None: one where the machine has a core to
+            spare, two where it has more.
     """
 
     def __init__(self, at_once: int | None = None) -> None:

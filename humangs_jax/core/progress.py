@@ -50,7 +50,7 @@ def _printable_character(c: str) -> str:
 
 def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
     """Returns the lines of a table. The first `left` columns are aligned to the left, the others to
-    the right. Rows may end early.
+    the right. A row may have fewer cells than others.
     """
     widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows)))]
 
@@ -63,9 +63,11 @@ def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
 TICK = 0.2
 """Seconds between two updates of the line."""
 LONG = 10.0
-"""Seconds after which the name of a running stage is printed, if stderr is no terminal."""
+"""Seconds after which the name of a running stage is printed, and between two updates of a bar, if
+stderr is no terminal.
+"""
 CLEAR = "\r\033[K"
-"""Puts the cursor of a terminal at the beginning of an empty line."""
+"""Text that puts the cursor of a terminal at the beginning of an empty line."""
 
 
 @dataclasses.dataclass
@@ -192,9 +194,7 @@ def stage(name: str) -> Generator[None]:
 
 
 COMPILING = "compiling, once"
-"""Text of a bar until its first item is done, if a program of JAX is compiled for it, which takes
-many seconds.
-"""
+"""Text of a bar or a stage while a program of JAX is compiled, which takes many seconds."""
 
 
 _compiled: set[Hashable] = set()
@@ -290,7 +290,9 @@ def _name(current: Progress, stop: threading.Event, _: float) -> None:
 
 
 def _named(current: Progress) -> str:
-    """Returns the names of the outermost and the innermost running stage."""
+    """Returns the names of the outermost and the innermost running stage as text, or one name if
+    they are the same.
+    """
     return ": ".join(dict.fromkeys((current.names[0], current.names[-1])))
 
 

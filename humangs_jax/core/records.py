@@ -1,10 +1,10 @@
-"""Checks of records by the annotations of their fields.
+"""Checks records by the annotations of their fields.
 
     opacities: Annotated[Float[Array, " g"], UNIT]
 
 says that an array has one axis, as long as those that other fields call g, and numbers in [0, 1].
 Floating-point arrays without such a mark hold finite numbers. A record that is a field of another
-one is looked into where a mark names its batch axes: `Annotated[Camera, Batch("v")]`.
+one is checked, too, if a mark names its batch axes: `Annotated[Camera, Batch("v")]`.
 """
 
 import dataclasses

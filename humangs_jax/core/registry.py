@@ -1,4 +1,5 @@
-"""Tables of formats: files, folders and data sets that can be read or written, a row each.
+"""Tables of formats of files, folders and data sets that can be read or written. Each row is a
+format.
 
 A row names its code and imports it when it is first asked for, so that the command line, its help
 and the docs can list every format without importing any. A new format is one file and one line:
@@ -20,7 +21,7 @@ class Format:
     """One kind of files. Tables that say more of each kind use a subclass."""
 
     about: str
-    """Whose files these are, a few words: shown by `--help` and in the docs."""
+    """Whose files these are, in a few words. `--help` and the docs show it."""
     code: str | Callable[..., Any]
     """The function that reads or writes such files, or its name as "package.module:function"."""
     suffixes: tuple[str, ...] = ()
@@ -94,8 +95,8 @@ def alternatives(suffixes: tuple[str, ...]) -> str:
 
 
 def imported(code: str | Callable[..., Any]) -> Callable[..., Any]:
-    """Returns the function that "package.module:function" names; a function is returned as it
-    is.
+    """Returns the function that "package.module:function" names, or `code` itself if it is a
+    function.
     """
     if not isinstance(code, str):
         return code

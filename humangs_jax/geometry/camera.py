@@ -44,7 +44,7 @@ class Camera(Batchable):
     """
 
     K: Annotated[Matrix3, Part("focal lengths", lambda K: K[..., [0, 1], [0, 1]], POSITIVE)]
-    """Intrinsics, pixels."""
+    """Intrinsics, (3, 3), pixels."""
     cam_from_world: Matrix4
     """Rigid transform from the world to the camera, (4, 4), metres. Camera axes are OpenCV's: x
     right, y down, z forward.

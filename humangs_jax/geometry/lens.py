@@ -1,4 +1,4 @@
-"""Lenses: where a point of the plane z = 1 before a camera appears on it, and how far a lens
+"""Computes where a lens shows points of the plane z = 1 before a camera, and how far the lens
 reaches.
 
 "pinhole" with OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]] (Brown and Conrady,
@@ -13,8 +13,8 @@ k2 k3 k4, or none:
 
     (x, y) = (u, v) t / r (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
 
-"orthographic" has neither: pixels are fx X + cx and fy Y + cy, K in pixels a metre. Arrays are
-planes of any shape.
+"orthographic" has neither: pixels are fx X + cx and fy Y + cy, K in pixels a metre. u and v are
+arrays of one shape, which may be any.
 """
 
 import jax

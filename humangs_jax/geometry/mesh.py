@@ -100,10 +100,10 @@ def in_front(
 def smallest_turns(
     a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], opposite: float = 1e-6
 ) -> Float[np.ndarray, "*n 3 3"]:
-    """Returns the rotation matrices that turn unit vectors a into b by the smallest angle; the
-    identity where one is zero.
+    """Returns the rotation matrices that turn unit vectors a into b by the smallest angle, (..., 3,
+    3). Where a or b is zero, the matrix is the identity.
 
-    Where 1 + a.b is less than `opposite`, it is half a turn about some axis across a.
+    Where 1 + a.b is less than `opposite`, the rotation is half a turn about some axis across a.
     """
     from scipy.spatial.transform import Rotation
 

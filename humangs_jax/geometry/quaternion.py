@@ -14,12 +14,12 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
 def normalize(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
-    """Returns q / |q|; the identity, with zero gradient, where q is 0."""
+    """Returns q / |q|. Where q is 0, it is the identity, with zero gradient."""
     return safe_normalize(q, jnp.asarray(IDENTITY, q.dtype))
 
 
 def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array, "*b 4"]:
-    """Returns the Hamilton product p q: first rotates by q, then by p."""
+    """Returns the Hamilton product p q. As a rotation, it rotates first by q, then by p."""
     pw, px, py, pz = jnp.moveaxis(p, -1, 0)
     qw, qx, qy, qz = jnp.moveaxis(q, -1, 0)
     return jnp.stack(
@@ -95,8 +95,8 @@ def from_matrix(m: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
     """Returns the quaternion of a rotation matrix, by the best conditioned of the four candidates
     (see `candidates_from_matrix`).
 
-    A matrix that is no rotation is not repaired: the result then has |q| != 1, as in the published
-    network ("rotation" skinning).
+    A matrix that is no rotation is not repaired. The result may then have |q| != 1, as in the
+    published network ("rotation" skinning).
     """
     candidates, q_abs = candidates_from_matrix(m)
     best = jnp.argmax(q_abs, axis=-1)[..., None, None]
@@ -158,8 +158,8 @@ def to_axis_angle(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
 def interpolate(
     a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"], share: Float[Array, "*#b"]
 ) -> Float[Array, "*b 3"]:
-    """Returns the rotation vector at a share of the shortest way from a to b: spherical linear
-    interpolation (Shoemake 1985, https://doi.org/10.1145/325165.325242).
+    """Returns the rotation vector at a share, 0 to 1, of the shortest way from a to b. This is
+    spherical linear interpolation (Shoemake 1985, https://doi.org/10.1145/325165.325242).
     """
     start = from_axis_angle(a)
     turn = to_axis_angle(multiply(from_axis_angle(-a), from_axis_angle(b)))

@@ -310,8 +310,8 @@ class ArrayFile:
 
 _ONE_AT_A_TIME = threading.Lock()
 """Lock around reading the header of an array. numpy reads headers through Python's syntax trees,
-and CPython 3.11 counts the depth of these for all threads together. Two at once rarely fail with
-"AST constructor recursion depth mismatch" (python/cpython#106905).
+and CPython 3.11 counts the depth of these for all threads together. Two threads that read at once
+sometimes fail with "AST constructor recursion depth mismatch" (python/cpython#106905).
 """
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -407,6 +407,8 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
     """Returns the array of an archive's member of `size` bytes, or None for pickled objects.
 
     Memory is allocated only after the size is checked.
+    Raises: InvalidFileError for other types than numbers and strings, or for another size;
+    EOFError.
     """
     shape, columns_first, dtype = read_header(member)
     if dtype.hasobject:

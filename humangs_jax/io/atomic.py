@@ -288,8 +288,8 @@ def _described(entry: Path) -> str:
 
 
 def _entries(folder: str | os.PathLike[str]) -> list[str]:
-    """Returns the sorted names of a folder's entries. The list is empty if the folder does not
-    exist, for example because another process is replacing it.
+    """Returns the sorted names of a folder's entries. The list is empty for a file, and if the
+    folder does not exist, for example because another process is replacing it.
     """
     try:
         return sorted(os.listdir(folder))

@@ -2,9 +2,9 @@
 gamma with chromaticities.
 
 A conversion has three steps: a curve from levels to light, a matrix from the primaries of the file
-to those of sRGB, and the curve of sRGB. Profiles that consist of tables (of printers, scanners,
-CMYK) are left to Little CMS. In images of high dynamic range, the white of a sheet of paper becomes
-1, and brighter light is compressed.
+to those of sRGB, and the curve of sRGB (of BT.709 for HLG). Profiles that consist of tables (of
+printers, scanners, CMYK) are left to Little CMS. In images of high dynamic range, the white of a
+sheet of paper counts as 1, and light above 0.75 is compressed below 1.
 """
 
 import io
@@ -27,7 +27,7 @@ class Encoding(NamedTuple):
     curves: tuple[Curve, ...]
     """Curves from levels to light, one for each channel or one for all."""
     matrix: Float[np.ndarray, "3 3"]
-    """Matrix from light of the file's primaries to light of sRGB's."""
+    """Matrix (3, 3) from light of the file's primaries to light of sRGB's."""
     bright: bool = False
     """Whether light may be far beyond white."""
     camera: bool = False
@@ -77,8 +77,8 @@ def _power(exponent: float) -> Curve:
 
 
 def _compressed(light: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns light whose largest channel is compressed below 1. All three channels are scaled
-    alike, so the hue stays.
+    """Returns light whose largest channel is compressed below 1; up to 0.75 light is unchanged. All
+    three channels are scaled alike, so the hue stays.
     """
     knee = 0.75  # light up to here stays
     largest = np.maximum(light.max(axis=-1, keepdims=True), 1e-6)

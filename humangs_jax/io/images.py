@@ -344,7 +344,7 @@ def is_own_output(path: str | Path) -> bool:
 def image_row(
     images: Iterable[Float[np.ndarray, "h w c"]], height: int = 240
 ) -> Float[np.ndarray, "height w c"]:
-    """Returns one image of all images side by side, each resized to `height` pixels."""
+    """Returns one image of all images side by side, each resized to a height of `height` pixels."""
     return np.concatenate(
         [resized(i, max(1, round(i.shape[1] * height / i.shape[0])), height) for i in images],
         axis=1,

@@ -2,9 +2,10 @@
 files of scans by trimesh.
 
 GLB is JSON that describes arrays, and one block of their bytes
-(https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#glb-file-format-specification).
-Everything that trimesh would trust is checked before. Textures of an OBJ file are read if they lie
-in its folder and are PNG or JPEG. A texture that cannot be read is left out, with a warning.
+(https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#glb-file-format-specification). Files
+that an OBJ file names are checked before trimesh gets them. Textures are read if they lie in the
+folder of the OBJ file and are PNG or JPEG. A texture that cannot be read is left out, with a
+warning.
 """
 
 import io
@@ -42,7 +43,9 @@ BINARY_CHUNK = 0x004E4942
 """Kind of the chunk with the numbers."""
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-"""https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#accessor-data-types"""
+"""Type of the numbers for each component type of an accessor
+(https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#accessor-data-types).
+"""
 VERTICES = 34962
 """Target of a buffer view that a graphics card reads as vertices."""
 INDICES = 34963

@@ -96,7 +96,7 @@ class Limits:
     network_views: int = 512
     """Photos that the network looks at together."""
     views_per_photo: int = 16
-    """Views of a capture that name one photo."""
+    """Views of a capture, divided by the photos that they name."""
     frames: int = 250_000
     """Frames of a motion or a capture, read or written."""
     rate: int = 1000
@@ -104,11 +104,11 @@ class Limits:
     frames_per_photo: int = 100
     """Frames of a capture without poses, divided by its photos."""
     people: int = 100_000
-    """People in keypoint files, and their images."""
+    """People in keypoint files together with their images, or people in a motion file."""
     parts: int = 2000
-    """Materials of an OBJ, solids of an STL, or mesh parts of a GLB file."""
+    """Materials of an OBJ, and its textures with them, or parts of a GLB file's meshes."""
     entries: int = 1_000_000
-    """Files of a folder that is searched for photos or keypoints."""
+    """Files and folders in a folder that is searched for photos or keypoints."""
 
 
 _current: Limits | None = None
@@ -217,7 +217,7 @@ class FileError(ValueError):
 
 def is_unread(error: BaseException) -> bool:
     """Says whether a file could not be read because of its permissions, so that nothing is known
-    about its content.
+    about its content. error: as `reading` raised it.
     """
     return isinstance(error.__cause__, PermissionError)
 
@@ -361,8 +361,8 @@ def walk(
 
 
 def visible(paths: Iterable[Path]) -> list[Path]:
-    """Returns the paths whose names do not begin with a dot. Such names have `._NAME` files of
-    macOS, and files that are still being written.
+    """Returns the paths whose names do not begin with a dot. Files of macOS (`._NAME`) and files
+    that are still being written have such names.
     """
     return [path for path in paths if not path.name.startswith(".")]
 

@@ -56,7 +56,7 @@ PRESETS = {
 """For each preset of VRM, the weights of ARKit's shapes at a weight of 1. Names of presets are in
 lower case. A shape without a side stands for both sides."""
 FARTHEST = 10.0
-"""The largest size of a coefficient of a track. Shapes are made for 0 to 1, and components of
+"""Largest magnitude of a coefficient of a track. Shapes are made for 0 to 1, and components of
 SMPL-X go up to about 3.
 """
 _PLAIN = {name.lower(): name for name in ARKIT}
@@ -84,9 +84,8 @@ def arkit_name(name: str) -> str | None:
 
 
 def of_preset(name: str) -> dict[str, float] | None:
-    """Returns weights of ARKit's shapes for a name of ARKit or a preset of VRM.
-
-    None for another name.
+    """Returns the weight of each of ARKit's shapes that a name stands for: a shape of ARKit or a
+    preset of VRM. None for another name.
     """
     own = arkit_name(name)
     if own is not None:

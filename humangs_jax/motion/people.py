@@ -57,7 +57,7 @@ class Person(NamedTuple):
     values: Mapping[str, Any]
     """The values of the person, by the file's keys."""
     frames: np.ndarray | None = None
-    """Numbers of the frames in which the person was seen; None for all."""
+    """Numbers of the frames in which the person was seen. None if the file has none."""
     pickled: tuple[str, ...] = ()
     """Keys whose values are not read because they are pickled."""
 
@@ -154,7 +154,8 @@ def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
 def _found(content: Any, name: str, depth: int) -> list[Person]:
     """Returns the people in some content.
 
-    name: of a person without a name. depth: number of levels above the content.
+    name: given to a person who has none in the file. depth: number of levels above the content.
+    Raises: InvalidFileError for more people than the limit.
     """
     content = objects(content)
     if depth > _DEEPEST:

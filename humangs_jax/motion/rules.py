@@ -36,7 +36,7 @@ COLUMNS = {
     72: "SMPL",
     BODY_NUMBERS: "the body",
 }
-"""How many numbers a pose has, and the body model that has this many."""
+"""Number of numbers in a pose -> the body model that has this many."""
 MILLIMETRES = 1000.0
 ORTHONORMAL = 0.05
 """Largest difference of R R^T from the identity at which a matrix in a file is a rotation."""

@@ -30,9 +30,9 @@ _RENDER = (
     "make rotations of them, as MDM's `python -m visualize.render_mesh` does (*_smpl_params.npy)"
 )
 _FEATURES = {263: "HumanML3D", 251: "KIT-ML"}
-"""Numbers of columns of feature vectors, and the data set that has them."""
+"""Number of columns of feature vectors -> the data set that has them."""
 _JOINTS = {22: "HumanML3D's new_joints", 21: "KIT-ML's new_joints"}
-"""Numbers of joints in space, and the data set that has them."""
+"""Number of joints in space -> the data set that has them."""
 
 
 def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
@@ -79,12 +79,14 @@ def hint_for(values: Mapping[Any, Any]) -> str:
 
 
 def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[str, Any]:
-    """Replaces rotations of six numbers by matrices (m, j, 3, 3), and puts frames first.
+    """Returns values in which rotations of six numbers are replaced by matrices (m, j, 3, 3), and
+    frames come first.
 
-    rotations: key of an array (j, 6, m) or (m, j, 6). moves: key of the positions, which become
-    (m, 3).
+    rotations: key of an array (j, 6, m) or (m, j, 6). moves: key of the positions, which become (m,
+    3).
 
-    Raises: InvalidFileError, which names the key, if the rotations have another shape.
+    Raises: InvalidFileError, which names the key, if the rotations have another shape or are no
+    real numbers.
     """
     six = np.asarray(as_array(values[rotations]))
     last = six.ndim == 3 and six.shape[1] == 6
@@ -102,7 +104,9 @@ def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[
 
 
 def _matrices_of(six: Float[np.ndarray, "*b 6"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Makes rotation matrices of their first two rows; not finite where these are 0 or parallel."""
+    """Returns rotation matrices from their first two rows. A matrix is not finite if its rows are 0
+    or parallel.
+    """
     a, b = np.asarray(six[..., :3], np.float64), np.asarray(six[..., 3:], np.float64)
     with np.errstate(all="ignore"):
         first = a / np.linalg.norm(a, axis=-1, keepdims=True)

@@ -47,7 +47,7 @@ WEIGHTS = 8
 STEPS = 65535
 SMALLEST_SCALE = 1e-7
 """Smallest scale of a Gaussian, metres. It keeps the logarithm finite for flat Gaussians, and is
-too small to be seen: a thousandth of eps2d for a camera at any distance.
+too small to be seen.
 """
 _SMALLEST_RANGE = 1e-6
 """Least range of quantized values. It keeps the division finite where all values are equal."""

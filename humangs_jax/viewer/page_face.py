@@ -25,8 +25,9 @@ def pack_face(
     nearest vertex of each hidden Gaussian, for sliders of shape. face_shown uint8 (hidden,): the
     expression that shows a hidden Gaussian, or 255 for one that is seen between the lips. face_lips
     float32 (4, 3): points of the lips, metres. face_lip_directions float32 (e, 4, 3): how these
-    points move, metres. face_turns float32 (e, 2, 3): turns of both eyes. motion_faces int16
-    (m, e): coefficients divided by motion.face_step; only if the motion has some.
+    points move, metres. face_turns float32 (e, 2, 3): axis-angle of both eyes, radians.
+    motion_faces int16 (m, e): coefficients divided by motion.face_step; only if the motion has
+    some. Here g counts the hidden Gaussians, too.
     """
     face = avatar.face
     assert face is not None
