@@ -1,4 +1,4 @@
-"""`python -m humangs_jax`: the `humangs` command, where scripts are not on the path."""
+"""Lets `python -m humangs_jax` run the `humangs` command, where scripts are not on the path."""
 
 from humangs_jax.cli import main
 

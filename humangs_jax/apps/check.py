@@ -390,7 +390,7 @@ def _label(view: ViewCheck) -> str:
 # --------------------------------------------------------------------------------------------------
 
 VIEWS = 24
-"""Most views on the sheet of a fit."""
+"""Largest number of views on the sheet of a fit."""
 _FINE = 2
 """Factor by which a sheet is drawn too large and then shrunk, so that lines are smooth."""
 

@@ -210,21 +210,21 @@ class FromPhotos:
     out: Path
     """The capture folder to write."""
     cameras: Path | None = None
-    """File or folder of the calibration; None: that of the folder of photos, if there is one.
-    `_IGNORE`: none.
+    """File or folder of the calibration. None: the calibration in the folder of photos, if there is
+    one. `_IGNORE`: no calibration is used.
     """
     masks: Path | None = None
-    """Folder of masks; None: that of the folder of photos, if there is one."""
+    """Folder of masks. None: the masks in the folder of photos, if there are any."""
     others: Path | None = None
-    """Folder of masks of what is in front of the person; None: that of the folder of photos, if
-    there is one.
+    """Folder of masks of what is in front of the person. None: such masks in the folder of photos,
+    if there are any.
     """
     keypoints: Path | None = None
-    """File or folder of keypoints; None: those of the folder of photos, if there are any."""
+    """File or folder of keypoints. None: those in the folder of photos, if there are any."""
     person: int | None = None
-    """Number of the person, if there are several; None: the only one."""
+    """Number of the person, if there are several. None: the only one, or the only large one."""
     height: float | None = None
-    """Height of the person, metres, without a calibration. None: that of an average person."""
+    """Height of the person, metres, if there is no calibration. None: an average person's."""
     scale: float | None = None
     """Metres per unit of the calibration. None: 1."""
     up: str | None = None

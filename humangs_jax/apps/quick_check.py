@@ -62,7 +62,7 @@ _LIMITS = _Limits()
 
 
 VIEWS = 24
-"""Most views that are looked at before a reconstruction. They are evenly chosen."""
+"""Largest number of views that are looked at before a reconstruction. They are evenly chosen."""
 
 Matrix = Float[np.ndarray, "4 4"]
 Cells = Bool[np.ndarray, "rows columns"]

@@ -307,8 +307,8 @@ def _scan(folder: Path) -> FolderScan:
 
 
 READ = 8
-"""Most photos that the network reads if cameras were found from the person. More photos would take
-longer and give no sharper avatar. All photos serve for poses and refinement.
+"""Largest number of photos that the network reads if cameras were found from the person. More
+photos would take longer and give no sharper avatar. All photos serve for poses and refinement.
 """
 SIZE = 512
 """Side of the crop in which bodies are compared, pixels."""
@@ -401,8 +401,8 @@ def _psnr_of_person(
 
 
 def _photos_to_hold_out(capture: Capture | PreparedCapture) -> PreparedCapture:
-    """Prepares the photos of which one will be held out: those that the network reads, reduced to
-    `LONGEST` pixels.
+    """Returns the prepared photos of which one will be held out. They are the photos that the
+    network reads, reduced to `LONGEST` pixels.
     """
     photos = photos_to_read(prepare_capture(capture))
     large = max(photos.capture.images.shape[1:3]) > LONGEST

@@ -156,7 +156,7 @@ class Animate:
         )
 
     def _motion(self, avatar: "Avatar") -> "Motion":
-        """Reads the motion of a file, or finds that of a video.
+        """Reads the motion of a file, or finds the motion in a video.
 
         Raises: UsageError for options that a video does not take.
         """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """From photos or a video of a person to an avatar in the browser.
+    """Make an avatar from photos or a video, and show it in the browser.
 
     Cameras, masks and keypoints are used if the folder has them, and estimated otherwise. Run it
     again after you have added something. docs: your_photos.

@@ -312,7 +312,7 @@ def falling_tube(
 
     thickness: by which the skull is enlarged, metres. bottom: template height where the tube ends
     at the back. opening: where the face is free. wave: height of waves, metres. ends: template
-    height where the tube ends in front. None: that of hair, which ends on the shoulders. over:
+    height where the tube ends in front. None: 0.15, where hair ends on the shoulders. over:
     distance of the clothes below from the skin, metres.
     """
     skin, template = anatomy.skin, anatomy.skin.template

@@ -411,7 +411,7 @@ def _sample(
 ) -> Float[Array, "p 6"]:
     """Returns a person's texture (p, 6) at uv coordinates `at` (p, 2) in [0, 1], with v down.
 
-    Values are interpolated bilinearly; they are those of the bytes, as floats in 0 to 255.
+    Values are floats in [0, 255], interpolated bilinearly.
     """
     size = texture.shape[1]
     at = jnp.clip(at * size - 0.5, 0, size - 1)
@@ -454,7 +454,7 @@ def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
 class GeneratedSource:
     """Source of examples that `make` computes from random keys.
 
-    All keys are those of people of one split, see `subject.SPLITS`.
+    All keys are made from seeds of one split, see `subject.SPLITS`.
 
     Raises: ValueError if there is no split of that name.
     """

@@ -19,7 +19,8 @@ logger = logging.getLogger(__name__)
 
 
 def people_of_run(people: int, out: Path, body: BodyModel) -> SourceFactory:
-    """Makes a source of the first people of the training split, rendered anew for every step.
+    """Returns a function that makes a source of the first people of the training split. They are
+    rendered anew for every step.
 
     people: number of people. out: folder of the run, which keeps their bank.
     """
@@ -29,7 +30,8 @@ def people_of_run(people: int, out: Path, body: BodyModel) -> SourceFactory:
 def people_of_split(
     people: int, body: BodyModel, split: str, size: int, each_once: bool = False
 ) -> SourceFactory:
-    """Makes a source of the first people of a split, rendered anew for every step.
+    """Returns a function that makes a source of the first people of a split. They are rendered anew
+    for every step.
 
     people: number of people. size: side of the images, pixels. Textures are as fine as images of
     this size need.
@@ -47,7 +49,8 @@ def people_of_split(
 def on_the_fly_people(
     bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY, each_once: bool = False
 ) -> SourceFactory:
-    """Makes a source of the people of a bank, rendered for every step on the device that trains.
+    """Returns a function that makes a source of the people of a bank. They are rendered for every
+    step on the device that trains.
 
     Image sizes and views are those of the run's configuration.
 

@@ -250,8 +250,8 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
 
     person: the description to build, such as one with other clothes. None: that of the seed.
 
-    Raises: ValueError if the body is not the package's body; the cuts and the paint of clothes are
-    given in the coordinates of that one.
+    Raises: ValueError if the body is not the package's body. The cuts and the paint of clothes are
+    given in coordinates of the package's body.
     """
     if (body.name, len(body.template)) != BODY:
         raise ValueError(f"synthetic people need the shipped body '{BODY[0]}', got '{body.name}'")

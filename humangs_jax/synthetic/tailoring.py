@@ -71,7 +71,7 @@ def neckline(template: Points, style: str, depth: float) -> Field:
 
 
 def sleeves(template: Points, end: float) -> Field:
-    """Returns a field (n,) that is positive on trunk and arms up to |x| = end.
+    """Returns a field (n,) that is positive everywhere but on arms beyond |x| = end.
 
     With end < 0.2 the top is sleeveless, and its armholes widen down to the armpits.
     """
@@ -439,8 +439,8 @@ def _skirt_weights(
 ) -> Float[np.ndarray, "n j"]:
     """Returns the skinning weights (n, j) of a skirt.
 
-    They are those of the trunk at the waist. Further down they are blended into the weights of the
-    thigh and the shin on the vertex's side. template_y: template heights of the vertices (n,).
+    At the waist they are the trunk's weights. Further down they are blended into weights of thigh
+    and shin. template_y: template heights of the vertices (n,).
     """
     x, y, _ = anatomy.skin.template.T
     near = np.flatnonzero((np.abs(x) < 0.2) & (y < 0.0) & (y > -0.4))[::2]

@@ -148,7 +148,7 @@ def _seamed(colors: Points, s: Spots) -> Points:
 def _hemmed(colors: Points, s: Spots, hem: float, sleeve: float | None) -> Points:
     """Adds stitches at height y = hem on trunk or legs, and at |x| = sleeve on arms.
 
-    sleeve: None for no stitches on arms.
+    sleeve: None: there are no stitches on arms.
     """
     x, y, _ = s.template.T
     on_arm = np.abs(x) > 0.2

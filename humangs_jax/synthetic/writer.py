@@ -315,8 +315,8 @@ def _views(
 def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
     """Returns the capture folders in `root`, sorted by name.
 
-    split: the split that all people of a synthetic set must belong to. None: any. It does not
-    matter for other folders: real captures, and those of `humangs preprocess`.
+    split: the split that all people of a synthetic set must belong to. None: any. It is ignored for
+    real captures and for captures of `humangs preprocess`.
 
     Raises: ValueError if a synthetic set has a person of another split, or if there is no capture.
     """

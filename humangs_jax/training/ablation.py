@@ -164,11 +164,11 @@ def ablate(
         intervals.
 
     Raises:
-        ValueError: before the first run, if a variant is named "base", has a path that is no field,
-            changes the seed, needs a network that is missing or cannot be made, or cannot use
-            people on disk that the base can use; if there is no such metric; if `seeds` is below
-            1. Later, if a folder holds a run of other settings, or if there is nobody to compare
-            on.
+        ValueError: before the first run, if a variant cannot be trained. It may be named "base",
+            change the seed, have a path that is no field, describe a network that cannot be made,
+            need a loss network that is missing, or lack people on disk that the base can use. Also
+            if there is no such metric, or `seeds` is below 1. Later, if a folder holds a run of
+            other settings, or if there is nobody to compare on.
         TrainingInterrupted: after Ctrl-C. What is trained is kept.
 
     Examples:

@@ -117,7 +117,8 @@ class TrainConfig:
     """The optimizer and its learning rate."""
     splat: SplatConfig = SplatConfig()
     """How targets are drawn. Without `max_pairs`, a run on one device measures what the first
-    targets of a stage need. Its buffers then have room for twice that, see `training.room`.
+    targets of a stage need, where measuring is worth it. Its buffers then have room for twice that,
+    see `training.room`.
     """
     target_size: Side = 128
     """Side of the targets, pixels."""

@@ -63,9 +63,9 @@ def reconstruct_example(
 def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
     """Returns the network's configuration with the token capacity for a step of `views` photos.
 
-    The configured capacity is for the largest of `views.input_counts`. Fewer photos get their share
-    plus that of one view, because one photo may show more of a person than the others. More photos
-    get more in proportion.
+    The configured capacity is for the largest of `views.input_counts`, m. Fewer photos, n, get the
+    share (n + 1) / (m + 1) of it, because one photo may show more of a person than the others. More
+    photos get more in proportion.
     """
     most, capacity = max(config.views.input_counts), config.model.runtime.token_capacity
     if views == most:
@@ -185,7 +185,8 @@ def as_validated(config: TrainConfig) -> TrainConfig:
 
 
 def compared_as(base: TrainConfig, make_source: SourceFactory) -> SourceFactory:
-    """Returns a source of the people with the photos and targets that `base` is validated on.
+    """Returns a function that makes a source of the people of `make_source`, with the photos and
+    targets that `base` is validated on.
 
     It is for variants of the run `base`. A variant changes only the size of the photos that the
     network sees.

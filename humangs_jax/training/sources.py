@@ -88,15 +88,15 @@ def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list
 def captured_people(
     folders: Sequence[str | Path], body: BodyModel, body_file: str | Path = DEFAULT_BODY
 ) -> SourceFactory:
-    """Returns a source of capture folders whose parameters belong to `body`. Images are decoded
-    once for all stages.
+    """Returns a function that makes a source of capture folders, whose parameters belong to `body`.
+    Images are decoded once for all stages.
     """
     return _cached_people(CaptureCache(folders, body, body_file=body_file))
 
 
 def _cached_people(cache: PeopleCache) -> SourceFactory:
-    """Returns a source of people on disk. Images are decoded once for all stages. Depths are
-    unknown.
+    """Returns a function that makes a source of people on disk. Images are decoded once for all
+    stages. Depths are unknown.
     """
 
     def make(config: TrainConfig) -> Source:
@@ -114,15 +114,15 @@ def _cached_people(cache: PeopleCache) -> SourceFactory:
 
 
 def mixed_people(parts: Sequence[SourceFactory], weights: Sequence[float | int]) -> SourceFactory:
-    """Returns a source that mixes several sources. weights: the share of each, see
-    `examples.Mixture`.
+    """Returns a function that makes a source of several sources, `parts`. weights: the share of
+    each, see `examples.Mixture`.
     """
     return lambda config: Mixture(tuple(part(config) for part in parts), tuple(weights))
 
 
 def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> SourceFactory:
-    """Returns a source of the people in a folder of captures, a scene list or a data set
-    (docs/datasets.md), whose body is `body`.
+    """Returns a function that makes a source of the people in a folder of captures, a scene list or
+    a data set (docs/datasets.md), whose body is `body`.
 
     split: the split that all people of a synthetic set must belong to, see
     `synthetic.writer.find_people`. None: any.
@@ -143,8 +143,8 @@ def training_people(
     body: BodyModel,
     body_file: str | Path = DEFAULT_BODY,
 ) -> SourceFactory:
-    """Returns a source of the people of `people_on_disk`, of `on_the_fly` synthetic people that are
-    rendered for every step, or of both, half and half.
+    """Returns a function that makes a source of the people of `people_on_disk`, of `on_the_fly`
+    synthetic people who are rendered for every step, or of both, half and half.
 
     One process makes the synthetic people once, into out/people.npz. Raises: ValueError if there is
     nobody, or if synthetic people are asked for with another body than the shipped one.

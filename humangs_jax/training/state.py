@@ -67,9 +67,9 @@ class GuardState(NamedTuple):
     """The state of `guard`."""
 
     skipped: Int[Array, ""]
-    """Steps skipped so far."""
+    """Number of steps skipped so far."""
     nonfinite: Int[Array, ""]
-    """Steps so far whose loss or gradient was not finite, skipped or not."""
+    """Number of steps so far whose loss or gradient was not finite, skipped or not."""
     norm: Float[Array, ""]
     """Norm of the last gradient, after it was made finite and before it is clipped."""
     inner: PyTree

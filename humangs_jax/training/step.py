@@ -188,7 +188,7 @@ def batch_gradients(
     mesh: Mesh | None = None,
 ) -> Gradients:
     """Returns the `local_gradients` of a whole batch. Each device of a mesh takes its share of the
-    subjects.
+    subjects, and gets its part of the gradients, see `sharding.partition`.
     """
     if mesh is None:
         return local_gradients(params, batch_stats, body, batch, keys, config, networks)
