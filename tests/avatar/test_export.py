@@ -65,7 +65,7 @@ TRANSFORM = shutil.which(
 
 
 @pytest.mark.parametrize(("up", "matrix"), MATRICES.items())
-def test_a_world_is_turned_as_a_whole_and_up_is_where_it_is_said(up, matrix):
+def test_a_world_is_turned_as_a_whole_to_the_up_that_was_asked_for(up, matrix):
     before, R = random_gaussians(), np.asarray(matrix, float)
     after = turned(before, up)
     np.testing.assert_allclose(R @ [0, 1, 0], AXES[up], atol=1e-6)

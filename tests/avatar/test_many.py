@@ -110,7 +110,7 @@ def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(netwo
         ("reconstruct people/a --batch 0", "--batch 0: expected at least 1"),
     ],
 )
-def test_what_cannot_be_meant_is_said_before_the_work(
+def test_what_cannot_be_meant_is_refused_before_the_work(
     line, problem, tmp_path, monkeypatch, humangs
 ):
     monkeypatch.chdir(tmp_path)

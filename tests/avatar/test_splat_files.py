@@ -515,7 +515,7 @@ def test_version_4_is_written_and_read(tmp_path):
         hg.save_gaussians(tmp_path / "a.ply", scene(), version=4)
 
 
-def test_what_a_spz_says_and_is_not_used_is_told(tmp_path, caplog):
+def test_unused_entries_of_a_spz_are_reported(tmp_path, caplog):
     system = struct.pack("<III", 0xADBE0003, 4, 1)
     other = struct.pack("<II", 0x12340001, 3) + b"abc"
     (tmp_path / "a.spz").write_bytes(spz_four(zeros(), flags=3, records=system + other))
@@ -603,7 +603,7 @@ def test_other_files_of_gaussians_are_named_with_what_converts_them(name, messag
         hg.load_gaussians(tmp_path / name)
 
 
-def test_colors_of_other_spaces_are_told(tmp_path, caplog):
+def test_colors_of_other_spaces_are_reported(tmp_path, caplog):
     def linear(content):
         return content["meshes"][0]["primitives"][0]["extensions"][EXTENSION].update(
             colorSpace="lin_rec709_display"

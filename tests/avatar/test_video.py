@@ -135,7 +135,7 @@ def test_float32_roundings_beside_0_and_1_are_written(tmp_path):
     ("name", "size"),
     [("a.mp4", (64, 48)), ("a.webm", (64, 48)), ("a.gif", (63, 47)), ("a", (63, 47))],
 )
-def test_the_size_that_is_told_is_that_of_the_file(tmp_path, name, size):
+def test_the_reported_size_is_that_of_the_file(tmp_path, name, size):
     write_video(tmp_path / name, moving_square(2, 47, 63), 24)
     file = tmp_path / name / "frame_00000.png" if name == "a" else tmp_path / name
     assert video_size(file.parent if name == "a" else file, 63, 47) == size

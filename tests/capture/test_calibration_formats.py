@@ -448,7 +448,7 @@ def test_photos_of_one_moment_are_one_frame(tmp_path, kind):
         ),
     ],
 )
-def test_moments_that_cannot_be_told_apart_are_refused(tmp_path, keys, problem):
+def test_moments_that_are_not_distinct_are_refused(tmp_path, keys, problem):
     with pytest.raises(CaptureError, match=problem):
         at_moments(tmp_path, keys)
     assert not (tmp_path / "out").exists()

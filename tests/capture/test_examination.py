@@ -109,7 +109,7 @@ def test_exchanged_sides_are_named_before_what_they_cause(good):
     assert report.warnings[1].startswith("body and keypoints disagree in view m1v2")
 
 
-def test_exchanged_hands_are_told_and_explain_the_sides_of_their_view_and_no_cameras(monkeypatch):
+def test_exchanged_hands_are_named_and_explain_the_sides_of_their_view_and_no_cameras(monkeypatch):
     """The other exchanges are given, because finding them takes long."""
     names = ("left_wrist", "right_wrist", "left_hand_root", "right_hand_root", "nose")
     capture, keypoints = person(0, 1, 2, kind=KeypointSet("wrists", names, (1, 0, 3, 2, 4)))

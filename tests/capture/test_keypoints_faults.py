@@ -41,7 +41,7 @@ def annotations(size=SIZE, **more):
 # --------------------------------------------------------------------------------------------------
 
 
-def test_frames_that_were_matched_in_order_are_told(tmp_path):
+def test_frames_that_were_matched_in_order_are_reported(tmp_path):
     """OpenPose counts the frames of a video from 0 and ffmpeg from 1."""
     content = [entry(f"clip_{i:012d}", shift=i) for i in range(3)]
     (tmp_path / "k.json").write_text(json.dumps(content))
@@ -69,7 +69,7 @@ def test_confidences_a_little_out_of_range_are_clipped(tmp_path, confidence, cli
     assert read(tmp_path / "k.json", [with_number(2, confidence)]).confidences[0, 0] == clipped
 
 
-def test_scores_of_another_scale_are_divided_by_the_largest_of_the_file_and_it_is_said(tmp_path):
+def test_scores_of_another_scale_are_divided_by_the_largest_with_a_warning(tmp_path):
     people = [entry(confidence=1.5), entry("back", confidence=6.0)]
     people[0]["keypoints"][2] = 3.0
     keypoints = read(tmp_path / "k.json", people)

@@ -583,7 +583,7 @@ def assert_named(keypoints, seen=lambda name: True):
 
 @pytest.mark.parametrize("seen", ["all", "without legs", "without the head", "some"])
 @pytest.mark.parametrize("order", ORDERS)
-def test_the_order_of_openposes_points_is_told_by_where_they_lie(order, seen, tmp_path):
+def test_the_order_of_openposes_points_is_found_by_where_they_lie(order, seen, tmp_path):
     hidden = {
         "all": (),
         "without legs": ("knee", "ankle", "toe", "heel"),
@@ -615,7 +615,7 @@ def test_easymocaps_25_points_may_be_in_either_order_and_keep_their_hands(tmp_pa
     np.testing.assert_array_equal(found.points[0, 25:46] - 0.5, np.asarray(hand)[:, :2])
 
 
-def test_an_order_that_is_not_clear_is_the_usual_one_and_said(tmp_path):
+def test_an_order_that_is_not_clear_is_the_usual_one_with_a_warning(tmp_path):
     few = lambda name: name in ("nose", "left_wrist", "right_wrist", "left_big_toe", "left_eye")
     for order, line in (
         ("BODY_25B", "taken for BODY_25, not BODY_25B"),

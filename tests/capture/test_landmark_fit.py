@@ -149,7 +149,7 @@ def still():
 
 
 @pytest.mark.slow
-def test_what_one_view_does_not_determine_is_told(still):
+def test_what_one_view_does_not_determine_is_reported(still):
     joints, seen, fit = still
     found = fit_uncertainty(model_of(), seen, fit)
     camera = np.asarray(seen.cam_from_world[0, 0])

@@ -86,7 +86,7 @@ def test_someone_who_moved_is_given_a_pose_for_each_photo_and_someone_who_stood_
     assert np.linalg.norm(after) < np.linalg.norm(before)
 
 
-def test_the_movement_that_is_told_is_that_across_the_line_of_sight():
+def test_the_reported_movement_is_that_across_the_line_of_sight():
     one = with_own_poses(truth()).select([0])
     towards = np.asarray(one.cameras.center[0]) - np.asarray(one.poses.translation[0])
     towards = 0.2 * towards / np.linalg.norm(towards)

@@ -121,7 +121,7 @@ def test_one_photo_is_enough_for_its_own_camera():
     )
 
 
-def test_photos_of_several_moments_are_told_and_stand_alone():
+def test_photos_of_several_moments_are_named_and_stand_alone():
     changes = (
         ("standing", 0, 0.0),
         ("crouching", 0, 0.4),
@@ -157,7 +157,7 @@ def cameras_at(*azimuths):
 
 
 @pytest.mark.parametrize("azimuths", [(0, 0.5, 1, 1.5), (40, 40.6, 41.2, 42, 42.4)])
-def test_photos_from_one_side_stand_alone_and_are_said_to_be_from_one_side(azimuths):
+def test_photos_from_one_side_stand_alone_with_a_warning(azimuths):
     found = cameras_from_person(seen_by(posed(), cameras_at(*azimuths)))
     assert found.moments == len(azimuths) == len(found.views)
     assert any(
@@ -345,7 +345,7 @@ def test_all_moments_of_a_camera_that_stands_still_count_and_two_cameras_may_be_
 
 
 @pytest.mark.parametrize("views", [1, 2])
-def test_nothing_is_said_of_one_or_two_cameras(views):
+def test_nothing_is_reported_for_one_or_two_cameras(views):
     truth, keypoints = person(0, 1, views)
     assert find_camera_errors(turned(truth, [0], (2.0, 0.0, 0.0)), keypoints) == ()
 

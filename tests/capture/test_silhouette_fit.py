@@ -186,7 +186,7 @@ def test_views_with_an_empty_mask_take_no_part():
 
 
 @pytest.mark.slow
-def test_cameras_that_look_the_other_way_are_told_and_left():
+def test_cameras_that_look_the_other_way_are_named_and_left():
     away = turned(truth(), 180.0)
     refined = refine_capture(away, config=CONFIG)
     assert not refined.report.kept and refined.capture is away

@@ -175,7 +175,7 @@ def test_smoothness_that_the_keypoints_contradict_by_the_certainty_that_the_fit_
     np.testing.assert_array_equal(again.joints, fit.joints)
 
 
-def test_what_became_of_smooth_motion_is_told():
+def test_the_result_of_smoothing_is_reported():
     joints = np.zeros((5, 4, 3)) + 0.05 * np.arange(5)[:, None, None]
     found = lambda held, joints=joints: list(_motion_warnings(joints, held, 0.01))
     assert found(0.01) == []

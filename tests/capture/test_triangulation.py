@@ -345,7 +345,7 @@ def test_a_view_that_exchanges_left_and_right_is_found_by_the_others(wrong):
     assert [i for i, mirrored in enumerate(match.mirrored) if mirrored] == [wrong]
 
 
-def test_somebody_whom_one_view_alone_shows_stays_alone():
+def test_a_person_in_one_view_only_is_matched_to_nobody():
     views, _ = seen_in(somebody(3)[None])
     stranger = somebody(4, 0.7)[:, :2] * [250, -250] + 256
     views[1] = views[1]._replace(people=(np.c_[stranger, np.ones(17)], *views[1].people))
@@ -406,7 +406,7 @@ SIDEWAYS = np.asarray([200.0, 0.0, 0.0])
 """A move by 200 pixels without a change of visibility."""
 
 
-def test_whom_space_does_not_link_the_photo_of_one_camera_links():
+def test_people_without_rays_in_common_are_linked_by_the_photos_of_one_camera():
     """Each moment has one view; two people change their order in the list, and a third comes."""
     views, _ = seen_in(np.stack([somebody(0, -0.5), somebody(1, 0.5)]), 1)
     first, second = views[0].people

@@ -67,7 +67,7 @@ def test_one_module_writes_to_the_terminal():
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
-def test_any_name_can_be_said_on_any_terminal(encoding, monkeypatch):
+def test_any_name_can_be_printed_on_any_terminal(encoding, monkeypatch):
     stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
     monkeypatch.setattr(sys, "stdout", stream)
     progress.say("写真 caf\udce9.png: 3 × 4\nsecond")
@@ -97,7 +97,7 @@ def test_an_error_in_a_bar_is_a_line_of_its_own(terminal, monkeypatch, capsys):
     assert "humangs: error: no" in lines_of(capsys.readouterr().err)
 
 
-def test_what_is_said_beside_a_bar_is_a_line_of_its_own(capsys):
+def test_a_message_beside_a_bar_has_a_line_for_itself(capsys):
     with progress.bar(total=3, desc="a\x1b[2J\nb") as shown:
         shown.update(1)
         shown.refresh()

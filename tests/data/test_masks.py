@@ -272,7 +272,7 @@ def test_masks_of_photos_on_white_are_never_moved(folder, caplog):
 
 
 @pytest.mark.parametrize(("option", "moved"), [((), True), (("--no-fit-masks",), False)])
-def test_reconstruct_moves_masks_unless_told_not_to(
+def test_reconstruct_moves_masks_unless_asked_not_to(
     option, moved, folder, caplog, monkeypatch, capsys
 ):
     place, _ = folder

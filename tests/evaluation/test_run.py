@@ -386,7 +386,7 @@ class People:
         )
 
 
-def test_people_of_one_name_are_told_apart():
+def test_people_of_one_name_are_kept_apart():
     paths = [Path("/data/Actor01/Sequence1"), Path("/data/Actor02/Sequence1")]
     assert _short_names(paths) == ("Actor01_Sequence1", "Actor02_Sequence1")
     assert _short_names([Path("a/x"), Path("a/y")]) == ("x", "y")

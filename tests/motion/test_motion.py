@@ -70,7 +70,7 @@ def smpl_params(**changes):
     return {k: v for k, v in {**parts, **changes}.items() if v is not None}
 
 
-def test_principal_coefficients_of_hands_are_left_flat_and_that_is_said(tmp_path, caplog):
+def test_principal_coefficients_of_hands_are_left_flat_with_a_warning(tmp_path, caplog):
     parts = smpl_params(left_hand_pose=random((FRAMES, 12), 7))
     rotations = np.asarray(load_motion(write(tmp_path / "a.npz", **parts)).rotations)
     assert not rotations[:, 25:40].any() and rotations[:, 40:].any()
@@ -173,7 +173,7 @@ def test_people_on_the_floor_stay_there(tmp_path, caplog, kind, heading):
 
 @pytest.mark.parametrize(("arrays", "usual"), [(amass, "z"), (parts, "y")])
 @pytest.mark.parametrize("up", ["y", "z", "-y"])
-def test_where_the_floor_agrees_another_axis_is_up_and_it_is_said(
+def test_where_the_floor_agrees_another_axis_is_up_with_a_warning(
     tmp_path, caplog, arrays, usual, up
 ):
     expected, translations = motions()["walking"]
@@ -185,7 +185,7 @@ def test_where_the_floor_agrees_another_axis_is_up_and_it_is_said(
     assert [line.startswith(warning) for line in caplog.messages] == ([] if up == usual else [True])
 
 
-def test_who_stands_still_may_lie_and_that_is_said(tmp_path, caplog):
+def test_people_who_stand_still_may_lie_and_the_warning_says_so(tmp_path, caplog):
     still = np.zeros((4, 55, 3)), np.zeros((4, 3))
     motion = load_motion(write(tmp_path / "a.npz", **amass(*still)))
     assert motion.rotations[0, 0, 0] == pytest.approx(-np.pi / 2)

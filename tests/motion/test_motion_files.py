@@ -199,7 +199,7 @@ def test_frames_in_which_nobody_was_seen_are_filled(tmp_path, caplog):
     assert len(load_motion(every_second).rotations) == FRAMES
 
 
-def test_what_is_missing_is_said(tmp_path, caplog):
+def test_missing_parts_are_reported(tmp_path, caplog):
     load_motion(npz(**{k: v for k, v in parts().items() if k != "transl"})(tmp_path))
     assert (
         "no frames per second: taken for 30" in caplog.text

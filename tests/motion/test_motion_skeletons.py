@@ -426,7 +426,7 @@ def test_people_on_the_floor_stay_there(tmp_path, caplog, kind, up):
     assert not [line for line in caplog.messages if " is up, not " in line]
 
 
-def test_people_who_walk_along_another_axis_than_the_rest_pose_are_turned_and_it_is_said(
+def test_people_who_walk_along_another_axis_than_the_rest_pose_are_turned_with_a_warning(
     tmp_path, caplog
 ):
     poses, translations = motions()["walking"]

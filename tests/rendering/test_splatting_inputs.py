@@ -24,7 +24,7 @@ def scene():
     return random_gaussians(1, np.float32)
 
 
-def test_a_batch_of_cameras_is_told_where_to_go():
+def test_the_error_for_a_batch_of_cameras_names_the_right_function():
     words = (
         r"render draws one camera, got a batch \(3,\): use render_views\(gaussians, cameras\), or"
         r" jax.vmap"
@@ -34,7 +34,7 @@ def test_a_batch_of_cameras_is_told_where_to_go():
             draw(scene(), BATCH)
 
 
-def test_a_single_camera_is_told_where_to_go():
+def test_the_error_for_a_single_camera_names_the_right_function():
     with pytest.raises(
         ValueError,
         match="render_views draws cameras with one leading axis, got a single camera: use render",
@@ -45,7 +45,7 @@ def test_a_single_camera_is_told_where_to_go():
         render_views(scene(), nested)
 
 
-def test_a_batch_of_sets_is_told_where_to_go():
+def test_the_error_for_a_batch_of_sets_names_the_right_function():
     sets = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), scene())
     with pytest.raises(
         ValueError,

@@ -156,7 +156,7 @@ def watched(folder, steps, bad_samples=list, before=0):
     return read(folder / "log.jsonl")
 
 
-def test_steps_that_went_wrong_are_told_by_number(tmp_path, capsys):
+def test_steps_that_went_wrong_are_reported_by_number(tmp_path, capsys):
     bad = [(3 + i, 3 + i, 4 + i, np.nan, 1.0) for i in range(MANY_SKIPPED)]
     events = watched(tmp_path, [(1, 2, 2, 1.0, 1.0), (2, 2, 3, 1.0, 1.0), *bad], before=2)
     skipped = [(3 + i, "skipped") for i in range(MANY_SKIPPED)]
