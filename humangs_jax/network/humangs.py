@@ -54,7 +54,7 @@ class HumanGS(nn.Module):
     """Whether the outputs keep the features in `scene`, for a driver."""
 
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> HumanGSOutputs:
-        """Returns the Gaussians of one subject."""
+        """Returns the outputs for one subject."""
         encoding = self.encoder(inputs, ctx)
         features = self.reader(encoding, inputs, ctx)
         outputs = self.decoder(features, inputs, ctx)

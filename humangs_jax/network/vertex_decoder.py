@@ -260,8 +260,12 @@ def activate(
     `config.offset_scale` is not None, and are turned to the axes of the canonical body, as are
     rotations.
 
-    With shells, each Gaussian has weights of the shells that sum to 1. Its offset and color correct
-    the weighted mean of the distances along the normal and of the photo colors.
+    With shells, each Gaussian has weights of the shells that sum to 1. Its offset is added to the
+    weighted mean of the distances along the normal. With `config.residual_color`, its color is
+    relative to the weighted mean of the shells' photo colors, or without shells to the vertex's
+    photo color.
+
+    Raises: ValueError if the configuration needs photo colors and there are none.
     """
     # shape
     offsets, quats, scales = jnp.split(raw.geometry, (3, 7), axis=-1)

@@ -144,6 +144,6 @@ class RefineConfig:
 
 
 ITERATIONS_ALONE = RefineConfig(steps=0, seconds=None, image_size=512)
-"""The refinement that commands make by default: iterations and steps on the head, on photos of at
-most 512 pixels. It takes some seconds.
+"""The default refinement of new avatars: iterations on photos of at most 512 pixels, and steps on
+the head. It takes some seconds.
 """

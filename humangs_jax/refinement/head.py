@@ -43,7 +43,7 @@ LEAST_SIDE = 512
 detail than the iterations reach.
 """
 LARGEST_HEAD = 112
-"""The side that the largest head should have, pixels. Photos are reduced until it is about as
+"""The side that the largest head should have, pixels. Photos are reduced until it is about that
 small.
 """
 LOOK = 1024
@@ -61,11 +61,11 @@ EXCESS = 1.0
 OPAQUE = 0.1
 """Gaussians of the head with more opacity than this have to lie in the crops."""
 OUTLIERS = 1.0
-"""Percent of these Gaussians that may lie outside of the crops, at each side."""
+"""Percent of the opaque Gaussians of the head that may lie outside of the crops, at each side."""
 FAR = 1e4
 """Bound of the coordinates of points outside of photos, pixels."""
 PARTS = 10
-"""The number of parts of a run; it can be interrupted between them."""
+"""The number of parts of a run. Between two parts the bar moves."""
 
 
 class Crops(NamedTuple):
@@ -183,8 +183,8 @@ def head_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
 
 
 def head_crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) -> Crops | None:
-    """Returns crops of the photos around the region; None if the body has no such region or no
-    photo shows it.
+    """Returns crops of the photos around the region. None if the avatar has no opaque Gaussians
+    there, or if no photo shows the region.
     """
     # the Gaussians that the joints of the region move; faint ones may lie outside of the crops
     columns = [

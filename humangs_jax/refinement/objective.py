@@ -41,7 +41,7 @@ Image = tuple[Float[Array, "h w 3"], Float[Array, "h w"]]
 """Colors and alpha."""
 FASTER_COMPILATION = {"xla_backend_optimization_level": 1}
 """Options of the compiler on a CPU. Programs compile in 0.8 to 0.9 of the time of level 3, and run
-in the same time. At level 0 they take eight times as long.
+in the same time. At level 0 programs take eight times as long.
 """
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -21,8 +21,8 @@ MARGIN = 8
 and Gaussians beyond the silhouette cost alpha there.
 """
 MULTIPLE = 16
-"""Sides of crops are multiples of this number of pixels, so that few sizes are compiled. Sides of
-smaller images are kept.
+"""Sides of crops are multiples of this number of pixels, so that few sizes are compiled. A crop is
+no larger than its photo.
 """
 COVERED = 0.02
 """Value of a mask above which a pixel belongs to the person."""

@@ -109,11 +109,11 @@ def refine(
     """Fits an avatar to the photos of a capture. Returns the fitted avatar, or the avatar itself if
     the fit is no better.
 
-    First come iterations of a learned optimizer, then steps of Adam. Without a limit in seconds,
-    steps on the head alone follow if photos have 512 pixels or more (`RefineConfig.head_steps`).
-    Views whose mask does not show the person are left out, and exposure is made equal as in
-    `reconstruct`. Ctrl-C ends the run; the best state until then is returned. `refine_with_report`
-    also returns the steps, the seconds and the gain.
+    First come iterations of a learned optimizer, then steps of Adam. Without a limit in seconds, or
+    with `steps` 0, steps on the head alone follow if photos have 512 pixels or more
+    (`RefineConfig.head_steps`). Views whose mask does not show the person are left out, and
+    exposure is made equal as in `reconstruct`. Ctrl-C ends the run; the best state until then is
+    returned. `refine_with_report` also returns the steps, the seconds and the gain.
 
     Args:
         avatar: of the person in the photos, on the body of the capture.

@@ -66,11 +66,11 @@ def plan_buffers(
     config: SplatConfig | str = DEFAULT_CONFIG,
     margin: float = 1.25,
 ) -> SplatConfig:
-    """Returns a configuration with buffers for one camera, or for the most demanding one of a
+    """Returns a configuration with buffers for one camera, or for the most demanding camera of a
     batch, times `margin`.
 
-    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation.
-    Measures concrete arrays: call it outside of transformations.
+    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. It
+    measures concrete arrays, so call it outside of transformations.
 
     No margin is enough for Gaussians that are optimised for long, because they grow. If pairs no
     longer fit, `Rendering.overflow` is above 0, and `SplatConfig.warn_overflow` logs it. Then plan

@@ -3,13 +3,14 @@ oracle of `splatting`.
 
 It shares only small functions with the tiled renderer, such as the checks of arguments. Its
 projection multiplies plain matrices, its compositing is the loop of the formula, and its gradients
-are autodiff's. With a_j the columns of M and C = cov2d = M M^T + eps2d I, the exponent is
+are autodiff's. With a_j the columns of M and C = cov2d = M M^T + eps2d I, the exponent is -1/2 of
 
     d^T C^-1 d = (sum_j (a_j x d)^2 + eps2d |d|^2) / det C,
-    det C      = sum_i<j (a_i x a_j)^2 + eps2d |M|^2 + eps2d^2,
+    det C      = sum_i<j (a_i x a_j)^2 + eps2d |M|^2 + eps2d^2.
 
-sums of squares, accurate for needles of any length (the inverse of C has no correct digit left at
-1e8 pixels). Memory and time grow with Gaussians times pixels; use it in float64 on small images.
+These are sums of squares, which are accurate for needles of any length. (The inverse of C has no
+correct digit left at 1e8 pixels.) Memory and time grow with Gaussians times pixels; use it in
+float64 on small images.
 """
 
 import functools

@@ -38,8 +38,8 @@ the same value. Opacity is not compensated for it (gsplat "classic").
 
 MIP_EPS2D = 0.1
 """Added variance for Gaussians whose scales contain the low-pass of the images that they were
-fitted to, pixels^2. It is about the footprint of a pixel. Images of other sizes then show them as
-wide as those images did (Mip-Splatting, https://arxiv.org/abs/2311.16493).
+fitted to, pixels^2. It is about the footprint of a pixel. Images of other sizes then show the
+Gaussians as wide as the fitted images do (Mip-Splatting, https://arxiv.org/abs/2311.16493).
 """
 
 LEAST_DIMMING = 1e-4
@@ -53,8 +53,8 @@ the same value.
 """
 
 ALPHA_MAX = 0.999
-"""Largest alpha. Larger ones are clamped, so that no pixel is ever fully opaque (T > 0). gsplat and
-INRIA have 0.99.
+"""Largest alpha. Larger alphas are clamped, so that no pixel is ever fully opaque (T > 0). gsplat
+and INRIA have 0.99.
 """
 
 TRANSMITTANCE_STOP = 1e-4
@@ -64,7 +64,7 @@ of this or less. INRIA and gsplat have the same value.
 
 LARGEST_FOOTPRINT = 1e9
 """Largest coordinate of the axes (one standard deviation long) of a projected Gaussian, pixels.
-Gaussians with a larger one are not drawn, because its fourth power could overflow float32.
+Gaussians with a larger coordinate are not drawn, because its fourth power could overflow float32.
 """
 
 

@@ -189,9 +189,9 @@ def render_views(
     background: Background = None,
 ) -> Rendering:
     """Draw every camera of a batch (leading axis v), one after the other. Working memory does not
-    grow with v, but the values that a gradient keeps do. `jax.vmap` of `render` draws all views at
-    once and holds the buffers of all views. On CPUs it is as fast, but slower with gradients of
-    many views.
+    grow with v. The memory for values that a gradient needs later grows with v. `jax.vmap` of
+    `render` draws all views at once and holds the buffers of all views. On CPUs it is as fast, but
+    slower with gradients of many views.
 
     Args:
         gaussians: as `render`.

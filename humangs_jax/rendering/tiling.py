@@ -3,10 +3,10 @@ buffer of fixed size.
 
 Splatting takes five steps. All have static shapes, and no gradient passes the first three:
 
-1. `expand` the counts of the tiles that each item touches: slot -> item. Splats take two such
-   steps, item -> rows of tiles -> tiles (`emit_pairs`).
-2. `sort_into_tiles` sorts the (tile, item) pairs by tile, and by item inside a tile. Number the
-   items by depth first (`depth_order`), and every list runs front to back.
+1. `expand` gives each item as many slots as it touches tiles, one for each (tile, item) pair.
+   Splats take two such steps, first to rows of tiles, then to tiles (`emit_pairs`).
+2. `sort_into_tiles` sorts the (tile, item) pairs by tile, and by item inside a tile. If items are
+   numbered by depth (`depth_order`), every list runs front to back.
 3. `blocks_by_length` orders tiles by falling list length. A block of consecutive tiles then has
    lists of about the same length. Empty tiles come last, and blocks of empty tiles are not visited.
    Only the schedule for CPUs uses blocks.
@@ -77,7 +77,7 @@ class TileGrid:
 
     @property
     def tiles(self) -> Size:
-        """Number of tiles. It is also the tile number that means "no tile"."""
+        """Number of tiles. This number also stands for "no tile" in lists of tile numbers."""
         return self.columns * self.rows
 
     @property
@@ -343,7 +343,7 @@ class Footprints(NamedTuple):
 
 
 class _Bands(NamedTuple):
-    """The numbers of each ellipse that its span within a row of tiles is computed from, planes of
+    """The numbers from which the span of each ellipse in a row of tiles is computed, planes of
     (g,).
     """
 

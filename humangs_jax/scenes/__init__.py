@@ -1,1 +1,1 @@
-"""Scenes of a fixed number of Gaussians, fitted to posed photos."""
+"""Fits scenes of a fixed number of Gaussians to posed photos."""

@@ -7,8 +7,8 @@ of cloning, splitting and pruning:
 
 - `mcmc_relocate` moves Gaussians that have become transparent, and slots that are used from now on,
   onto other Gaussians. These are drawn at random in proportion to their opacity. The N Gaussians
-  that then lie in one place look as the one before. If o was its opacity and s its scales, theirs
-  are (equation 9)
+  that then lie in one place look like the Gaussian that was there. If o was its opacity and s its
+  scales, theirs are (equation 9)
 
       o' = 1 - (1 - o)^(1/N),
       s' = s o / sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1);
@@ -36,9 +36,11 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.rendering.gaussians import UnconstrainedGaussians, constrain, covariances
 
 DEAD = 0.005
-"""Opacity at and below which a Gaussian is moved. It is the paper's."""
+"""Opacity at and below which a Gaussian is moved. It is the paper's value."""
 SHARPNESS = 100.0
-"""Steepness of the sigmoid of the opacity by which noise fades around `DEAD`. It is the paper's."""
+"""Steepness of the sigmoid of the opacity by which noise fades around `DEAD`. It is the paper's
+value.
+"""
 STEP = 0.1
 """Distance of the nodes of the integral. The trapezoidal rule converges exponentially at this
 distance; tests compare it with the double sum.

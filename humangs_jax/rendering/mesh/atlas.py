@@ -110,7 +110,7 @@ class _Flat:
     chart.
     """
     heights: np.ndarray
-    """Heights of the points above the plane of their chart, (u,), metres."""
+    """Coordinates of the points along the axis of their chart, (u,), metres."""
     faces: np.ndarray
     """Indices of the points at the corners of each face, (f, 3)."""
     vertices: np.ndarray
