@@ -7,10 +7,10 @@ a blurred avatar. Here each window of the image first moves to where it is most 
 at most `REACH`:
 
     e(p) = |I(p + d(p)) - P(p)|^2,   d(p) = argmin over |d| <= r of
-           mean over q in W(p) of |I(q + d) - P(q)|^2 + `RELUCTANCE` |d|^2 / r^2.
+           variance over q in W(p) of I(q + d) - P(q), plus `RELUCTANCE` |d|^2 / r^2.
 
-Each square is a mean over the channels. The mean of I - P in the window, squared, is subtracted
-from the cost, so that a difference in brightness does not count there.
+Squares and variances are means over the channels. The variance leaves out differences in
+brightness between a window and the photo.
 
 The same moves, made smooth, bring a photo to where the image shows the person (`smooth_moves`,
 `moved_photo`). Images are on the host. They have colors and alpha side by side.

@@ -95,8 +95,8 @@ class RefineConfig:
     image_size: PhotoSide | None = knob(
         None, cost="detail of the photos", gain="time of a step", measured=MEASURED
     )
-    """Largest longer side of the photos, pixels. Larger photos are reduced to it, except for the
-    crops of `head_steps`. None: no photo is reduced.
+    """Largest longer side of the photos, pixels. Larger photos are reduced to it. None: photos keep
+    their size. The photos of `head_steps` have another size, by the size of heads.
     """
     structural: Weight = 0.2
     """Weight of the structural dissimilarity beside the L1 distance of colors."""
