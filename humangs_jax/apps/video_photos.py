@@ -155,7 +155,7 @@ def seconds_of_photos(folder: Path, names: Sequence[str]) -> Float[np.ndarray, "
 
 def _by_direction(video: Path, sharpness: Float[np.ndarray, " n"]) -> list[int]:
     """Chooses sharp frames that see the person from different directions, and returns their
-    numbers. Returns an empty list if the person does not turn, or is not found in half of the
+    numbers. Returns an empty list if the person does not turn, or is found in less than half of the
     offered frames.
     """
     offered, worth = offered_frames(sharpness)

@@ -58,8 +58,8 @@ from humangs_jax.synthetic.surroundings import cameras_around, spread_azimuths
 
 
 JOINTS_PER_VERTEX = 6
-"""Number of joints that are kept for each vertex. Bodies have up to 7, smoothed garments up to 12.
-Six lose at most 0.4 % of the weight, less than a millimetre in any pose.
+"""Number of joints that are kept for each vertex. Bodies have up to 6, smoothed garments up to 12.
+Six lose at most about 0.5 % of the weight.
 """
 SLOPE_STEP = 1 / 100
 """Slope of one step of the slope texture's bytes, which hold slopes up to 1.27."""

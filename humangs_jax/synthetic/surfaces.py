@@ -81,7 +81,7 @@ class Folds:
         self.patches = [Ripples(rng, 4 * wavelength) for _ in range(directions)]
 
     def slope(self, points: np.ndarray) -> np.ndarray:
-        """Returns slopes (n, 3) at points (n, 3): at most about 1, and 0 between patches."""
+        """Returns slopes (n, 3) at points (n, 3): mostly below 1, and 0 between patches."""
         points = points.astype(np.float32)
         total, warp = np.zeros_like(points), 3.0 * self.warp(points)
         for k, direction, phase, patch in zip(

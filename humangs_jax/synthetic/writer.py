@@ -313,7 +313,7 @@ def _views(
 
 
 def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
-    """Returns the capture folders in `root`, sorted by name.
+    """Returns the capture folders in `root`, sorted by name, or `root` itself if it is a capture.
 
     split: the split that all people of a synthetic set must belong to. None: any. It is ignored for
     real captures and for captures of `humangs preprocess`.

@@ -173,7 +173,7 @@ class Diagnosis:
     skip_norm: float
     """Steps whose gradient has a larger norm than this are skipped."""
     stored: tuple[StageReport, ...]
-    """Reports of what the step began with: state and batch."""
+    """Reports of what the step began with: state, loss networks and batch."""
     stages: tuple[StageReport, ...]
     """The stages in the order in which they end."""
 

@@ -337,6 +337,7 @@ def train(
             variables of `config.seed`.
         networks: networks of the losses that need them.
         fsdp: number of devices that share one copy of the state, see `sharding.training_mesh`.
+            None: all devices.
         stop_at: number of steps of the run after which the call saves the state and returns. A
             later call continues the run. None: `config.steps`.
         progress: whether a progress bar is shown.
