@@ -1,5 +1,5 @@
-"""Finds out what a folder of photos has of what an avatar needs, what is missing, and which
-well-known tool makes what is missing.
+"""Finds the photos in a folder and the files that an avatar needs, and says which of them are
+missing and which well-known tool makes them.
 
 The user need not describe the folder, because its files are found by their names.
 docs/your_photos.md shows the way. The module also measures how well an avatar reproduces a photo

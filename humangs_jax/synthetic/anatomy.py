@@ -349,7 +349,7 @@ def cloth_coordinates(template: np.ndarray) -> np.ndarray:
 def leg_coordinates(template: np.ndarray) -> np.ndarray:
     """Returns the cloth coordinates (n, 4) of trousers, which are sewn along the middle.
 
-    They are relative to the axis of the leg on the point's side, above the crotch, too.
+    They are relative to the axis of the leg on the point's side, also above the crotch.
     """
     x, y, z = template.T
     knee = np.interp(-y, [0.358, 0.764, 1.159], [0.101, 0.130, 0.137])

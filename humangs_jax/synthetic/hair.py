@@ -212,7 +212,7 @@ are positive where hair or cloth is, and negative where the face is free.
 
 
 def _fringe(rng: np.random.Generator, haircut: Haircut) -> _Opening:
-    """Returns the function that returns how far points are above the edge of a fringe, metres."""
+    """Returns the `_Opening` above the edge of a fringe. Values are heights above it, metres."""
     angles, heights = (np.asarray(x) for x in _FRINGE_LINES[haircut.fringe])
     phase = rng.uniform(0, 6.28, 3)
 

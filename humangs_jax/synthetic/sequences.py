@@ -320,7 +320,7 @@ def _reach(rng: np.random.Generator, build: kin.Build, frames: int) -> _Moves:
     for i in range(frames):
         k = int(np.searchsorted(times, i / FPS, side="right")) - 1
         a, b = keys[k], keys[k + 1]
-        # three quarters of the time on the way, then a rest
+        # four fifths of the time on the way, then a rest
         s = _ease((i / FPS - times[k]) / (0.8 * (times[k + 1] - times[k])))
         rotations[i] = kin.between(a[0], b[0], s)
         centers[i], sinks[i] = (1 - s) * a[1] + s * b[1], (1 - s) * a[2] + s * b[2]
