@@ -92,8 +92,10 @@ class CameraError:
 
 
 def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[CameraError, ...]:
-    """Returns the cameras that keypoints show to be turned, those that explain most first. Empty
-    with fewer than three cameras.
+    """Returns the cameras that keypoints show to be turned. Cameras that explain most come first.
+
+    The result is empty for fewer than three or more than `most_cameras` cameras, or if too few
+    landmarks are seen. It is also empty if a rotation exceeds `most_degrees`.
     """
     camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
     if not 3 <= camera_of.max() + 1 <= _DECISION.most_cameras:
@@ -173,8 +175,9 @@ class _Seen:
         keypoints: Keypoints,
         camera_of: Int[np.ndarray, " v"],
     ) -> "_Seen | None":
-        """Returns what the cameras see of the person, or None if that is too little. camera_of:
-        number of each view's camera, (v,).
+        """Returns the landmarks that err independently, in at most 24 moments. Returns None if
+        fewer than 8 landmarks are seen in two views of a moment. camera_of: number of each view's
+        camera, (v,).
         """
         # landmarks that err independently: those of a face or a hand err together
         parts = (

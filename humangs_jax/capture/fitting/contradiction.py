@@ -1,14 +1,14 @@
-"""Whether a calibration and the keypoints of a person can both be right.
+"""Checks whether a calibration and the keypoints of a person can both be right.
 
-Two things are looked at. Rays of one landmark through several cameras have to meet. And where they
-meet, the body must not be a mirror image: a person who faces the camera has the chest in front of
-the back, which the detector's own depths say. Calibrations of other tools fail both ways: matrices
-that go from cameras to the world in place of the other way round do not meet, and images whose y
-axis points up may meet and show a person upside down or mirrored.
+The rays of one landmark through several cameras have to meet in front of the cameras. If they do
+not meet well, the body must not be a mirror image, which the detector's depths show. Calibrations
+of other tools can fail in these ways. With matrices that go from cameras to the world instead of
+the other way round, rays do not meet. With images whose y axis points up, rays may meet and show a
+person upside down or mirrored.
 
-Where the calibration fails, the same is asked of the mistakes that are known, so that the error can
-name the one without which keypoints and cameras agree. Where no mistake explains it, cameras are
-found from the person, as for photos without a calibration, and asked in its place.
+If a calibration fails, usual mistakes are undone on trial, so that the error can name a change with
+which keypoints and cameras agree. If no change helps, cameras are found from the person, as for
+photos without a calibration, and tried instead.
 """
 
 import dataclasses
@@ -26,26 +26,27 @@ from humangs_jax.data.photos import Photos
 
 @dataclasses.dataclass(frozen=True)
 class _Limits:
-    """When a calibration and keypoints contradict each other."""
+    """Limits that decide if a calibration and keypoints contradict each other."""
 
     most_missed: float = 0.06
-    """Median distance of landmarks from the triangulated ones over the person's size in the photo,
-    from which on a calibration is wrong whatever else is known. It was 0.015 for four photos of a
-    woman, 0.12 with their y axis upside down. A camera turned by a degree adds 0.02 in its own
-    photo."""
+    """Largest median distance of landmarks from the triangulated ones, over the person's size in
+    the photo, that is tolerated if no remedy is found. It was 0.015 for four photos of a woman, and
+    0.12 with their y axis upside down. A camera turned by a degree adds 0.02 in its photo.
+    """
     agrees: float = 0.035
-    """The same, below which cameras agree."""
+    """Largest median distance, measured as in `most_missed`, at which cameras agree."""
     better: float = 0.5
-    """Share of the distance that may be left without a mistake, to believe in it."""
+    """Largest ratio of the distances with and without a remedy, for the remedy to be believed."""
     mirrored: float = 0.8
-    """Share of the distance from the detector's own places that is left where those are mirrored in
-    depth, below which the person is a mirror image, unless cameras agree."""
+    """Largest ratio of the distances from the detector's 3D landmarks if the person is mirrored in
+    depth, and if not, for the person to count as a mirror image.
+    """
     seen: float = 0.5
     """Least confidence of a keypoint that counts."""
     least_landmarks: int = 8
-    """Triangulated landmarks below which nothing is concluded."""
+    """Least number of triangulated landmarks. With fewer, nothing is concluded."""
     least_views: int = 4
-    """Views from which on all but one of them may agree without it."""
+    """Least number of views of which one may be left out because the others agree without it."""
 
 
 _LIMITS = _Limits()
@@ -57,11 +58,11 @@ class Agreement(NamedTuple):
     missed: float
     """Median distance of keypoints from triangulated landmarks, as a share of the person's size."""
     pixels: float
-    """The same distance in pixels."""
+    """Median distance of keypoints from triangulated landmarks, pixels."""
     mirrored: bool
     """Whether the triangulated person is a mirror image."""
     behind: bool
-    """Whether most of the person is behind the cameras."""
+    """Whether more than half of the landmarks in all views are behind the cameras."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,14 +70,16 @@ class Contradiction:
     """A calibration that does not agree with the keypoints of the person."""
 
     found: Agreement
-    """With the calibration as it is."""
+    """How well cameras and keypoints agree with the calibration as it is."""
     remedy: str | None
-    """The mistake without which keypoints and cameras agree, in words; None if none is known."""
+    """Words for a change with which cameras and keypoints agree. None if no such change is
+    known.
+    """
     after: Agreement | None
-    """With the remedy."""
+    """How well cameras and keypoints agree with the remedy. None without a remedy."""
 
     def __str__(self) -> str:
-        """One line: what does not agree, and what does."""
+        """Returns one line that says how large the disagreement is, and what remedies it."""
         off = f"landmarks miss each other by {self.found.pixels:.0f} px"
         share = f"{off}, {self.found.missed:.0%} of the person's size"
         what = "the person would be behind the cameras" if self.found.behind else share
@@ -87,9 +90,12 @@ class Contradiction:
 
 
 def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | None:
-    """What keypoints of one person say against the calibration of the photos; None: nothing.
+    """Returns the contradiction between keypoints of one person and the calibration of the photos.
 
-    Cameras that are a little turned are not meant: `find_camera_errors` names these.
+    The result is None if they agree, or if too few landmarks are seen in several views. It is also
+    None if they agree after `find_camera_errors` turned cameras back, or without one of several
+    photos. If no remedy is known, small contradictions are None, too, because the person may have
+    moved between the photos.
     """
     K = np.asarray(photos.cameras.K, np.float64)
     matrices = np.asarray(photos.cameras.cam_from_world, np.float64)
@@ -131,10 +137,10 @@ def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | 
 
 
 def _without_calibration(photos: Photos, keypoints: Keypoints) -> Agreement | None:
-    """How well cameras that are found from the person agree with the keypoints.
+    """Returns how well cameras that are found from the person agree with the keypoints.
 
-    None where that cannot be known: several moments, no 3D landmarks, or cameras that do not
-    explain all photos.
+    The result is None if there are several moments or no 3D landmarks, or if no cameras are found
+    that explain all photos.
     """
     if keypoints.world is None or len(np.unique(photos.frames)) > 1:
         return None
@@ -170,7 +176,9 @@ def _agrees(found: Agreement) -> bool:
 def _remedies(
     K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], height: int
 ) -> dict[str, tuple[Float[np.ndarray, "v 3 3"], Float[np.ndarray, "v 4 4"]]]:
-    """Gives the cameras as they were without a usual mistake, by the words for that mistake."""
+    """Returns K and cam_from_world with one usual mistake undone, by words for the change. height:
+    height of the images, pixels.
+    """
     other = np.diag([1.0, -1.0, 1.0, 1.0])
     upwards = K.copy()
     upwards[:, 1, 2] = height - K[:, 1, 2]
@@ -190,7 +198,9 @@ def agreement(
     frames: Int[np.ndarray, " v"],
     keypoints: Keypoints,
 ) -> Agreement | None:
-    """How well cameras and keypoints agree; None where too few landmarks are in several views."""
+    """Returns how well cameras and keypoints agree, or None if too few landmarks are seen in
+    several views of a frame. frames: frame of each view, (v,).
+    """
     errors, sizes, behind = [], [], []
     plain = mirrored = 0.0
     count = 0
@@ -241,10 +251,11 @@ def _triangulated(
     points: Float[np.ndarray, "v k 2"],
     seen: Bool[np.ndarray, "v k"],
 ) -> tuple[Float[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
-    """Landmarks where the rays of those views meet best that see them, and which at least two do.
+    """Returns the points where the rays of the views that see a landmark meet best, (k, 3), and
+    which landmarks at least two views see, (k,).
 
-    Direct linear transformation: rows u P_3 - P_1 and v P_3 - P_2 of each view, homogeneous, of
-    projections of unit length.
+    The points solve the equations of a direct linear transformation, which has the rows u P_3 - P_1
+    and v P_3 - P_2 for each view. Each row is scaled so that its first three numbers have length 1.
     """
     scaled = project / np.linalg.norm(project[:, 2, :3], axis=-1)[:, None, None]
     rows = points[..., None] * scaled[:, None, 2:] - scaled[:, None, :2]
@@ -257,8 +268,8 @@ def _triangulated(
 
 
 def _apart(places: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "k 3"]) -> float:
-    """Mean distance of points from others that are moved, turned and scaled to fit them best; over
-    their size. Mirror images are no fit (Umeyama 1991).
+    """Returns the mean distance of `places` from `others`, over the size of `places`. The others
+    are first moved, turned and scaled to fit best, but not mirrored (Umeyama 1991).
     """
     a, b = places - places.mean(axis=0), others - others.mean(axis=0)
     u, values, v = np.linalg.svd(a.T @ b)

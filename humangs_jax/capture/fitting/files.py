@@ -6,10 +6,11 @@ fit.npz, the input of a fit to keypoints and how well its result is known:
                                                              `humangs_jax.capture.keypoints` stores
                                                              them
     noise (m,)               std of the detections, pixels
-    joint_std (m, j)         of the joints' positions, metres
+    joint_std (m, j)         std of the joints' positions, metres
     determined (m, j)        share of the joints' rotations that the views determine
     shape_covariance (s, s)
-    places (k, 3), certainty (k,)    of the set, as the fit found them, metres and weights
+    places (k, 3)            offsets of the set's landmarks that the fit found, metres
+    certainty (k,)           weights of the set's landmarks that the fit found
 
 fit.json is the report (`FitReport.to_json`).
 """
@@ -47,7 +48,9 @@ KEYS = ("set", "names", "points", "confidences", *_FOUND, "places", "certainty")
 
 
 class UnknownViewError(ValueError):
-    """A capture has views that its fit does not know: photos were added after it."""
+    """Error for a capture with views that its fit does not know, because photos were added
+    later.
+    """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,7 +58,7 @@ class FitRecord:
     """The contents of fit.npz: v views, m frames, j joints, s shape coefficients."""
 
     keypoints: Keypoints
-    """Keypoints of the v views, with the set as the fit found that the detector uses it."""
+    """Keypoints of the v views. Their set has the places and certainties that the fit found."""
     names: tuple[str, ...]
     """Names of the v views."""
     noise: Float[np.ndarray, " m"]
@@ -68,7 +71,10 @@ class FitRecord:
     """Covariance of the shape coefficients, (s, s)."""
 
     def of_views(self, names: Sequence[str]) -> Keypoints:
-        """The keypoints of views, in their order. Raises: UnknownViewError."""
+        """Returns the keypoints of the named views, in their order.
+
+        Raises: UnknownViewError.
+        """
         missing = [name for name in names if name not in self.names]
         if missing:
             raise UnknownViewError(f"the capture's fit knows no view {few(missing)}: fit it again")
@@ -81,7 +87,7 @@ class FitRecord:
 
 
 def _write_fit_record(path: str | Path, record: FitRecord) -> None:
-    """Write fit.npz, whole or not at all."""
+    """Writes fit.npz. If writing fails, no file appears."""
     kind = record.keypoints.set
     arrays = {
         "set": np.asarray(kind.name),
@@ -96,7 +102,10 @@ def _write_fit_record(path: str | Path, record: FitRecord) -> None:
 
 
 def read_fit_record(path: str | Path) -> FitRecord:
-    """Read fit.npz. Raises: CaptureError naming file and key."""
+    """Reads fit.npz.
+
+    Raises: CaptureError, which names file and key.
+    """
     path = Path(path)
     with reading(path, "fit.npz", CaptureError):
         file = ArrayFile.open(path, CaptureError)
@@ -107,7 +116,7 @@ def read_fit_record(path: str | Path) -> FitRecord:
             )
 
         def own(key: str, shape: tuple[int | None, ...] | None = None) -> np.ndarray:
-            """The numbers under a key."""
+            """Returns the numbers under a key."""
             return numbers(file.array(key), path, key, shape)
 
         # the set says how many keypoints the arrays have to have
@@ -143,13 +152,16 @@ def check_place(
     overwrite: bool,
     inputs: Iterable[str | Path | None] = (),
 ) -> Path:
-    """The folder that a fit of the capture `source` is written to, checked before the work begins.
+    """Returns the folder that a fit of the capture `source` is written to. Checks before the work
+    begins that it can be written.
 
-    Arguments: out: None: the capture folder itself, of which the body and the cameras are replaced.
-    inputs: further files and folders that the fit reads, None is left out; another folder that is
-    replaced may hold none of them, nor a photo.
-    Raises: ValueError if something would be overwritten without `overwrite`; OSError for a place
-    that cannot be written to; see also `check_replaceable`.
+    Arguments: out: the folder. None: the capture folder itself, of which body and cameras are
+    replaced. overwrite: whether an existing fit may be replaced. inputs: further files and folders
+    that the fit reads, or None. If `out` is another folder, neither these nor the photos may lie in
+    it.
+    Raises: ArgumentError if there is a body in the capture folder, and `overwrite` is False.
+    ValueError as in `check_replaceable` for another folder. OSError for a place that cannot be
+    written to.
     """
     source = capture_folder(source)
     target = source if out is None else Path(out)
@@ -165,7 +177,9 @@ def check_place(
 
 
 def _photo_files(description: dict[str, Any]) -> list[str]:
-    """Images and masks of a capture, and what is unknown, as its description has them."""
+    """Returns the names of a capture's images, masks and files of unknown pixels, as its
+    description has them.
+    """
     kinds = ("image", "mask", "unknown")
     return sorted({view[key] for view in description["views"] for key in kinds if key in view})
 
@@ -177,11 +191,11 @@ def write_fitted(
     report: FitReport,
     record: FitRecord | None = None,
 ) -> None:
-    """Write cameras and body of a capture: into the capture folder `source` itself, or with its
-    photos into another folder.
+    """Writes cameras, body and report of a capture. They go into the capture folder `source`
+    itself, or with copies of its photos into another folder `target`, which is replaced.
 
-    Arguments: record: of a fit to keypoints. None: a fit.npz of the source no longer holds; it is
-    left out or removed.
+    Arguments: record: record of a fit to keypoints. If it is None, the target has no fit.npz
+    afterwards, because that of the source is of other cameras.
     """
     source, target = capture_folder(source), Path(target)
     description = read_description(source / "capture.json")
@@ -213,7 +227,9 @@ def write_fitted(
 
 
 def _with_cameras(description: dict[str, Any], capture: Capture) -> dict[str, Any]:
-    """capture.json with the cameras and the frames of the capture where they have changed."""
+    """Returns the contents of capture.json with the cameras and the frames of the capture. Numbers
+    that have not changed stay as they are in the description.
+    """
     views = []
     for i, view in enumerate(description["views"]):
         new = {

@@ -1,4 +1,4 @@
-"""Fits a body to photos with cameras and keypoints, and reports how well it is known and how well
+"""Fits a body to photos with cameras and keypoints. Reports how well the body is known and how well
 it agrees with the keypoints.
 """
 
@@ -66,8 +66,9 @@ class Uncertainty(NamedTuple):
     joint_covariances: Float[np.ndarray, "m j 3 3"]
     """Covariances of the joints' positions, (m, j, 3, 3), square metres."""
     determined: Float[np.ndarray, "m j"]
-    """Share of the prior's variance of each joint's rotation that the views remove, (m, j), mean
-    over axes. 1 is all. 0 is nothing, as for joints that no keypoint depends on.
+    """Share of the prior's variance of each joint's rotation that the views remove, (m, j), a mean
+    over axes. 1 is all. 0 is nothing, as for joints that no keypoint depends on. For the root it is
+    1 minus the largest standard deviation of its orientation about an axis, in half turns.
     """
     shape_covariance: Float[np.ndarray, "s s"]
     """Covariance of the shape coefficients, (s, s)."""
@@ -132,7 +133,8 @@ def _derivatives(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> tuple[Float[Array, "m r u"], Float[Array, "m j 3 u"]]:
     """Returns the derivatives of residuals, (m, r, u), and of joints, (m, j, 3, u), of each frame
-    by its u unknowns: global_orient, transl, body_pose, and the shape.
+    by its u unknowns: global_orient, transl, body_pose, and the shape. The prior of the shape is
+    not among the residuals.
     """
     problem, state, m = keypoint_problem(model), fit.state, len(observations.noise)
     poses = jnp.concatenate(
@@ -175,15 +177,15 @@ class Examination:
 
 
 def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = None) -> Examination:
-    """Compare the body of a capture with keypoints of its views.
+    """Compares the body of a capture with keypoints of its views.
 
     Args:
         capture: the capture with its body.
         keypoints: keypoints in the order of the capture's views.
         record: record of the fit to these keypoints. It has the noise of the keypoints, and what
             the views determine. None: the noise is estimated from the median error.
-    Raises: ValueError if the number of views differs, if the record has fewer frames, or if the
-    body has none of the landmarks.
+    Raises: ValueError if the number of views differs, if the record has fewer frames or another
+    number of joints, or if the body has none of the landmarks.
     """
     _check_same_views(capture, keypoints, record)
     # distances of the body's landmarks from the keypoints, frame by frame
@@ -289,7 +291,7 @@ def _view_report(
 
 
 def _quantile(values: Float[np.ndarray, "..."], share: float) -> float:
-    """Returns a quantile of the values that are finite. NaN if none is."""
+    """Returns a quantile of the finite values. It is NaN if no value is finite."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if known.size else float("nan")
 
@@ -348,8 +350,8 @@ def fit_photos(
     smoothness: float = 0.0,
     fixed_cameras: bool = False,
 ) -> FittedCapture:
-    """Find shape and poses of the person in photos. Cameras that are turned, as the keypoints show,
-    are turned back.
+    """Finds shape and poses of the person in photos. Cameras that are turned, as the keypoints
+    show, are turned back.
 
     Args:
         photos: photos with cameras.

@@ -1,17 +1,19 @@
 """Fits a body to the keypoints of one person in stages. At the end all frames are fitted together
 with one shape. The functions are pure, so that they can be vmapped over people.
 
-    rigid   position and orientation of a resting body, from the best of several starts
-    points  body joints and shape to triangulated points; skipped by frames without any
-    body    body joints and shape to the keypoints of every view
-    hands   all joints that a keypoint depends on, with a smaller robust scale
-    person  all frames at once: one shape, with the noise that was found, also for each landmark.
-            For four and more frames that several views show, also the places at which the detector
-            sees its landmarks
-    motion  if requested, all frames with smooth motion, see `smooth_motion`
+    rigid   fits position and orientation of a resting body
+    points  fits body joints and shape to triangulated points, or to the keypoints in frames that
+            have no such points
+    body    fits body joints and shape to the keypoints of every view
+    hands   fits all joints that a keypoint depends on, with a smaller robust scale
+    person  fits all frames at once with one shape. Frames and landmarks have the noise that was
+            found. If there are at least four frames, and several views in a frame, the places at
+            which the detector sees its landmarks move too
+    motion  fits all frames with smooth motion if that is requested, see `smooth_motion`
 
 The first four stages are one program that runs with different weights and free unknowns, because
-compilation dominates the time.
+compilation dominates the time. They run from each of the best starts of a frame, and the result
+with the least cost is kept.
 """
 
 import functools
@@ -66,14 +68,14 @@ ROBUST_SCALES = {"rigid": 30.0, "points": 15.0, "body": 15.0, "hands": 10.0, "pe
 STEPS = 150
 """Largest number of steps of the solver in a stage."""
 _TOLERANCE = 3e-4
-"""Change of the unknowns at which the solver stops. Unknowns are of unit size."""
+"""Tolerance of the solver, see `state.solve`."""
 MOTION_SCALE = 5.0
 """Robust scale of accelerations, multiples of the expected one. It is small, so that a frame that
 shows somebody else hardly pulls the others.
 """
 FEW = 6
-"""Number of keypoints below which a frame's pose follows mostly from the prior. Smooth motion
-interpolates such a frame.
+"""Number of landmarks. The pose of a frame that shows fewer follows mostly from the prior. Smooth
+motion interpolates such a frame.
 """
 
 
@@ -108,14 +110,14 @@ def fit_landmarks(
     """Returns shape and poses of one person.
 
     The result is finite for all finite observations. Frames without keypoints rest in the prior's
-    usual pose, or are interpolated if the motion is smooth.
+    usual pose, or `smooth_motion` interpolates them.
 
     Args:
         model: landmarks of the keypoints on the body.
         observations: keypoints of all frames, a batch of m. They have to be in order of time if the
             motion is smooth.
-        smoothness: expected acceleration of joints, metres per frame squared. 0: frames are
-            independent.
+        smoothness: expected acceleration of joints, metres per frame squared. If it is 0, or if
+            there are fewer than three frames, frames are independent.
     """
     fit = fit_frames(model, observations)
     if smoothness and len(fit.noise) > 2:
@@ -212,14 +214,14 @@ def _rigid_starts(
     counts: Float[Array, " k"],
     kept: int,
 ) -> FitState:
-    """Returns the `kept` best positions and orientations of a resting body, a batch.
+    """Returns states of a resting body with the `kept` best positions and orientations, a batch.
 
-    One candidate is the trunk of the resting body turned onto triangulated points (Kabsch 1976),
-    the others are the 24 orientations of a cube. The position for an orientation solves linear
-    equations. The candidates that follow the keypoints best are kept.
+    In one candidate the trunk of the resting body is turned onto triangulated points (Kabsch 1976).
+    The other candidates have the 24 orientations of a cube. The position for an orientation solves
+    linear equations. The candidates that follow the keypoints best are kept.
 
     Arguments: points: triangulated landmarks, (k, 3), metres. counts: number of views that agree
-    with each, (k,). 0: unknown.
+    with each landmark, (k,). 0 if the landmark is unknown.
     """
     resting = zero_state(problem.origin)
     landmarks, joints = problem.landmarks_and_joints(resting)
@@ -291,8 +293,9 @@ def _position(
     """Returns the position at which landmarks project to their detections, (3,), metres. offsets:
     landmarks relative to the position, (k, 3), metres.
 
-    Let (x, y) be a detection over the focal length, (X, Y, z) the offset and t the position, all in
-    the camera's axes. Then x (z + t_z) = X + t_x, and the same for y, which is linear in t.
+    Let (x, y) be a detection relative to the principal point over the focal length, (X, Y, z) the
+    offset and t the position, all in the camera's axes. Then x (z + t_z) = X + t_x, and the same
+    for y, which is linear in t. The position solves these equations of all views by least squares.
     """
     rotation = observations.cam_from_world[:, :3, :3]
     xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
@@ -321,7 +324,7 @@ class _Stage:
     scale: Float[Array, ""]
     """Robust scale, standard deviations."""
     free: FitState
-    """Booleans of the state's shape: which numbers move."""
+    """A boolean for each number of the state: whether it moves."""
 
 
 def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
@@ -380,8 +383,9 @@ def _certainty_found(
 ) -> Float[Array, " k"]:
     """Returns the certainties of the landmarks, (k,): the noise of all landmarks over that of each.
 
-    The noise of a landmark is the median error of its keypoints that several views of a frame show.
-    The fewer there are, the nearer it is to the usual noise.
+    The noise of a landmark follows from the median error of its keypoints and its mirror image's,
+    in frames where several views show the landmark. The fewer keypoints there are, the nearer the
+    noise is to the usual noise. It is at least half the usual noise.
     """
     names = problem.model.names
 
@@ -436,7 +440,7 @@ def smooth_motion(
     fit: LandmarkFit,
     smoothness: float | Float[Array, ""],
 ) -> LandmarkFit:
-    """Returns a fit whose joints move as smoothly as `smoothness` expects, and as the keypoints
+    """Returns a fit whose joints move as smoothly as `smoothness` expects, as far as the keypoints
     allow.
 
     Args:
@@ -444,14 +448,19 @@ def smooth_motion(
         fit: the fit without smooth motion, of at least three frames.
         smoothness: expected acceleration of joints, metres per frame squared.
 
-    The expected acceleration is multiplied by 64, 16, 4 and 1, one solve each. So frames that one
-    view hardly determines come together before anything pulls hard. The result is that of the last
-    of these levels that follows the keypoints of every frame as well as the fit does, up to their
-    noise. If no level does, the result is the fit itself.
+    Frames that show fewer than `FEW` landmarks are first interpolated between their neighbours.
+    Then there are four solves, each from the result of the one before. They expect 64, 16, 4 and 1
+    times `smoothness`. The first ones pull weakly, and bring frames together that one view hardly
+    determines.
 
-    "Up to their noise" means that the robust cost of a frame may exceed the fit's by the number of
-    the frame's unknowns. That is twice the excess of the true pose on average: a fit with p
-    unknowns takes up p of the squared normal errors, and half of them are the cost.
+    A solve is accepted if no frame follows its keypoints worse than in the fit, except for noise.
+    The last accepted solve is the result. If no solve is accepted, the result is the interpolated
+    fit if that is acceptable, else the fit.
+
+    "Except for noise" means that the robust cost of a frame may exceed the fit's by p. Here p is
+    the number of the frame's unknowns, or of its observed coordinates if these are fewer. The true
+    pose exceeds the fit's cost by p / 2 on average: a fit with p unknowns removes p from the sum of
+    the squared normal errors, and the cost is half that sum.
     """
     problem = keypoint_problem(replace(model, certainty=fit.certainty))
     seen = replace(observations, noise=fit.noise)
@@ -521,8 +530,9 @@ def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) ->
 
 
 def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> FitState:
-    """Returns the state with interpolated poses in frames that show fewer than `FEW` landmarks.
-    They lie between the nearest other frames.
+    """Returns the state with new poses in frames that show fewer than `FEW` landmarks. A new pose
+    is interpolated between the nearest other frames before and after. If one of these is missing,
+    it is the pose of the other.
     """
     m = len(seen.noise)
     shown = jnp.sum(jnp.any(seen.confidences * problem.known > 0, axis=1), axis=1) >= FEW

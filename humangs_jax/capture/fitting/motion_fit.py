@@ -1,15 +1,15 @@
 """Fits a motion to the keypoints of a video of one camera that stands still. One fit covers all
 frames, with one shape. Its stages are:
 
-    start    the trunk of each frame by the detector's 3D landmarks, smoothed over time
-    shape    the shape, unless it is known, by frames from all over the video without their order
-    motion   windows of `WINDOW` frames that overlap, by keypoints with their noise, the detector's
-             depths, the priors of poses, and accelerations and jerk of the joints
-    feet     the motion once more, with the feet held where the motion shows that they stand still
-    floor    the world turned so that people stand along y
+    start    places the trunk of each frame like the detector's 3D landmarks, smoothed over time
+    shape    fits the shape, unless it is known, to frames from all over the video, without order
+    motion   fits overlapping windows of `WINDOW` frames to the keypoints with their noise, the
+             detector's depths, the priors of poses, and accelerations and jerk of the joints
+    feet     fits the motion once more, and holds the feet where the motion shows that they stand
+    floor    turns the world so that the person stands along y
 
-The unknowns of a window are u with x = S u, S = (1 + w D^T D)^(-1/2), where D takes third
-differences over time. This is preconditioning: in u the jerk is about as stiff as the keypoints, so
+The unknowns of a window are u, where S u is the change of its state x, S = (1 + w D^T D)^(-1/2),
+and D takes third differences over time. In u the jerk is about as stiff as the keypoints, so
 that few steps of the solver carry a correction through all frames. All stages use one compiled
 program.
 
@@ -58,8 +58,8 @@ from humangs_jax.geometry.transform import EXACT
 WINDOW, OVERLAP = 120, 24
 """Number of frames of a window, and of frames that it shares with the next window."""
 _STEPS, _STEP_LENGTH = 120, 0.1
-"""Number of steps of gradient descent in each stage of a window, and length of the first step in
-each unknown.
+"""Number of steps of Adam in each stage of a window, and length of the first step in each
+unknown.
 """
 _ACCELERATION, _JERK = 10.0, 100.0
 """Expected standard deviations of a joint's acceleration, m/s^2, and jerk, m/s^3. They are those of
@@ -168,7 +168,8 @@ def fit_motion(
         K: intrinsics of the camera, (3, 3), pixels.
         fps: frames per second.
         betas: shape of the person, (s,). None: the shape is fitted.
-        height: height of the person, metres. None: it follows from keypoints and prior.
+        height: height of the person, metres. None: it follows from keypoints and prior. It has no
+            effect if `betas` is given.
         watch: called with the stages and the number of windows. It returns the stages, and may show
             a bar meanwhile.
     Raises: ValueError if no frame shows the person, or if the keypoints have no 3D landmarks.
@@ -301,13 +302,15 @@ def _place(
     K: Float[np.ndarray, "3 3"],
     offsets: Float[np.ndarray, "k 3"],
 ) -> Float[np.ndarray, "3"]:
-    """Returns the position t at which a body is seen where its keypoints are, metres.
+    """Returns the position t at which a body is seen where its keypoints are, (3,), metres, in the
+    axes of the world.
 
-    Arguments: points: keypoints, pixels. offsets: points of the body relative to t, metres.
+    Arguments: points: keypoints, (k, 2), pixels. offsets: points of the body relative to t, (k, 3),
+    metres, in the axes of the world.
 
-    Let (X, Y, Z) be a point's offset in the camera's axes, and (x, y) its keypoint over the focal
-    length, from the principal point. Then x (Z + t_z) = X + t_x, which is linear in t; y gives the
-    same.
+    Let (X, Y, Z) be a point's offset in the camera's axes, and (x, y) its keypoint relative to the
+    principal point over the focal length. Then x (Z + t_z) = X + t_x, and the same for y, which is
+    linear in t.
     """
     xy = (points - K[:2, 2]) / np.diagonal(K)[:2]
     off = offsets * np.diag(FLIP)[:3]
@@ -335,7 +338,9 @@ def _tallness(body: BodyModel) -> Float[np.ndarray, " s1"]:
 def _of_height(
     betas: Float[np.ndarray, " s"], tall: Float[np.ndarray, " s1"], height: float | int | None
 ) -> Float[np.ndarray, " s"]:
-    """Returns the shape nearest to `betas` that has this height, metres. None: `betas`."""
+    """Returns the shape nearest to `betas` that has this height, metres. If the height is None, it
+    returns `betas`. tall: see `_tallness`.
+    """
     if height is None:
         return betas
     missing = height - tall[0] - tall[1:] @ betas
@@ -360,8 +365,8 @@ def _joined(
 ) -> BodyPose:
     """Solves the windows one after the other, and returns the poses of all frames.
 
-    Each window is held to the first half of the frames that it shares with the window before. more:
-    further arguments of `run` for a window.
+    In the first half of the frames that two windows share, the second window is held to the result
+    of the first. more: returns further arguments of `run` for a window.
     """
     for i, window in enumerate(windows):
         anchored = np.zeros(len(window))
@@ -384,8 +389,8 @@ def _run(
     static: Float[np.ndarray, "w f"] | None = None,
     anchored: Float[np.ndarray, " w"] | None = None,
 ) -> tuple[BodyPose, Float[np.ndarray, " s"]]:
-    """Fits the poses of some frames. Returns the poses of all frames, with those replaced, and the
-    shape.
+    """Fits the poses of some frames. Returns the poses of all frames, of which it replaced those of
+    `frames`, and the shape.
 
     Args:
         frames: numbers of the frames, (w,) at most `WINDOW`.
@@ -393,7 +398,8 @@ def _run(
         scales: a row of `_LEVELS`.
         timed: whether the frames follow each other in time. If so, the shape stays.
         static: how surely the feet stand still, (w, f). None: they are not held.
-        anchored: 1 for frames that are held to their poses, (w,). None: none is.
+        anchored: 1 for frames that are held to their poses, 0 for others, (w,). None: no frame is
+            held.
     """
     count = len(frames)
     # windows have one length, so that one program does for all: what is added shows nothing

@@ -1,16 +1,16 @@
 """A pose for each photo of a person who moved a little between photos that one pose nearly
 explains.
 
-Whoever turns before a camera moves head, arms and legs by centimetres. Between "one moment" and
-"each photo its own moment" lies this: one shape, one set of cameras, and in each photo a pose that
-starts at the shared one and stays near it (`CONFIG`). Photos of a video follow each other:
-their deviations x_i from the shared pose, in standard deviations, are a process of Ornstein and
-Uhlenbeck, where x_{i+1} - r x_i has the variance 1 - r^2, with r = exp(-t / MEMORY) for photos that
-are t seconds apart.
+A person who turns before a camera moves head, arms and legs by centimetres. Such photos are neither
+of one moment nor of separate moments. They have one shape and one set of cameras, and each photo
+has a pose that starts at the shared pose and stays near it (`CONFIG`). Photos of a video follow
+each other. Their deviations x_i from the shared pose, in standard deviations, are a process of
+Ornstein and Uhlenbeck, where x_{i+1} - r x_i has the variance 1 - r^2, with r = exp(-t / MEMORY)
+for photos that are t seconds apart.
 
-More numbers always fit the keypoints better. What tells that the person has moved is evidence that
-the poses were not fitted to: poses from keypoints alone are judged by the masks. Where nobody moved
-these poses are the detector's errors, and the body fills the masks less than before.
+More numbers always fit the keypoints better. So poses are fitted to the keypoints alone, and the
+masks show whether the person moved. If nobody moved, these poses follow the detector's errors, and
+the body fills the masks less than before.
 """
 
 import dataclasses
@@ -49,22 +49,25 @@ CONFIG = dataclasses.replace(
         ("wrist", 1.2),
     ),
 )
-"""Settings of poses that stay near the one that photos share."""
+"""Settings of poses that stay near the pose that the photos share."""
 MEMORY = 2.0
-"""Seconds after which a body that sways has forgotten most of where it was."""
+"""Time after which the correlation of a swaying body's deviations has fallen to 1 / e, seconds."""
 LEAST_GAIN = 0.002
-"""Least rise of the silhouettes' IoU, through poses that know keypoints alone, that shows a
-movement. Synthetic people whose photos are of one moment lose 0.012, with joints bent by 2 degrees
-they gain 0.005, and a real man who turns before a camera gains 0.017."""
+"""Least rise of the silhouettes' IoU that shows a movement, if poses are fitted to keypoints alone.
+Synthetic people whose photos are of one moment lose 0.012. If their joints are bent by 2 degrees,
+they gain 0.005. A real man who turns before a camera gains 0.017.
+"""
 
 
 class Movement(NamedTuple):
     """Whether a person moved between photos."""
 
     before: float
-    """Mean IoU of the masks and the body in the shared pose; NaN without masks."""
+    """Mean IoU of the masks and the body in the shared pose. NaN without masks."""
     after: float
-    """The same in poses that know the keypoints of each photo alone."""
+    """Mean IoU of the masks and the body in a pose for each photo, which was fitted to keypoints
+    alone. NaN without masks.
+    """
 
     @property
     def shown(self) -> bool:
@@ -75,12 +78,13 @@ class Movement(NamedTuple):
 def find_movement(
     capture: Capture, keypoints: Keypoints, seconds: Float[np.ndarray, " v"] | None = None
 ) -> Movement:
-    """What masks say of poses that know the keypoints of each photo alone.
+    """Returns how well the body fills the masks in the shared pose, and in a pose for each photo
+    that is fitted to keypoints alone.
 
     Arguments:
         capture: photos with masks, and a body in poses that they share.
-        keypoints: of its views, as a fit has stored them.
-        seconds: when each photo of a video was taken, rising; None: photos in no order.
+        keypoints: keypoints of the capture's views, as a fit has stored them.
+        seconds: times of a video's photos, (v,), rising. None: the photos have no order.
     """
     start = with_own_poses(capture)
     judge = SilhouetteFit.of(start, keypoints, CONFIG)
@@ -96,8 +100,11 @@ def find_movement(
 def fit_own_poses(
     capture: Capture, keypoints: Keypoints, seconds: Float[np.ndarray, " v"] | None = None
 ) -> RefinedCapture:
-    """A pose for each photo by masks and keypoints; cameras and shape stay. Arguments: see
-    `find_movement`. Where that is no better, each photo has the shared pose.
+    """Returns the capture with a pose for each photo, fitted to masks and keypoints. The cameras
+    stay, and the shape hardly changes. If the result is not clearly better, each photo has the
+    shared pose.
+
+    Arguments: see `find_movement`.
     """
     return refine_capture(
         with_own_poses(capture), keypoints=keypoints, config=CONFIG, memory=_memory(seconds)
@@ -105,12 +112,14 @@ def fit_own_poses(
 
 
 def _memory(seconds: Float[np.ndarray, " v"] | None) -> Float[np.ndarray, " n"] | None:
-    """Correlations of the deviations of neighbours."""
+    """Returns the correlations of the deviations of successive photos, (v - 1,). None without
+    times.
+    """
     return None if seconds is None else np.exp(-np.diff(seconds) / MEMORY)
 
 
 def with_own_poses(capture: Capture) -> Capture:
-    """The capture with a frame for each photo, all in the poses that they share."""
+    """Returns the capture with a frame for each photo, in the pose of the frame that it had."""
     frames = np.asarray(capture.frames)
     poses = replace(
         capture.poses,
@@ -123,19 +132,20 @@ def with_own_poses(capture: Capture) -> Capture:
 
 
 def record_of_photos(record: FitRecord, frames: Int[np.ndarray, " v"]) -> FitRecord:
-    """Gives the record of a fit in which each of the v photos now has another frame.
+    """Returns the record of a fit with a frame for each of the v photos.
 
-    frames: those of the fit that the photos showed before.
+    frames: the frame of the fit that each photo showed before, (v,).
     """
     rows = {name: getattr(record, name)[frames] for name in ("noise", "joint_std", "determined")}
     return dataclasses.replace(record, **rows)
 
 
 def movement_line(capture: Capture) -> str:
-    """One line that says how far the person moved between photos that have a pose each.
+    """Returns a line that says how far the person moved between photos that have a pose each.
 
-    The number is the mean distance of the skin, across the line of sight, from where the mean of
-    all poses has it, in the photo where it is largest: a photo does not show depths.
+    For each photo, it measures how far the skin is from its place in the mean of all poses. This is
+    a mean over the skin, across the line of sight, because a photo does not show depths. The line
+    has the largest number of all photos.
     """
     frames = np.asarray(capture.frames)
     poses = jax.tree.map(np.asarray, capture.poses)

@@ -15,10 +15,13 @@ p_z:
                                                      McClure
     world   sqrt(w) (X - mean_v(X) - W) / std        W: the detector's 3D landmarks; means are
                                                      weighted by w
-    size    (log r(X) - log r(W)) / std              r: the root of all views' weighted mean square
-                                                     distances from the mean
-    bones   (|left bone| - |right bone|) / std       each kind has its own std, see `STD`
-    focal   y_g, with f_v = f0_v exp(std_v y_g)      one y for each kind of camera
+    size    (log r(X) - log r(W)) / std              r: the root of the sum over the views of the
+                                                     weighted mean square distance from the mean
+    bones   (|left bone| - |right bone|) / std
+    focal   y_g, with f_v = f0_v exp(std_v y_g)      one y for each kind of camera, and
+                                                     std_v = `Evidence.focal_std`
+
+The std of world, size and bones are the fields of `STD`.
 
 A pixel depends on one landmark, one camera and one y. So the landmarks can be eliminated (Schur
 complement: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6.1), which leaves
@@ -49,7 +52,9 @@ class _Std:
     landmarks share, so that pixels decide where several views see a landmark.
     """
     bones: float = 0.01
-    """Standard deviation of the difference of a left and its right bone's length, metres."""
+    """Standard deviation of the difference between the lengths of a left bone and its right
+    partner, metres.
+    """
     size: float = 0.01
     """Standard deviation of the logarithm of the person's size against the detector's 3D landmarks.
     This keeps the scale.
@@ -64,9 +69,11 @@ ROBUST_SCALES = (40.0, 6.0)
 first is large because the start is off by tens of standard deviations.
 """
 EXACT = 1e-9
-"""Relative decrease of the cost that ends the search for a final result."""
+"""A search for a final result ends when a step decreases the cost by less than this share."""
 COARSE = 1e-3
-"""Relative decrease of the cost that ends a search whose cost is only compared with others."""
+"""A search whose cost is only compared with others ends when a step decreases the cost by less than
+this share.
+"""
 _STILL = 1e-6
 """Number that is added to the diagonal of the normal equations, so that unknowns that no residual
 moves stay where they are.
@@ -116,7 +123,7 @@ class Rig:
     rotations: Float[np.ndarray, "c 3 3"]
     """Rotations from the landmarks' axes to those of the cameras, (c, 3, 3)."""
     places: Float[np.ndarray, "c 3"]
-    """Positions of the landmarks' origin in the cameras, (c, 3), metres."""
+    """Position of the landmarks' origin in the axes of each camera, (c, 3), metres."""
     focal: Float[np.ndarray, " c"]
     """Focal lengths, (c,), pixels."""
 
@@ -149,7 +156,7 @@ def _turns_onto(
     weights: Float[np.ndarray, "c k"],
 ) -> Float[np.ndarray, "c 3 3"]:
     """Returns the rotations, (c, 3, 3), that turn a shape best onto the landmarks of each view
-    (Kabsch 1976). If points lie on a line, one of the best rotations.
+    (Kabsch 1976). If the points lie on a line, several rotations are best, and one is returned.
     """
     share = weights / weights.sum(1, keepdims=True)
     source = shape - (share @ shape)[:, None]
@@ -168,8 +175,9 @@ def place_person(
     """Returns the position at which landmarks project to their pixels, (3,), metres.
 
     Let (x, y) be a pixel over the focal length, (X, Y, z) the landmark's offset and t the position.
-    Then x (z + t_z) = X + t_x, and the same for y, which is linear in t. If that gives a distance
-    far from the one by the person's size, the position follows from the size.
+    Then x (z + t_z) = X + t_x, and the same for y, which is linear in t. If the depth t_z differs
+    by more than a factor of 3 from the depth at which the person has the size in the photo, the
+    position follows from the size.
 
     points: (k, 2) pixels from the principal point. weights: (k,). offsets: landmarks relative to
     the position, in the camera's axes, (k, 3), metres. focal: focal length, pixels.
@@ -317,8 +325,8 @@ def _tied(
 ) -> Float[np.ndarray, "t k 3"]:
     """Returns the derivatives of the residuals of size and bones by all landmarks, (t, k, 3).
 
-    They are d log r / d L = the sum over views of share R^T (X - mean) / r^2, and for bones d |a -
-    b| / d a = (a - b) / |a - b|.
+    Before the division by `STD` they are d log r / d L = the sum over views of share R^T (X - mean)
+    / r^2, and for bones d |a - b| / d a = (a - b) / |a - b|.
     """
     share = _shares(evidence)
     centered = turned - np.sum(share * turned, axis=1, keepdims=True)
@@ -355,7 +363,9 @@ def _factors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, " g"]:
 
 
 def _cross(x: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Returns the matrices [x], (..., 3, 3), with [x] y = x x y."""
+    """Returns the matrix of the cross product with each vector, (..., 3, 3): `_cross(a) @ b` is
+    `np.cross(a, b)`.
+    """
     out = np.zeros((*x.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -x[..., 2], x[..., 1], -x[..., 0]
     return out - np.swapaxes(out, -1, -2)
@@ -402,10 +412,11 @@ def adjust(
     scales: Sequence[float] = ROBUST_SCALES,
 ) -> tuple[Rig, float]:
     """Runs bundle adjustment by Levenberg and Marquardt. Returns the rig, and half the square sum
-    of its residuals.
+    of its residuals with the last scale.
 
-    Arguments: tolerance: relative decrease of the cost that ends a search. scales: robust scales of
-    pixels, standard deviations. There is one search for each, in this order.
+    Arguments: tolerance: a search ends when a step decreases the cost by less than this share.
+    scales: robust scales of pixels, standard deviations. There is one search for each, in this
+    order.
     """
     rig, cost = start, np.inf
     for scale in scales:
@@ -514,8 +525,9 @@ def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
     """Returns the damped step of Gauss and Newton, and the decrease of the cost that the linear
     model expects from it.
 
-    Let l be the landmarks, q the cameras, U the tied rows, r their residuals, and t = U l + r
-    separate unknowns:
+    Let l be the step of the landmarks and q that of the cameras, a and b their J^T r of the rows
+    that are not tied, and D, E and C the blocks of the damped J^T J. Let U be the derivatives of
+    the tied rows, r their residuals, and t = U l + r separate unknowns:
 
         D l + E q + U^T t = -a                  D block diagonal: landmarks by landmark
         E^T l + C q       = -b

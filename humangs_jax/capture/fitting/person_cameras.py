@@ -69,7 +69,8 @@ _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 class PersonCameras:
     """Cameras around a person who stands on y = 0 at x = z = 0, facing +z.
 
-    All fields except `views` have one entry for each of the c photos that are used.
+    `cameras`, `landmarks`, `mirrored` and `errors` have one entry for each of the c photos in
+    `views`.
     """
 
     views: tuple[int, ...]
@@ -94,12 +95,15 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
     """Returns the cameras of photos, found from the person in them. If one set of landmarks
     explains all photos, they are of one moment. Otherwise each camera is found alone.
 
-    If one photo of many contradicts the others, it is left out.
+    Photos that show too little of the person are left out if other photos show more. If one photo
+    of several contradicts the others, it is left out, too.
 
     Arguments: height: height of the person without shoes, metres. None: the person has the size of
     the detector's 3D landmarks.
-    Raises: ValueError with the name of the photo, if it shows too little of the person, or if no
-    camera is found.
+    Raises: ValueError, with the name of a photo, if all photos show too little of the person, if
+    the person is too small in a photo, if a focal length or the 3D landmarks are unusable, or if no
+    camera is found. ValueError, too, without photos, for arrays that do not fit each other, and for
+    a height that is not between 0.3 and 3 metres.
     """
     _check(seen, height)
     # photos that show too little are left out where others show more
@@ -138,6 +142,8 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
 def _cameras(seen: PersonViews, trial: Trial, height: float | None) -> PersonCameras:
     """Returns cameras and landmarks of a trial, in the world of the person. height: see
     `cameras_from_person`.
+
+    Raises: ValueError if the trial has numbers that are not finite.
     """
     rig = trial.rig
     if not all(np.isfinite(getattr(rig, field.name)).all() for field in dataclasses.fields(rig)):

@@ -242,9 +242,8 @@ def explain(seen: PersonViews) -> Explanation:
 def _without_one(
     seen: PersonViews, chosen: tuple[int, ...]
 ) -> tuple[Trial, tuple[int, ...]] | None:
-    """Fits the cameras of all photos but the one that contradicts the others most.
-
-    None if the rest is not of one moment either.
+    """Returns the trial of the chosen photos without the one that contradicts the others most, and
+    the photos that are left. None if these are not of one moment either.
     """
     rests = [tuple(v for v in chosen if v != out) for out in chosen]
     trials = [
@@ -261,9 +260,9 @@ def _without_one(
 def _with_others(
     seen: PersonViews, trial: Trial, views: tuple[int, ...], others: Sequence[int]
 ) -> tuple[Trial, tuple[int, ...]]:
-    """Adds those of the other photos that show the person of the trial, mirrored or not.
+    """Adds each of the other photos that agrees with the trial, mirrored or not.
 
-    Returns the cameras of all these photos, fitted together, and the photos.
+    Returns a trial of the cameras of these photos and `views`, fitted together, and the photos.
     """
     mirrored = dict(zip(views, trial.mirrored, strict=True))
     for view in under_bar(others, "cameras of further photos"):
@@ -319,8 +318,8 @@ def best_trial(seen: PersonViews) -> Trial:
 
 
 def _least(seen: PersonViews, start: Trial) -> Trial:
-    """Mirrors one view after the other, as long as the cost decreases clearly. Returns the best
-    trial.
+    """Mirrors the view that decreases the cost most, again and again, as long as the cost decreases
+    clearly. Returns the last trial.
     """
     views = np.arange(len(seen.points))
     while True:
@@ -345,8 +344,8 @@ def _polished(trial: Trial) -> Trial:
 
 
 def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"]) -> float:
-    """Returns the rms of the errors, (c, k). The divisor is the number of degrees of freedom that
-    are left after points and cameras were fitted.
+    """Returns the rms of the errors, (c, k), of landmarks that are seen. The divisor is the number
+    of degrees of freedom that are left after points and cameras were fitted.
     """
     views, shown = len(errors), weights.max(0) > SEEN
     numbers = 2 * (weights > SEEN).sum()

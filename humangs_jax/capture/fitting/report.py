@@ -143,7 +143,7 @@ class FitReport:
         return _plain(dataclasses.asdict(self))
 
     def __str__(self) -> str:
-        """Returns a table of views, then errors, notes and warnings."""
+        """Returns a table of views, then errors, notes, undetermined joints and warnings."""
         lines = _view_rows(self.views) if self.views else []
         for key, change in self.errors.items():
             label, form = _LABELS[key]
@@ -225,8 +225,9 @@ def undetermined_joints(
     joint_std: Float[np.ndarray, "m j"],
     determined: Float[np.ndarray, "m j"],
 ) -> tuple[str, ...]:
-    """Returns the names of the joints that the views do not determine in m frames. Fingers and
-    other groups have one name.
+    """Returns the names of the joints that the views do not determine in m frames. A group in
+    `_GROUPS` has one name if all of its joints are undetermined. The name is followed by the number
+    of frames if this is not all.
 
     Arguments: joint_std: standard deviation of each joint, (m, j), metres. determined: share of
     each joint's rotation that the views determine, (m, j).

@@ -1,9 +1,9 @@
 """Refines cameras, shape and poses of a capture with its silhouettes and keypoints.
 
 Each iteration matches the rendered silhouette of the body with the edge of the mask, as iterated
-closest points do, and then solves a few steps of damped least squares. `StateStd` is a Gaussian
-prior around the start: without it, cameras and people could move together. The result is kept only
-if its score is better than that of the start.
+closest points do, and then solves a few steps of damped least squares, or of L-BFGS if there are
+many unknowns. `StateStd` gives a Gaussian prior around the start. Without it, cameras and people
+could move together. The result is kept only if its loss is clearly less than that of the start.
 """
 
 import dataclasses
@@ -77,7 +77,9 @@ class CaptureRefineConfig:
     std: StateStd = dataclasses.field(default_factory=StateStd)
     """Standard deviations of what the start may be off by."""
     coefficients: int = 10
-    """Least number of shape coefficients; a capture with fewer gets more."""
+    """Least number of shape coefficients. A capture with fewer gets more, as far as its body has
+    them.
+    """
     fixed_cameras: bool = False
     """Whether the cameras stay as they are, so that only shape and poses move."""
     iterations: int = 10
@@ -85,13 +87,13 @@ class CaptureRefineConfig:
     longest_side: int = 512
     """Longest side of the photos that the refinement works on, pixels. Larger photos are shrunk."""
     points: int = 300
-    """Number of points on the silhouette of the body in a view."""
+    """Number of points on the silhouette of the body in a view, and on that of the mask."""
     reach: tuple[float, float] = (0.08, 0.015)
-    """How far the points of the body look for the edge of the mask, in the first and in the last
-    matching. Both are shares of the person's height in the image.
+    """Largest distance at which points of the body and of the mask are matched, in the first and in
+    the last matching. Both are shares of the person's height in the image.
     """
     independent: float = 30.0
-    """Number of independent equations that all points of a view together count as."""
+    """Number of independent equations that all points of a view together count as, at most."""
     robust_scales: tuple[float, float] = (1.0, 0.5)
     """Robust scales for points of the body outside and inside of the mask, multiples of the
     reach.
@@ -102,8 +104,8 @@ class CaptureRefineConfig:
     it, wrong bodies that fill clothes 1.8.
     """
     by_joint: tuple[tuple[str, float], ...] = ()
-    """Pairs (word, factor). A joint whose name holds the word gets `std.body_pose` times the
-    factor.
+    """Pairs (word, factor). A joint whose name contains the word gets `std.body_pose` times the
+    factor. If several words fit, the first counts.
     """
 
 
@@ -354,7 +356,7 @@ class SilhouetteFit:
     """
 
     capture: Capture
-    """The start: the body, and the photos at their full size."""
+    """The start, with the photos at their full size."""
     config: CaptureRefineConfig
     """Settings."""
     memory: Float[Array, " n"] | None
@@ -377,7 +379,7 @@ class SilhouetteFit:
     boundaries: list[silhouettes.Boundary]
     """Boundaries of the masks, without the parts where something stands in front."""
     model: LandmarkModel
-    """Places of the keypoints on the body."""
+    """Places of the keypoints on the body. Without keypoints, it has no landmarks."""
     keypoints: Observations | None
     """Keypoints in pixels of the photos at their full size, which scores are in. None without
     keypoints.
@@ -589,8 +591,8 @@ def overlap(
     mask: Float[np.ndarray, "h w"],
     known: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """Returns the intersection over union of a body and a mask. known: pixels that count (default:
-    all). NaN if the mask is empty.
+    """Returns the intersection over union of a body and a mask. It is NaN if the mask is empty.
+    known: pixels where the body counts, by default all. The mask counts everywhere.
     """
     person = mask > 0.5
     if known is not None:
@@ -612,8 +614,8 @@ def posed_vertices(
 def _noise(
     boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]
 ) -> float:
-    """Returns how far the bodies are from their masks, pixels, at least 0.7. 1.0 if nothing was
-    matched.
+    """Returns the standard deviation of the distances between bodies and masks, pixels, from their
+    median. It is at least 0.7, and 1.0 if nothing was matched.
 
     Clothes make masks less certain, and so does a body that has not yet arrived. Silhouettes are
     never more exact than 0.7 pixels.
@@ -634,7 +636,8 @@ def _person_height(
     observations: Observations | None,
 ) -> float:
     """Returns the height of the person in the image, pixels. This is the median over the views of
-    the extent of the mask, or of the keypoints if all masks are empty. NaN without either.
+    the mask's height or width, whichever is larger. If all masks are empty, the keypoints are
+    measured instead. Without masks and keypoints, the result is NaN.
     """
     sizes = [max(np.ptp(x) for x in np.nonzero(mask > 0.5)) for mask in masks if (mask > 0.5).any()]
     if not sizes and observations is not None:
@@ -655,7 +658,7 @@ class RefinedCapture:
     """The result of a refinement."""
 
     capture: Capture
-    """The start or the result, whichever is better. The start itself if `report.kept` is False."""
+    """The refined capture, or the start itself if `report.kept` is False."""
     report: FitReport
     """What was fitted, and how well."""
 
@@ -667,16 +670,17 @@ def refine_capture(
     config: CaptureRefineConfig = DEFAULT_CONFIG,
     memory: Float[np.ndarray, " n"] | None = None,
 ) -> RefinedCapture:
-    """Refine cameras (rotation, centre, focal length), shape and poses of a capture.
+    """Refines cameras (rotation, centre, focal length), shape and poses of a capture.
 
-    Views whose mask is empty take no part.
+    In a view whose mask is empty, only the keypoints count. The start is kept if the result is not
+    clearly better.
 
     Args:
         capture: the start.
         keypoints: keypoints in the capture's views, or None.
-        config: settings. After a fit to these keypoints, those of `usual_config`.
-        memory: (m - 1,) correlations in [0, 1) of each of the m poses with the one before, as in a
-            video. None: poses are independent.
+        config: settings. `usual_config` returns settings that suit the start.
+        memory: correlation of each pose but the first with the pose before, (m - 1,), in [0, 1), as
+            in a video. None: poses are independent.
 
     Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint. ValueError if
     the keypoints have another number of views than the capture.

@@ -1,12 +1,12 @@
 """The state and the solver that all fits share. A state holds shape and poses and, if a fit moves
-them, cameras and clothing.
+them, cameras, clothing and the places of landmarks.
 
 The numbers of a state are deviations from an `Origin` in units of their expected size. So zeros are
-the origin, solvers take steps of one length in all directions, and the square of a number is its
-prior.
+the origin, a step of length 1 means as much in all directions, and half the square of a number is
+its negative logarithmic prior.
 
-    keypoints    betas, the pose of every frame               origin: the mean shape in its usual
-                                                              pose
+    keypoints    betas, the pose of every frame, places of    origin: the mean shape in the usual
+                 landmarks                                    pose
     refinement   betas, poses, cameras, clothing              origin: a capture
 
 The root turns by global_orient after the origin's rotation, because sums of rotation vectors near
@@ -77,15 +77,15 @@ def solve(
     tolerance: float = 1e-4,
     free: T | None = None,
 ) -> tuple[T, Float[Array, ""]]:
-    """Minimise half the square sum of residuals.
+    """Minimises half the square sum of residuals.
 
     Args:
         residuals: function that returns a pytree of residuals.
         start: pytree of unknowns to begin with.
         steps: largest number of steps.
         method: see the module's docstring.
-        tolerance: change of the unknowns, and relative change of the loss, at which the solver
-            stops.
+        tolerance: the solver stops when a step changes each unknown and the loss by less than
+            this number times (1 + its size).
         free: pytree of booleans like start. Numbers that are False stay. None: all move.
     Returns: the solution and half its square sum. If the solution is not at least as good as the
     start, or not finite, these are the start and its half square sum.
@@ -99,7 +99,7 @@ def solve(
         moving = None if free is None else ravel_pytree(free)[0]
 
         def held(y):
-            """Returns the unknowns, with those that are not free as at the start."""
+            """Returns the unknowns. Those that are not free are as at the start."""
             return y if moving is None else jnp.where(moving, y, flat)
 
         def of(y):
@@ -180,8 +180,8 @@ _RANGES = {
     **{f"left_{finger}1": _KNUCKLE for finger in FINGERS if finger != "thumb"},
     **{f"left_{finger}{k}": _FINGER for finger in FINGERS if finger != "thumb" for k in (2, 3)},
 }
-"""Ranges of everyday movement, for the root and the left side. They are wider than measured joint
-angles, because components of a rotation vector are not joint angles.
+"""Ranges of everyday movement, for the joints in the middle and on the left side. They are wider
+than measured joint angles, because components of a rotation vector are not joint angles.
 """
 
 
@@ -189,7 +189,7 @@ angles, because components of a rotation vector are not joint angles.
 class PosePrior:
     """The prior of the rotations of a body's j joints, in the body's order.
 
-    The values of the root are not used: every orientation is as likely.
+    Of the root only the mean is used, because every orientation is equally likely.
     """
 
     mean: Float[np.ndarray, "j 3"]
@@ -265,8 +265,8 @@ class StateStd:
 
 
 FREE = StateStd(global_orient=math.degrees(0.3), transl=0.1, betas=1.0)
-"""Units for a fit without a start. Orientation and position have no prior then: theirs are step
-lengths of the solver. The shape has its usual standard deviation.
+"""Units for a fit without a start. Orientation and position have no prior in such a fit. Their
+units are step lengths of the solver. The shape has its usual standard deviation.
 """
 
 
@@ -305,7 +305,9 @@ class FitState:
     of `StateStd`. None without clothing.
     """
     places: Float[Array, "g 3"] | None = None
-    """Deviations of the places of groups of landmarks, (g, 3), see `LandmarkModel.moved`."""
+    """Deviations of the places of groups of landmarks, (g, 3), see `LandmarkModel.moved`. Their
+    unit is `residuals.keypoints.PLACE_STD`. None if the fit does not move them.
+    """
 
 
 @pytree_dataclass
@@ -341,7 +343,7 @@ class Origin:
     joints: tuple[int, ...] = static_field(default=())
     """Indices of the a free joints. The root (joint 0) is always free and not among them."""
     std: StateStd = FREE
-    """Units of everything that moves but the joints' rotations."""
+    """Units of everything that moves, except joints' rotations and landmarks' places."""
 
     @property
     def views(self) -> CameraOrigin:

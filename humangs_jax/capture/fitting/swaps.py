@@ -124,8 +124,8 @@ def find_swaps(
 
 
 def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[Swap, ...]:
-    """Returns views in which the hands' keypoints are at each other's wrists. Hand detectors leave
-    them so when their crops are exchanged.
+    """Returns a swap for each view in which the hands' keypoints are at each other's wrists. It is
+    empty if the set of keypoints has no roots of hands.
     """
     wanted = ("left_hand_root", "right_hand_root", "left_wrist", "right_wrist")
     if not set(wanted) <= set(keypoints.set.names):
@@ -158,7 +158,7 @@ class Order(NamedTuple):
         a: Int[np.ndarray, " e"],
         b: Int[np.ndarray, " e"] | None,
     ) -> "Order":
-        """The order after an exchange in some frames.
+        """Returns the order after an exchange in some frames.
 
         Cameras a and b exchange their keypoints. If b is None, left and right of camera a's
         keypoints are exchanged.
@@ -172,15 +172,17 @@ class Order(NamedTuple):
 
 
 def given(frames: int, views: int) -> Order:
-    """Returns the order in which every camera has the keypoints that it was given."""
+    """Returns the order in which every camera has its own keypoints, with their sides as they
+    are.
+    """
     return Order(np.tile(np.arange(views), (frames, 1)), np.zeros((frames, views), bool))
 
 
 def _arranged(
     observations: Observations, mirror: Int[np.ndarray, " k"], order: Order
 ) -> Observations:
-    """Returns the keypoints of m frames in an order. mirror: index of each keypoint's mirror
-    image.
+    """Returns the keypoints of m frames in an order. If the order exchanges sides, they have no 3D
+    landmarks. mirror: index of each keypoint's mirror image, (k,).
     """
     rows = np.arange(len(order.source))[:, None]
     columns = np.where(order.mirrored[rows, order.source, None], mirror, np.arange(len(mirror)))
@@ -330,8 +332,8 @@ class _Search:
         return trial.gain / max(attainable, 1e-6) > least
 
     def flips(self) -> dict[int, _Trial]:
-        """Finds the view of each frame whose sides are exchanged most clearly. Returns trials by
-        frame.
+        """Returns a trial for each frame in which the sides of a view are clearly exchanged, by
+        frame. It is the trial of the view whose exchange gains most.
         """
         found: dict[int, _Trial] = {}
         sided = self.mirror != np.arange(len(self.mirror))
@@ -345,8 +347,8 @@ class _Search:
         return found
 
     def exchanges(self) -> list[_Trial]:
-        """Returns the clear exchanges of two cameras: in all their frames together, and in each
-        frame alone.
+        """Returns the clear exchanges of two cameras. An exchange is tried in all frames of the two
+        cameras together, and in each frame alone.
         """
         # pairs of cameras that look exchanged in some frame are tried in all of their frames
         suspected = {self._pair(*at) for at in np.argwhere(self.pairs).tolist()}

@@ -178,8 +178,8 @@ class _SameWay:
     resized: float = 1.5
     """Largest ratio of a person's sizes in the photo of one camera in two successive frames."""
     shorter: float = 0.3
-    """How much longer the movements between two frames have to become if two people are exchanged,
-    for the people to be linked. A share of the largest movement.
+    """Least length that the movements between two frames have to gain if two people are exchanged,
+    for the people to be linked, a share of the largest movement.
     """
     far: float = 3.0
     """Multiple of the largest movement from which on all movements count as equally long."""
@@ -215,17 +215,20 @@ class Match(NamedTuple):
     mirrored: tuple[bool, ...]
     """Whether the person's left and right are exchanged, for each view."""
     error: float
-    """Median distance of the landmarks from the triangulated points, a share of the person's size.
-    Infinite for a person who is seen in one view.
+    """Mean over the views of the median distance of the landmarks from the triangulated points, a
+    share of the person's size. The two views that proposed the points count as one, with the larger
+    distance. It is infinite for a person who is seen in one view.
     """
     center: Float[np.ndarray, "3"]
-    """Median of the triangulated points, (3,), metres. NaN for a person who is seen in one view."""
+    """Median of the triangulated points, (3,), metres. NaN if no point was triangulated, as for a
+    person who is seen in one view.
+    """
 
 
 def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
-    """Matches the people of some views of one moment.
+    """Returns a match for each person in some views of one moment.
 
-    People that most views show come first, those of a single view last.
+    People that most views show come first, and people of a single view come last.
 
     Arguments: mirror: for each landmark the index of its mirror image.
     """
@@ -378,8 +381,8 @@ def in_order_of_time(
     person.
 
     People are linked so that the sum of all movements is the least. Movements are measured in
-    space, or in the photos of one camera for people without a position in space. Where another
-    choice is nearly as short, nobody is linked.
+    space first. People who are not linked then are compared in the photos of one camera. A person
+    is not linked if another choice is nearly as short.
 
     Arguments: shown: the views of each frame. None: people are followed in space alone.
     Returns: for each frame a match for each person, None where the frame does not show the person.

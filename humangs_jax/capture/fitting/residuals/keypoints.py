@@ -48,8 +48,8 @@ count.
 _NOISE_RANGE = (0.5, 8.0)
 """Bounds of the noise that a fit finds, multiples of the expected noise."""
 PLACE_STD = 0.02
-"""Standard deviation of the offset between where a detector sees a landmark and where it is
-expected to, metres.
+"""Standard deviation of the difference between the place where a detector sees a landmark and the
+expected place, along each axis, metres.
 """
 _WORLD_STD = 0.15
 """Standard deviation of a detector's 3D landmarks, a share of the root mean square of their
@@ -61,7 +61,7 @@ RAYLEIGH_MEDIAN = 1.1774
 
 @pytree_dataclass
 class Observations(Batchable):
-    """Keypoints of one frame in c views; a missing view has confidence 0."""
+    """Keypoints of one frame in c views. The keypoints of a missing view have confidence 0."""
 
     points: Float[Array, "c k 2"]
     """Detected points, (c, k, 2), pixels, with the centre of the first pixel at (0.5, 0.5)."""
@@ -97,10 +97,10 @@ def make_observations(
 
 
 def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -> Observations:
-    """Returns keypoints of photos in pixels of resized cameras, a batch of views with one view each
-    (c = 1). All have the noise that is expected of the views together.
+    """Returns keypoints of photos in pixels of resized photos, a batch with one view each (c = 1).
+    All views have the same noise, which is expected of the views together.
 
-    cameras: of the resized photos. photos: cameras of the photos.
+    cameras: cameras of the resized photos. photos: cameras of the photos.
     """
     scale = np.asarray(
         [cameras.width / photos.width, cameras.height / photos.height], keypoints.points.dtype
@@ -119,7 +119,8 @@ def group_by_frame(
     photos: Photos | Capture, keypoints: Keypoints
 ) -> tuple[Observations, Int[np.ndarray, "m c"]]:
     """Groups the keypoints of views by frame. Returns a batch of m frames, and the index of each
-    view, (m, c), -1 where there is none.
+    frame's views, (m, c). The index is -1 where a frame has fewer views than others. 3D landmarks
+    are kept only if every frame has one view.
     """
     frames, count = np.asarray(photos.frames), photos.frame_count
     # frames with fewer views than others have missing ones, whose keypoints have confidence 0
@@ -149,8 +150,10 @@ def in_camera_axes(
     weights: Float[np.ndarray, "*b k"],
     K: Float[np.ndarray, "*b 3 3"],
 ) -> Float[np.ndarray, "*b k 3"]:
-    """Turns landmarks whose z axis is the ray to the weighted mean of the points into the axes of
-    the camera, (..., k, 3).
+    """Returns landmarks in the axes of their camera, (..., k, 3).
+
+    world: the landmarks in axes whose z axis is the camera's ray to the weighted mean of the
+    points. points: pixels, (..., k, 2). weights: (..., k). K: intrinsics, (..., 3, 3), pixels.
     """
     total = weights.sum(-1, keepdims=True)
     middle = (weights[..., None] * points).sum(-2) / np.maximum(total, 1e-9)
@@ -166,8 +169,8 @@ def in_camera_axes(
 def expected_noise(
     points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]
 ) -> Float[np.ndarray, " m"]:
-    """Returns the expected noise of each frame, (m,), pixels. It follows from the size of the
-    person in the views, and is 1 where nothing is seen.
+    """Returns the expected noise of each frame, (m,), pixels. It follows from the median size of
+    the person in the views, and is at least `LEAST_NOISE`. It is 1 where nothing is seen.
     """
 
     def of_frame(points, seen):
@@ -184,9 +187,11 @@ def expected_noise(
 
 
 def found_noise(lengths: Array | np.ndarray, expected: Array | np.ndarray | np.floating) -> Any:
-    """Returns the noise, pixels, estimated from the median of errors, which outliers hardly change.
-    NaN marks a missing error. Without any error the noise is the expected one. Numpy arrays give a
-    numpy array.
+    """Returns the noise of keypoints, estimated from the median of the lengths of their errors,
+    which outliers hardly change. It stays within `_NOISE_RANGE` times the expected noise.
+
+    NaN marks a missing error. Without any error the noise is the expected one. `lengths`,
+    `expected` and the result have one unit. If `lengths` is a numpy array, so is the result.
     """
     xp: Any = jnp
     if isinstance(lengths, np.ndarray):
@@ -242,8 +247,8 @@ _TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")
 
 
 def trunk_weights(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
-    """Returns weights of landmarks, (k,): 1 for the trunk, and 0.02 for the others, which then only
-    decide where the trunk is not seen.
+    """Returns weights of landmarks, (k,): 1 for the trunk, and 0.02 for the others. So the others
+    only decide where the trunk is not seen.
     """
     return np.asarray([1.0 if kind_of(name) in _TRUNK else 0.02 for name in names], np.float32)
 
@@ -254,8 +259,9 @@ def keypoint_residuals(
     landmarks: Float[Array, "k 3"],
     scale: Float[Array, ""] | float,
 ) -> Float[Array, "c k 2"]:
-    """Returns the errors of keypoints, (c, k, 2), in standard deviations. scale: robust scale, in
-    standard deviations.
+    """Returns the robust errors of keypoints, (c, k, 2), in standard deviations, times the roots of
+    their confidences. They are 0 for landmarks that the body lacks. scale: robust scale, standard
+    deviations.
     """
     errors = (
         keypoint_errors(observations, landmarks) / observations.noise * model.certainty[:, None]
@@ -346,7 +352,7 @@ def frame_residuals(
     targets: Targets | None = None,
 ) -> dict[str, Float[Array, "..."]]:
     """Returns all residuals of one frame, by kind. Half their square sum is the negative log
-    posterior.
+    posterior, except for a constant.
 
     scale: robust scale of keypoints, standard deviations. targets: triangulated landmarks, or None.
     """

@@ -9,8 +9,8 @@ Points are matched as in edge trackers (Harris and Stennett 1990, "RAPiD"). Each
 silhouette looks along its normal for the nearest end of the mask. Each point of the mask's
 silhouette looks for the nearest point of the body's silhouette that faces the same way. Both give
 an equation n . x = n . q, where x is the point of the body in the image, q the point of the mask
-and n the normal: x may slide along the mask's silhouette. People wear clothes and hair. So
-distances outwards count in full, and distances inwards count less and less the larger they are.
+and n the normal: x may slide along the mask's silhouette. People wear clothes and hair. So points
+of the body outside of the mask can have a larger robust scale than points inside.
 """
 
 import dataclasses
@@ -170,8 +170,8 @@ def mask_boundary(
 ) -> Boundary:
     """Returns `count` points where the coverage of a mask crosses one half, or none if it does not.
 
-    hidden: pixels where something may stand in front of the person, (h, w). Neither the silhouette
-    of that nor the image border counts as silhouette of the person.
+    Contours along the image border are left out. hidden: pixels where something may stand in front
+    of the person, (h, w). Contours through these pixels are left out, too.
     """
     from skimage.filters import gaussian
     from skimage.measure import find_contours
@@ -237,8 +237,8 @@ def _spread(
 
 
 LOOKS = 129
-"""Number of samples along a normal. They are half a pixel apart in the first round, and closer
-later.
+"""Number of samples along a normal. With usual settings, they are half a pixel apart in the first
+matching of a person of 400 pixels, and closer in later ones.
 """
 
 
@@ -333,8 +333,8 @@ def coverage(mask: Float[Array, "h w"], places: Float[Array, "p l 2"]) -> Float[
 
 
 def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
-    """Matches points of the mask with points of the body: finds for each the nearest one that faces
-    the same way.
+    """Matches points of the mask with points of the body: finds for each point of the mask the
+    nearest point of the body within `reach` pixels that faces the same way.
     """
     if not len(body.positions) or not len(mask.positions):
         return np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
@@ -378,8 +378,8 @@ def silhouette_residuals(
         clothes: pixels by which the mask reaches beyond the body at each point, (p,).
         noise: standard deviation of a silhouette, pixels.
         scales: robust scales outwards and inwards, pixels.
-        independent: number of independent equations that all of the view count as. Neighbours on a
-            silhouette err together.
+        independent: number of independent equations that all equations of the view count as, at
+            most. Neighbours on a silhouette err together.
     """
     off = distances(matches, pixels) + clothes[matches.points]
     scale = jnp.where(off > 0, *scales)
