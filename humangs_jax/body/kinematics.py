@@ -1,4 +1,4 @@
-"""Joints in a pose, in numpy: for files and for what is decided on the host."""
+"""Poses joints with numpy, for files and for decisions on the host."""
 
 from collections.abc import Sequence
 

@@ -381,7 +381,7 @@ def _regressed(body: BodyModel, values: Float[Array, "n *b"]) -> Float[Array, "j
 
 
 def _rows(points: SurfacePoints, rows: Sequence[int]) -> SurfacePoints:
-    """Returns the points with these numbers."""
+    """Returns the points whose numbers are `rows`, in this order."""
     return jax.tree.map(lambda leaf: leaf[np.asarray(rows, np.int32)], points)
 
 
@@ -408,7 +408,7 @@ class _Beside(NamedTuple):
     joints: tuple[int, ...]
     """Indices of the joints that carry the place. Empty: the joints that carry its sources."""
     offset: tuple[float, float, float]
-    """From the mean to the place, in the axes of the body at rest, metres."""
+    """Vector from the mean to the place, in the axes of the body at rest, metres."""
 
 
 def _placed(body: BodyModel, place: _Beside) -> SurfacePoints:

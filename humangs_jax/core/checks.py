@@ -60,9 +60,9 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """Decorates a function so that each call checks the classes of its arguments, and the shapes of
     the arrays in them.
 
-    A parameter is not checked if its annotation allows anything besides plain classes and
-    sequences, or anything besides arrays. So numbers and callables are not checked. Of a parameter
-    that is an array, only the number of axes is checked.
+    A parameter is checked if its annotation allows only plain classes and sequences, or only
+    arrays; None may be allowed, too. So numbers and callables are not checked. Of an array, only
+    the number of axes is checked.
     Raises: TypeError, of one line, for an argument of another class, for a name that the function
     does not have, and for a missing argument. ValueError for an array with another number of axes,
     for a pytree that does not fit its annotations (`shape_fault`), and for a batch where the

@@ -21,7 +21,7 @@ from humangs_jax.core.pytree import annotated_axes, is_floating, types_and_marks
 
 
 class Part(NamedTuple):
-    """A mark of an annotation: a part of the array that is checked separately."""
+    """A mark of an annotation that names a part of the array. The part is checked separately."""
 
     words: str
     """What an error calls the part, after the name of the array."""
@@ -32,7 +32,9 @@ class Part(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """A mark of an annotation: the batch axes of a record that is a field of another one."""
+    """A mark of an annotation that names the batch axes of a record, which is a field of another
+    record.
+    """
 
     axes: str
     """Names of the axes, separated by spaces."""

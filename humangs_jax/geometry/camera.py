@@ -2,7 +2,7 @@
 
 A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres in, pixels out. What
 `lens` and `distortion` do between [R | t] p and K is in `geometry.lens`. Gaussians are drawn
-through every lens; what works with bodies and photos of people is for pinholes without distortion
+through every lens. Functions for bodies and photos of people need pinholes without distortion
 (`require_pinhole`).
 """
 
@@ -289,8 +289,8 @@ def look_at(
 
     Args:
         eye: (3,) the camera's centre, metres.
-        target: (3,) what its axis passes through.
-        up: (3,) what is up in the image; not parallel to the axis.
+        target: (3,) the point that the camera looks at, metres.
+        up: (3,) the direction that is up in the image; not parallel to the camera's axis.
         K: (3, 3) intrinsics, pixels.
         width: pixels.
         height: pixels.
@@ -327,10 +327,10 @@ def orbit(
     """Returns cameras on circles around a point, with y up. Azimuth 0 is at +z.
 
     Args:
-        target: (3,) what they look at, metres.
-        distance: metres, for all or (v,).
+        target: (3,) the point that the cameras look at, metres.
+        distance: of the cameras from the point, metres; one for all or (v,).
         azimuths: (v,) radians.
-        elevations: radians above the horizon, for all or (v,).
+        elevations: radians above the horizon; one for all or (v,).
         K: (3, 3) intrinsics, pixels.
         width: pixels.
         height: pixels.

@@ -58,11 +58,11 @@ def colors_in_srgb(
 
 
 def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
-    """Returns the color encoding that numbers in a photo's header state. None if an ICC profile
-    decides, if there are no such numbers, or if they state sRGB.
+    """Returns the color encoding that numbers in a photo's header state. None if they state sRGB,
+    if there are no such numbers, or if something else decides.
 
-    Of a PNG, cICP wins over an ICC profile and over sRGB, and these win over gAMA and cHRM. Of
-    other formats, an ICC profile wins.
+    In a PNG, a cICP chunk decides first, then an ICC profile or an sRGB chunk, then gAMA and cHRM.
+    In other formats, an ICC profile decides first.
     """
     if image.format == "PNG":
         chunks = png_chunks(data)

@@ -55,8 +55,8 @@ INDICES = 34963
 def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, Any], bytes]:
     """Returns the JSON of a GLB file, and the block of bytes that the JSON describes.
 
-    Arguments: limit: name of the limit on the JSON's size. The default is that of files that need
-    not be long.
+    Arguments: limit: name of the limit on the JSON's size. The default suits files whose JSON is
+    short.
     Raises: InvalidFileError, KeyError, TypeError, ... for sizes that do not fit the file or are
     more than the limits allow.
     """

@@ -1,15 +1,15 @@
 """Reads moving skeletons of other programs: BVH files, and animations of GLB files.
 
-BVH (https://research.cs.wisc.edu/graphics/Courses/cs-838-1999/Jeff/BVH.html): a tree of joints with
-offsets and channels, then one line of numbers per frame. Rotations are degrees about the axes of
-the channels, in their order: R = R_first R_second R_third. Position channels replace the offset. In
-the rest pose all rotations are 0. A joint's name may have spaces: it ends with its line or before a
-brace.
+A BVH file (https://research.cs.wisc.edu/graphics/Courses/cs-838-1999/Jeff/BVH.html) has a tree of
+joints with offsets and channels, then the numbers of each frame. Rotations are degrees about the
+axes of the channels, in their order: R = R_first R_second R_third. Position channels replace the
+offset. In the rest pose all rotations are 0. A joint's name may have spaces: it ends with its line
+or before a brace.
 
-GLB (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations): one of its animations,
-on the joints of its skin. The rest pose is the one in which the skin was bound to the mesh (inverse
-bind matrices), without a skin that of the nodes. Splines are taken at their keys and interpolated
-linearly.
+Of a GLB file (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations), one animation
+is read, for the joints of the skin. The rest pose is the one in which the skin was bound to the
+mesh (inverse bind matrices), or the pose of the nodes if there is no skin. Splines are taken at
+their keys and interpolated linearly.
 """
 
 import re

@@ -1,7 +1,7 @@
 """Reads expressions from tables of ARKit's shapes, scores of MediaPipe, and animations.
 
-Tables are those of Live Link Face, animations those of GLB and VRMA files. Tables and scores have
-no body: the person stands with the arms down, and the head turns if the file has its rotations.
+Tables come from Live Link Face, and animations from GLB and VRMA files. Tables and scores have no
+body: the person stands with the arms down, and the head turns if the file has its rotations.
 
 A table (.csv) has a line of names, then a line of numbers for each frame. Columns may be in any
 order; names are compared without case ("EyeBlinkLeft", "eyeBlinkLeft", "eyeBlink_L"). `HeadYaw`,
@@ -229,7 +229,8 @@ def _frames_of(content: Any) -> list[dict[str, float]] | None:
 def _scores_of(frame: Any, depth: int) -> dict[str, float]:
     """Returns the scores of one frame by ARKit's names; empty if there are none.
 
-    They may be an object of scores or a list of categories, at most `_DEEPEST` levels down.
+    The scores may be an object of numbers by name or a list of categories, at most `_DEEPEST`
+    levels down. Raises: InvalidFileError for a score that is no number.
     """
     if depth > _DEEPEST:
         return {}
@@ -311,7 +312,8 @@ def _keys_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reads the times (k,), seconds, and the values (k, c) of a channel.
 
-    Raises: InvalidFileError if times do not increase, or if there is not one row for each.
+    Raises: InvalidFileError if times do not increase, or if there is not one row of values for each
+    time.
     """
     sampler = animation["samplers"][channel["sampler"]]
     times = read_accessor(content, binary, sampler["input"])[:, 0]
@@ -330,7 +332,11 @@ def _keys_of(
 def _expression_tracks(
     content: dict[str, Any], binary: bytes, animation: Mapping[str, Any]
 ) -> Weights:
-    """Reads the weights of expressions in a VRMA file: the x of each expression's node."""
+    """Reads the weights of expressions in a VRMA file. The weight is the x of the translation of
+    the expression's node.
+
+    Raises: InvalidFileError if there are too many expressions, or if their numbers are wrong.
+    """
     extension = (content.get("extensions") or {}).get("VRMC_vrm_animation", {})
     expressions = {}
     if isinstance(extension, dict):

@@ -279,7 +279,7 @@ def _frames_of(values: Mapping[str, Any]) -> np.ndarray | None:
 def _listed_frames(content: Any) -> list[list[Person]] | None:
     """Returns the people of each frame, if the content has a list for each frame.
 
-    It may be a list of lists, or PHALP's dict by image. None: it is neither.
+    The content may be a list of lists, or PHALP's dict by image. None: it is neither.
     """
     content = objects(content)
     if (

@@ -7,19 +7,20 @@ frame t, in the world, ours is
 
     G_j(t) = C_j(t) D_j(t) A_j,    R_j = G_parent(j)^T G_j.
 
-C_j(t) is the smallest turn that makes the bone point where the file's points in the frame: none as
-long as the file's child hangs on the joint itself, but files have joints in between that turn on
-their own. The pelvis has a line, that of the hips, and the trunk for the turn about it: some files
-turn the pelvis's joint by any rotation and the joints that carry hips and spine back.
+C_j(t) is the smallest turn that makes the bone point where the file's bone points in the frame. It
+is the identity if the file's child hangs on the joint itself, but some files have further joints in
+between. The pelvis has no bone. Its direction is that of the line between the hips, and the trunk
+shows how far it turns about this line. This is needed because some files turn the pelvis's joint by
+any rotation, and turn the joints that carry hips and spine back.
 
-Twists about a bone are therefore relative to the file's rest pose. Where nobody can stand like that
-(in LaFAN's files all offsets lie along one axis, the legs folded onto the spine), the smallest turn
-says nothing about twists. A_j is then turned about the bone so that the twist of R_j is 0 on
+Twists about a bone are relative to the file's rest pose. If nobody can stand in that pose, the
+smallest turn says nothing about twists. (In LaFAN's files all offsets lie along one axis, and the
+legs are folded onto the spine.) A_j is then turned about the bone so that the twist of R_j is 0 on
 average over the frames.
 
-Steps become as much longer as the legs are. Feet stay where the file's are: the pelvis moves up or
-down so that the lower foot is as high above the floor as in the file, whatever the shares of
-thighs, shins and hips in the legs. The page does the same (viewer/page/motion_files.js).
+Steps are scaled by the ratio of the lengths of the legs. The pelvis moves up or down so that the
+lower foot is as high above the floor as in the file, whatever the shares of thighs, shins and hips
+in the legs. The page does the same (viewer/page/skeletons.js).
 """
 
 import dataclasses
@@ -93,9 +94,9 @@ def shipped_joints() -> Float[np.ndarray, "j 3"]:
 def retargeted(
     clip: Clip, joints: Float[np.ndarray, "j 3"], up: str = "auto"
 ) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], str]:
-    """Makes a body of SMPL-X's joints move as a clip.
+    """Returns the motion of a body of SMPL-X's joints that moves as a clip.
 
-    joints: of the body in T-pose, metres. up: as in `load_motion`.
+    joints: of the body in T-pose, (55, 3), metres. up: as in `load_motion`.
 
     Returns: rotations (m, j, 3), axis-angle, radians; translations (m, 3), metres; and a note about
     the axis that is up, "" for none.
@@ -244,7 +245,8 @@ def _pelvis_turns(
         return smallest_turns(unit(candidate @ rest_line), unit(line)) @ candidate
 
     def tilts(candidate, top):
-        """Angles (m,) about the line of the hips that the candidate rotations miss, radians.
+        """Returns the angles about the line of the hips that the candidate rotations miss, (m,),
+        radians.
 
         They go from the direction of a joint above the pelvis, turned by the candidate from the
         rest pose, to its direction in the frame.
