@@ -193,8 +193,8 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choic
 
 
 def _cropped(files: list[Path]) -> tuple[str, ...]:
-    """Returns one line that names photos whose EXIF describes a frame of another shape, so that
-    they were cropped. Empty if there are none.
+    """Returns a tuple of one line that names the photos whose EXIF describes a frame of another
+    shape. Such photos were cropped. Empty if there are no such photos.
     """
     frames = [(file, cropped_from(file)) for file in files]
     found = [(file, frame) for file, frame in frames if frame is not None]

@@ -45,8 +45,8 @@ class Stance:
 def _sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations) -> Stance:
     """Draws a stance and sets legs and pelvis in `rotations`; returns the stance.
 
-    The heading of the pelvis stays. A stance that exceeds the limits of the joints is drawn again;
-    after 20 such stances the person stands upright.
+    The heading of the pelvis stays. A stance that exceeds the limits of the joints, or that the
+    legs cannot reach, is drawn again. After 20 such stances the person stands upright.
     """
     heading, width = rotations[Joint.PELVIS, 1], build.hip_width / build.leg
     for _ in range(20):
