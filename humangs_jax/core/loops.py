@@ -40,7 +40,7 @@ def over(function: Callable[[PyTree], T], xs: PyTree, pixels: int = 1) -> T:
         return jax.lax.map(function, xs)
     count = len(jax.tree.leaves(xs)[0])
     most = max(1, PIXELS_AT_ONCE // pixels)
-    # equal parts: a last one of another size would be a program of its own
+    # equal parts: a last one of another size would need another program
     size = max((n for n in range(1, count + 1) if count % n == 0 and n <= most), default=1)
     if size == count:
         return jax.vmap(function)(xs)

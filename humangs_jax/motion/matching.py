@@ -214,8 +214,8 @@ def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
     """Returns the joints where the two long consecutive bones of a limb begin, meet and end, and
     the next joint if there is one.
 
-    The two bones are those of which the shorter one is longest. None: the limb has fewer than two
-    bones, or they have no length.
+    Of all pairs of consecutive bones, these have the longest shorter bone. None: the limb has fewer
+    than two bones, or they have no length.
     """
     bones = lengths[path[1:]]
     if len(bones) < 2:

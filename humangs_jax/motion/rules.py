@@ -226,16 +226,17 @@ def up_axis(
     fps: float,
     also: tuple[str, ...] = (),
 ) -> tuple[str, str]:
-    """Returns the axis that is up, and a note about it, "" for none.
+    """Returns the axis that is up, and a note about it, or "" if there is nothing to note.
 
-    It is the usual axis of the format, unless the person stands along another axis and there is a
-    floor below: the lowest joint stays at one height and rests there. Lying, crawling and
-    upside-down people also stand along other axes, but rest on no floor below.
+    The axis is the usual one of the format, with two exceptions. In the first, the person stands
+    along another axis and there is a floor below: the lowest joint stays at one height and rests
+    there. Lying, crawling and upside-down people also stand along other axes, but rest on no floor
+    below. In the second, the person stands along an axis in `also`, the floor does not contradict,
+    and the person is not upside down on the hands.
 
     points: joints in space, metres, in the frames of `sampled_frames`. stands: the axis along which
-    the person stands on average; None: there is none. usual: the axis of the format. also: axes
-    that are up in some files of the format. If the person stands along one of them, it is up unless
-    the floor contradicts, or unless the person is upside down on the hands.
+    the person stands on average; None: there is none. usual: the axis of the format. fps: frames
+    per second of the motion. also: axes that are up in some files of the format.
     """
     if stands is None or stands == usual:
         return usual, ""

@@ -99,7 +99,7 @@ def retargeted(
     joints: of the body in T-pose, (55, 3), metres. up: as in `load_motion`.
 
     Returns: rotations (m, j, 3), axis-angle, radians; translations (m, 3), metres; and a note about
-    the axis that is up, "" for none.
+    the axis that is up, or "".
 
     Raises: InvalidFileError if joints of the clip that are needed cannot be found, or if the body
     does not have SMPL-X's joints.

@@ -72,7 +72,7 @@ def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def hint_for(values: Mapping[Any, Any]) -> str:
-    """Returns a hint about values that are not a motion, "" for none."""
+    """Returns a hint about values that are not a motion, or "" if there is no hint."""
     if values.keys() >= {"motion", "text", "lengths"}:
         return f"; these are joints in space that MDM sampled: {_RENDER}"
     return ""

@@ -43,7 +43,9 @@ from humangs_jax.viewer.page_face import pack_face
 
 VERSION = 1
 WEIGHTS = 8
-"""Number of skinning weights that are kept for each Gaussian. The shipped body has at most 7."""
+"""Number of skinning weights that are kept for each Gaussian. A vertex of the shipped body has at
+most 6.
+"""
 STEPS = 65535
 SMALLEST_SCALE = 1e-7
 """Smallest scale of a Gaussian, metres. It keeps the logarithm finite for flat Gaussians, and is
