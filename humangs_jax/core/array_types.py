@@ -1,4 +1,5 @@
-"""Array types with shapes, and the glossary of axis names that every annotation uses.
+"""Array types with shapes, and the glossary of axis names that annotations share. Other names of
+axes are local to a module.
 
 ======  ====================================================
 axis    meaning

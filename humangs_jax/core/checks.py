@@ -229,8 +229,9 @@ class Values(NamedTuple):
 
 FINITE = Values("finite numbers")
 LARGEST = 1e6
-"""Largest number in avatars and in what is written of them, metres or any unit: nobody is larger,
-and float32 holds products of several such numbers."""
+"""Largest number in avatars and in their files, in metres or any other unit. No person is larger,
+and float32 holds products of several such numbers.
+"""
 BOUNDED = Values(f"finite numbers of at most {LARGEST:g} in magnitude", -LARGEST, LARGEST)
 ROUNDING = 1e-6
 """Distance by which numbers may lie outside of [0, 1] or [-1, 1]. It is a few float32 roundings, as

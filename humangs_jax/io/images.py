@@ -545,8 +545,8 @@ def _read_pixels(path: str | Path, as_stored: bool = False) -> Float[np.ndarray,
 
 
 def _levels(image: Any, data: bytes) -> tuple[UInt[np.ndarray, "h w c"], int]:
-    """Returns the integer levels of an image as stored, (h, w, channels), and the largest level
-    that its type can hold.
+    """Returns the integer levels of an image, (h, w, channels), and the largest level that its type
+    can hold. Images of 8 bits are converted to RGB or RGBA.
     """
     if data[:8] == PNG_SIGNATURE:
         check_png_chunks(data)

@@ -70,7 +70,7 @@ class Limits:
     opcodes: int = 4_000_000
     """Instructions of a pickle."""
     nesting: int = 64
-    """Depth of lists within lists in JSON and YAML."""
+    """Depth of lists and objects within each other in JSON and YAML."""
     pixels: int = 64_000_000
     """Pixels of a photo."""
     side: int = 32_768

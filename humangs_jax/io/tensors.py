@@ -7,9 +7,9 @@ refuses every other name. These calls return immutable objects, so that no later
 pickle can change them. A tensor is read as a description: a view of a storage, whose numbers lie
 elsewhere in the file. Only the storages of wanted tensors are read.
 
-The file is a zip archive of the pickle and one member per storage. Before torch 1.6 it was a stream
-of pickles and numbers, which is refused. Tensors in a plain pickle still have one such stream for
-each storage.
+A file of torch is a zip archive of the pickle and one member per storage. Before torch 1.6 it was a
+stream of pickles and numbers, which is refused. Tensors in a plain pickle still have one such
+stream for each storage.
 """
 
 import functools
