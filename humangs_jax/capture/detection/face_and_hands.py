@@ -1,9 +1,9 @@
-"""Face and hands of a person that BlazePose has found: scores of ARKit's shapes, and 21 landmarks a
-hand, by mediapipe's networks in LiteRT.
+"""Finds face and hands of a person whom BlazePose has found: scores of ARKit's shapes, and 21
+landmarks of each hand, by mediapipe's networks in LiteRT.
 
-Each is looked at twice: in the region that BlazePose's landmarks say, and in the one that the first
-look says, as mediapipe does from one frame of a video to the next. Regions follow its graphs of
-faces and hands: a square, turned upright.
+The networks look twice at a face or a hand. The first region follows from BlazePose's landmarks,
+and the second from the first look, as mediapipe does from one frame of a video to the next. The
+regions are those of mediapipe's graphs of faces and hands: squares that are turned upright.
 """
 
 from typing import NamedTuple
@@ -15,26 +15,28 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.motion.face_tracks import ARKIT
 
 _FACE_SIZE = 256
-"""Pixels a side of the network of faces."""
+"""Side of the face network's input, pixels."""
 _HAND_SIZE = 224
-"""Pixels a side of the network of hands."""
+"""Side of the hand network's input, pixels."""
 _HAND_POINTS = 21
-"""Landmarks of a hand."""
+"""Number of landmarks of a hand."""
 _LEAST_PRESENCE = 0.5
-"""Probability of a face or a hand from which on it is believed."""
+"""Least probability of a face or a hand that is believed."""
 _ENLARGED = {"face": 1.5, "palm": 2.0}
 """Side of a region over that of the box around the landmarks."""
 _HAND_REGIONS = (1.9, 2.7)
 """Sides of the regions in which a hand is looked for, one after the other, over twice the length
-from the wrist to the knuckles. 2.7 is mediapipe's; of 54 hands of synthetic people that are in view
-it finds 35, 1.9 finds 47, both find 51. A hand that points at the camera needs the larger one.
+from the wrist to the knuckles. Mediapipe uses 2.7. Of 54 hands of synthetic people that are in view
+it finds 35, 1.9 finds 47, and both find 51. A hand that points at the camera needs the larger one.
 """
 PALM = (0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18)
-"""Landmarks of a hand that say where it is in the next look: fingers move, the palm less."""
+"""Indices of the landmarks of a hand that the region of the next look follows from. They are those
+of the palm and near it, because fingers move more.
+"""
 SMALLEST = 24.0
-"""Pixels. In a smaller region faces and hands are not looked for."""
+"""Least side of a region in which faces and hands are looked for, pixels."""
 SHAPE_NAMES = ARKIT[:-1]
-"""Of the scores: all of ARKit's but the tongue's."""
+"""Names of the scores. They are ARKit's shapes except for that of the tongue."""
 SHAPE_POINTS = (
     0, 1, 4, 5, 6, 7, 8, 10, 13, 14, 17, 21, 33, 37, 39, 40, 46, 52, 53, 54, 55, 58, 61, 63,
     65, 66, 67, 70, 78, 80, 81, 82, 84, 87, 88, 91, 93, 95, 103, 105, 107, 109, 127, 132, 133,
@@ -47,25 +49,35 @@ SHAPE_POINTS = (
 )  # fmt: skip
 """Indices of the face's landmarks that the network of the scores reads."""
 _EYES, _MOUTH, _WRISTS = (2, 5), (9, 10), (15, 16)
-"""Landmarks of BlazePose: eyes, the corners of the mouth, and the wrists, the left one first."""
+"""Indices of BlazePose's landmarks of the eyes, the corners of the mouth, and the wrists, each with
+the left one first.
+"""
 _EYE_CORNERS, _WRIST, _ROOTS = (33, 263), 0, (5, 9, 13)
-"""Of a face, in the photo from left to right; of a hand, and the roots of its fingers."""
+"""Indices of landmarks: of the face, the outer corners of the right and the left eye; of a hand,
+the wrist, and the roots of index, middle and ring finger.
+"""
 
 
 class Hand(NamedTuple):
     """A hand in a photo."""
 
     pixels: Float[np.ndarray, "21 2"]
-    """Landmarks, pixels, the centre of the first at 0: wrist, then thumb to little finger, each
-    from the palm outwards."""
+    """Landmarks, (21, 2), pixels, with the centre of the first pixel at 0. The wrist comes first,
+    then thumb to little finger, each from the palm outwards.
+    """
     world: Float[np.ndarray, "21 3"]
-    """Metres from the wrist in the camera's axes (x right, y down, z away)."""
+    """Landmarks relative to the wrist in the camera's axes (x right, y down, z away), (21, 3),
+    metres.
+    """
     presence: float
     """Probability of a hand."""
 
 
 class FaceAndHands:
-    """The networks. Raises: ImportError, saying what to install, without LiteRT."""
+    """Mediapipe's networks of faces, of their shapes, and of hands.
+
+    Raises: ImportError if LiteRT is missing. It says what to install.
+    """
 
     def __init__(self) -> None:
         names = "face_landmarks_detector", "face_blendshapes", "hand_landmark_full"
@@ -75,8 +87,10 @@ class FaceAndHands:
     def face(
         self, photo: Float[np.ndarray, "h w 3"], body: Float[np.ndarray, "33 2"]
     ) -> Float[np.ndarray, "51"] | None:
-        """The scores of `SHAPE_NAMES` of somebody with these landmarks of BlazePose, pixels, in a
-        photo with values in [0, 1]; None where no face is seen.
+        """Returns the scores of `SHAPE_NAMES` for a person's face, (51,), or None if no face is
+        seen, or the face is too small.
+
+        photo: values in [0, 1]. body: BlazePose's landmarks of the person, (33, 2), pixels.
         """
         crop = face_region(body)
         for _ in range(2):
@@ -98,7 +112,12 @@ class FaceAndHands:
         body: Float[np.ndarray, "33 2"],
         visibility: Float[np.ndarray, " 33"],
     ) -> tuple[Hand | None, Hand | None]:
-        """The left and the right hand of somebody with these landmarks of BlazePose."""
+        """Returns the left and the right hand of a person. A hand that is not found, or whose wrist
+        is hidden, is None.
+
+        photo: values in [0, 1]. body and visibility: BlazePose's landmarks of the person, (33, 2),
+        pixels, and their visibilities, (33,).
+        """
         found: list[Hand | None] = []
         for side, wrist in enumerate(_WRISTS):
             if visibility[wrist] < 0.5:  # hands of hidden wrists are not looked at
@@ -143,8 +162,10 @@ class FaceAndHands:
 def hand_columns(
     hands: tuple[Hand | None, Hand | None], body: Float[np.ndarray, "33 3"]
 ) -> Float[np.ndarray, "42 6"] | None:
-    """Pixels, presence and places of the left and the right hand, which begin at the wrists of
-    BlazePose's body in space; 0 for a hand that was not seen, None for neither.
+    """Returns pixels, presence and positions of the landmarks of the left and then of the right
+    hand, (42, 6). A hand that was not seen has zeros. None if neither was seen.
+
+    body: BlazePose's landmarks in space, (33, 3), metres. The hands begin at its wrists.
     """
     if hands == (None, None):
         return None
@@ -160,12 +181,14 @@ def _probability(logit: np.ndarray) -> float:
 
 
 def _angle(across: Float[np.ndarray, "2"]) -> float:
-    """By how much what points to the right in an upright region is turned clockwise."""
+    """Returns the angle of a region whose x axis points along `across`, clockwise, radians."""
     return float(np.arctan2(across[1], across[0]))
 
 
 def face_region(body: Float[np.ndarray, "33 2"]) -> Crop:
-    """Where the face of somebody with these landmarks of BlazePose is looked for."""
+    """Returns the square in which a person's face is looked for. body: BlazePose's landmarks of the
+    person, (33, 2), pixels.
+    """
     left, right = body[list(_EYES)]
     eyes, mouth = (left + right) / 2, body[list(_MOUTH)].mean(0)
     down = mouth - eyes
@@ -178,8 +201,9 @@ def face_region(body: Float[np.ndarray, "33 2"]) -> Crop:
 
 
 def hand_region(body: Float[np.ndarray, "33 2"], side: int, enlarged: float) -> Crop:
-    """Returns the square in which a hand of somebody with these landmarks of BlazePose is looked
-    for. side: 0 for the left hand, 1 for the right one. enlarged: see `_HAND_REGIONS`.
+    """Returns the square in which a person's hand is looked for. body: BlazePose's landmarks of the
+    person, (33, 2), pixels. side: 0 for the left hand, 1 for the right one. enlarged: see
+    `_HAND_REGIONS`.
     """
     # the little finger and the index finger, of each side
     knuckles = ((17, 19), (18, 20))
@@ -191,7 +215,9 @@ def hand_region(body: Float[np.ndarray, "33 2"], side: int, enlarged: float) -> 
 
 
 def _palm_region(points: Float[np.ndarray, "21 2"]) -> Crop:
-    """The region of the next look, from the landmarks of this one."""
+    """Returns the region of the next look. points: landmarks of the hand in this look, (21, 2),
+    pixels.
+    """
     index, middle, ring = points[list(_ROOTS)]
     x, y = ((index + ring) / 2 + middle) / 2 - points[_WRIST]
     crop = _around(points[list(PALM)], float(np.arctan2(x, -y)), _ENLARGED["palm"])
@@ -201,7 +227,9 @@ def _palm_region(points: Float[np.ndarray, "21 2"]) -> Crop:
 
 
 def _around(points: Float[np.ndarray, "n 2"], angle: float, enlarged: float) -> Crop:
-    """The square around points, enlarged, that is turned by an angle."""
+    """Returns the square around points, (n, 2), turned by an angle, radians. enlarged: factor on
+    its side.
+    """
     turned = Crop(np.zeros(2), 1.0, angle)
     own = points @ turned.turn
     low, high = own.min(0), own.max(0)

@@ -1,4 +1,4 @@
-"""Photos in which somebody is painted over with the colors around."""
+"""Paints over people in photos with the colors around them."""
 
 import numpy as np
 from scipy import ndimage
@@ -7,19 +7,19 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.io.images import resized
 
 _LEAST_NEAR = 1e-3
-"""Weight of the colors nearby below which those far away count."""
+"""Weight of the colors far away. They count where the colors nearby have less weight."""
 
 
 def painted_over(
     photo: Float[np.ndarray, "h w 3"], covered: Bool[np.ndarray, "h w"], margin: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Returns the photo with the colors around in place of the covered pixels, and what was
-    painted, which is a little more.
+    """Returns the photo with covered pixels replaced by the colors around them, and which pixels
+    were painted, (h, w). These are a little more than the covered ones.
 
-    A plain color in their place has an outline, which the detector takes for that of a person.
+    A plain color would have an outline, which the detector takes for the outline of a person.
 
-    Arguments: margin: how far what is painted reaches beyond the mask, whose rim shows the person;
-    a share of the longest side.
+    Arguments: margin: how far the painting reaches beyond the covered pixels, whose rim may show
+    the person, a share of the photo's longest side.
     """
     height, width = photo.shape[:2]
     # the detector sees no more than 512 pixels
@@ -45,6 +45,9 @@ def painted_over(
 def _spread(
     colors: Float[np.ndarray, "h w 3"], kept: Float[np.ndarray, "h w"], sigma: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """The sum of what is kept nearby, and its weight."""
+    """Returns the sum of the colors of kept pixels nearby, weighted by a Gaussian, (h, w, 3), and
+    the sum of the weights, (h, w). kept: 1 for kept pixels, else 0. sigma: standard deviation of
+    the Gaussian, pixels.
+    """
     summed = [ndimage.gaussian_filter(colors[..., c] * kept, sigma) for c in range(3)]
     return np.stack(summed, axis=-1), ndimage.gaussian_filter(kept, sigma)

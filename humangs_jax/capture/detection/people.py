@@ -136,7 +136,7 @@ class Landmarks(NamedTuple):
 
 
 def available() -> bool:
-    """Whether LiteRT is installed."""
+    """Returns whether LiteRT is installed."""
     return importlib.util.find_spec("ai_edge_litert") is not None
 
 
@@ -491,7 +491,7 @@ def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[L
     """Returns the people of a photo, the largest first. photo: values in [0, 1].
 
     People who were found are painted over, and the detector looks at the photo again, until it
-    finds nobody more.
+    finds nobody more, or up to eight times.
     """
     longest = max(photo.shape[:2])
     detections = window_detections(networks, photo, SEARCH.shares)
@@ -514,7 +514,7 @@ def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[L
 def _hidden_people(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], found: list[Landmarks], margin: float
 ) -> list[Landmarks]:
-    """Finds the people that appear to the detector once those already found are painted over. The
+    """Returns the people that the detector finds after the people in `found` are painted over. The
     masks of the new people leave out those of the people found before.
     """
     height, width = photo.shape[:2]
@@ -597,9 +597,9 @@ def _settled(
     """Follows a person with the landmark network. Returns the landmarks, and how far they would
     still move the crop, as a share of the crop's side.
 
-    The crop is moved to what was found, and the network looks again, until the crop hardly moves.
-    It looks at a person at least twice: the landmark network knows hips and size better than the
-    detector does.
+    The crop is moved to the points that were found, and the network looks again, until the crop
+    hardly moves, or up to `SEARCH.most_looks` times. It looks at least twice, unless the presence
+    is low, because it knows hips and size better than the detector does.
     """
     look, drift = networks.landmarks(photo, crop), np.inf
     for _ in range(SEARCH.most_looks - 1):

@@ -1,8 +1,8 @@
-"""Edges of the detector's masks, moved to those of the photo.
+"""Moves the edges of the detector's masks to the edges of the photo.
 
-The masks have 256 pixels a side; a guided filter moves their edges to the photo's (He, Sun, Tang,
-Guided image filtering, 2013): within each window the mask is an affine function of the photo's
-colors, of a reduced photo (Fast guided filter, 2015).
+The masks have 256 pixels a side. They are sharpened by a guided filter (He, Sun, Tang, Guided image
+filtering, 2013). Within each of its windows the mask is an affine function of the photo's colors.
+The functions are fitted to a reduced photo (Fast guided filter, 2015).
 """
 
 import numpy as np
@@ -18,8 +18,10 @@ _RADIUS = 2.0
 def sharpened(
     mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"], pixel: float
 ) -> Float[np.ndarray, "h w"]:
-    """A mask with its edges at those of the photo. pixel: pixels of the photo for one of the
-    detector's mask.
+    """Returns a mask whose edges are at edges of the photo, (h, w), 0 to 1.
+
+    mask: the detector's mask at the size of the photo, (h, w), 0 to 1. photo: values in [0, 1].
+    pixel: number of the photo's pixels that one pixel of the detector's mask is wide.
     """
     rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
     if not len(rows):
@@ -43,7 +45,7 @@ def sharpened(
     slopes, offsets = _affine(small_guide, small_mask, max(1, round(_RADIUS * reduced * pixel)))
 
     def enlarged(values):
-        """Values of the reduced photo at the size of the window."""
+        """Returns values of the reduced photo at the size of the window."""
         return resized(values, width, height) if reduced < 1 else values
 
     # one color at a time: all together take gigabytes of a large photo
@@ -57,20 +59,20 @@ def sharpened(
 
 
 def filter_margin(pixel: float) -> int:
-    """Returns how many pixels around a mask `sharpened` looks at."""
+    """Returns how many pixels around a mask `sharpened` looks at. pixel: see `sharpened`."""
     return int(np.ceil(2 * _RADIUS * pixel))
 
 
 def _affine(
     guide: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], radius: int
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """Slopes (h, w, 3) and offsets (h, w) of the mask as a function of the colors, means over
-    the windows of each pixel.
+    """Returns slopes, (h, w, 3), and offsets, (h, w), of the mask as a function of the colors. They
+    are means over all windows that contain a pixel. radius: half side of the windows, pixels.
     """
     side = 2 * radius + 1
 
     def mean(x):
-        """Means over the window of each pixel."""
+        """Returns the means over the window of each pixel."""
         return ndimage.uniform_filter(x, (side, side) + (0,) * (x.ndim - 2), mode="nearest")
 
     # least squares in each window: covariance of colors and mask over that of the colors

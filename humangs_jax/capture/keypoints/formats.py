@@ -1,7 +1,7 @@
 """Reads files of keypoints: ours, OpenPose's, EasyMocap's, COCO's (also AlphaPose's and
 COCO-WholeBody's) and MMPose's.
 
-Only our files have the centre of the first pixel at (0.5, 0.5). There are two kinds.
+Only our files have the centre of the first pixel at (0.5, 0.5). There are two kinds of our files.
 `save_keypoints` writes the keypoints of one person: an npz of points (v, k, 2), confidences (v, k),
 the set's name, and the names of the v views. `humangs detect` writes the people in photos:
 
@@ -12,7 +12,7 @@ the set's name, and the names of the v views. `humangs detect` writes the people
 
 world: metres from the middle of the hips in the camera's axes (x right, y down, z away), of a
 person of average size. The i-th entry of `people` is the same person in all images, or null if the
-person is not in the image.
+person is not in the image. A person may also have "hands", see `SeenPerson.hands`.
 """
 
 import dataclasses
@@ -86,8 +86,8 @@ def read_own(source: KeypointFile, format: SourceFormat) -> Detections:
 
 
 def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
-    """Write keypoints of one person in our own format (.npz). `read_keypoints` reads exactly these
-    back.
+    """Writes keypoints of one person in our own format (.npz). The file has points, confidences,
+    the name of the set, and the names of the views. It has no 3D landmarks.
 
     names: one name for each view, as in the capture.
     Raises: ValueError if the path does not end in .npz, or if there is not one name per view.
@@ -176,7 +176,7 @@ class ImagePeople:
 
 
 def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
-    """Write the people of images to a file. If writing fails, no partial file is left."""
+    """Writes the people of images to a file. If writing fails, no partial file is left."""
     described = []
     for image in images:
         people = [None if person is None else _described(person) for person in image.people]
@@ -367,8 +367,9 @@ def recognizes_easymocap(source: KeypointFile) -> bool:
 
 
 def read_easymocap(source: KeypointFile, format: SourceFormat) -> Detections:
-    """Returns the people of one image. Person i is the one whose personID is i, if that is a whole
-    number below 64 and not taken. Other people follow after.
+    """Returns the people of one image. Person i has the personID i, if this is a whole number from
+    0 to 63 that no person before it has. A person with another ID gets the number of people before
+    it.
 
     Raises: CaptureError if the file is not valid.
     """
@@ -533,8 +534,8 @@ def _by_visibility(
 
 
 def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
-    """Returns width and height that the file states for an image, pixels. None if one is 0 or
-    missing.
+    """Returns width and height that the file states for an image, pixels, or None if one of them is
+    0 or missing.
 
     Raises: CaptureError for values that are no size.
     """

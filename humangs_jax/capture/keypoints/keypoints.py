@@ -83,7 +83,7 @@ class KeypointSet:
     """
     certainty: tuple[float, ...] = ()
     """Certainty of each point, (k,): the noise of all points over its noise, as a fit has found it.
-    Empty: as usual.
+    If it is empty, `usual_certainty` holds.
     """
 
     @property
@@ -97,8 +97,8 @@ class KeypointSet:
     def adapted(
         self, offsets: Float[np.ndarray, "k 3"], certainty: Float[np.ndarray, " k"]
     ) -> "KeypointSet":
-        """Returns the set with places and certainty as a fit has found them. offsets: of the
-        places, metres.
+        """Returns the set with places and certainty as a fit has found them. offsets: offsets of
+        all points, (k, 3), metres. Those of points without a place are ignored.
         """
         own = dict(zip(self.names, np.asarray(offsets, float).tolist(), strict=True))
         places = tuple(place._replace(offset=tuple(own[place.name])) for place in self.places)
@@ -301,7 +301,7 @@ class Keypoints:
     set: KeypointSet
     """The set of the k points."""
     missing: tuple[str, ...] = ()
-    """Names of the views that the file says nothing about."""
+    """Names of the views without a usable point."""
     world: Float[np.ndarray, "v k 3"] | None = None
     """The detector's 3D landmarks, (v, k, 3), metres, of a person of average size. The z axis is
     the ray to the person, and the translation is arbitrary. None if the detector has no such
@@ -320,8 +320,9 @@ class DetectedImage:
     file: Path
     """File from which the people were read."""
     people: tuple[Float[np.ndarray, "k columns"], ...]
-    """Points of each person, not yet checked: NaN and null are NaN. (k, 3) is x and y in the pixels
-    of the tool, and confidence. (k, 6) also has `Keypoints.world`.
+    """Points of each person, (k, 3) or (k, 6), not yet checked. The columns are x and y in the
+    pixels of the tool, confidence, and if there are six the 3D landmark, see `Keypoints.world`.
+    Missing numbers are NaN.
     """
     size: tuple[int, int] | None = None
     """Width and height of the image, pixels. None if the file does not state them."""
@@ -370,8 +371,8 @@ class KeypointFile:
 
 
 def detections_of(images: Sequence[DetectedImage], *more: KeypointSet) -> Detections:
-    """Returns detections with the keypoint set that has as many points as a person. more: sets
-    besides those of `SETS_BY_COUNT`.
+    """Returns detections with the keypoint set that has as many points as a person. The set is None
+    if there is no person. more: sets besides those of `SETS_BY_COUNT`.
 
     Raises: CaptureError if no set has this number of points, or if people have different numbers.
     """

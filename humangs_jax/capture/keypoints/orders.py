@@ -1,7 +1,7 @@
-"""The order of OpenPose's points, which its files do not tell: BODY_25 and BODY_25B both have 25 of
-them, and 18 are either those of its COCO model or COCO's own 17 with a neck behind them.
+"""Finds the order of OpenPose's points, which its files do not tell. 25 points are those of BODY_25
+or BODY_25B. 18 points are those of OpenPose's COCO model, or COCO's 17 points and a neck.
 
-The order is that in which the bones are shortest on average. In another one they lead from a knee
+In the right order the bones are shortest on average. In a wrong order a bone can lead from a knee
 to a wrist.
 """
 
@@ -25,15 +25,15 @@ from humangs_jax.core.array_types import Float
 
 
 class Order(NamedTuple):
-    """Points of the body in the order of a model, and what it is called."""
+    """An order of the points of the body."""
 
     name: str
-    """What the order is called."""
+    """Name of the order."""
     points: tuple[str, ...]
     """Names of the points, in this order."""
     set: KeypointSet
-    """The set that they become, with hands. It has the same points of the body, perhaps in another
-    order.
+    """Set that the points are converted to. It has the same points of the body, perhaps in another
+    order, and then hands.
     """
 
 
@@ -47,7 +47,7 @@ _ORDERS = {
         Order("COCO with a neck", (*COCO_17.names, "neck"), OPENPOSE_60),
     ),
 }
-"""By the number of points, the usual one first."""
+"""Possible orders by the number of points, the usual one first."""
 _BONES = (
     *(("nose", f"{side}_eye") for side in SIDES),
     *((f"{side}_eye", f"{side}_ear") for side in SIDES),
@@ -68,29 +68,33 @@ _BONES = (
 
 @dataclasses.dataclass(frozen=True)
 class _Known:
-    """When points tell which order they have."""
+    """Limits that decide if points tell which order they have."""
 
     shorter: float = 1.15
-    """How much longer the bones must be on average in any other order. 99 % of single people in
-    random poses, seen from anywhere, with errors of 1 % of their height, have more."""
+    """Least ratio of the bones' mean lengths in any other order and in the order that is found. It
+    is larger for 99 % of single people in random poses, seen from anywhere, with errors of 1 % of
+    their height.
+    """
     longest: float = 0.36
-    """Mean length of bones above which no order is known, sizes of a person. Of people in random
-    poses it is 0.13 to 0.3, where only the trunk is seen 0.25 to 0.35; of points without an order
-    0.52."""
+    """Largest mean length of bones in the order that is found, sizes of a person. It is 0.13 to 0.3
+    for people in random poses, 0.25 to 0.35 if only the trunk is seen, and 0.52 for points without
+    an order.
+    """
     fewest: int = 6
-    """Bones of all people together below which no order is known."""
+    """Least number of bones of all people together. With fewer, no order is found."""
     confident: float = 0.1
-    """Points of less confidence are not asked."""
+    """Confidence above which a point is used."""
 
 
 KNOWN = _Known()
 
 
 def in_order(detections: Detections, count: int) -> Detections:
-    """Detections of that many points of the body, perhaps with hands behind them, as those of the
-    set that they are found to be.
+    """Returns detections whose order of points was found, with the set and the order of its points.
 
-    A warning says which order was found, where it is not the usual one, or that none was.
+    count: number of points of the body, 25 or 18. Points of the hands may follow. If the order is
+    not clear, the usual one is assumed. A warning names the order, except if 25 points are clearly
+    BODY_25.
     """
     orders = _ORDERS[count]
     people = [person for image in detections.images for person in image.people]
@@ -126,7 +130,9 @@ def _order_note(order: Order, known: bool, count: int) -> str:
 def _mean_bone(
     people: Sequence[Float[np.ndarray, "k columns"]], names: tuple[str, ...], count: int
 ) -> float:
-    """Mean length of the bones in an order, in sizes of their person; infinite for too few."""
+    """Returns the mean length of the bones in an order, in sizes of their person. It is infinite if
+    there are too few bones. names: names of the points in this order.
+    """
     index = {name: i for i, name in enumerate(names)}
     pairs = np.asarray([[index[a], index[b]] for a, b in _BONES if a in index and b in index])
     lengths: list[float] = []

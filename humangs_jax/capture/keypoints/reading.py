@@ -30,8 +30,9 @@ from humangs_jax.io.images import PHOTO_SUFFIXES
 from humangs_jax.io.reading import check_limit, reading, walk
 
 _TRUNK_AND_LIMBS = frozenset(COCO_17.names)
-"""Points that tell people from ghosts, which are false finds of a detector. Hands, face and feet do
-not count: detectors leave them out where they are small, or were not asked for them.
+"""Points that tell people from ghosts, which are false finds of a detector. Points of hands and
+feet, and the 68 points of the face, do not count. Detectors leave them out where they are small, or
+were not asked for them.
 """
 
 
@@ -40,11 +41,13 @@ class _Plausible:
     """Limits of numbers that can be pixels and scores of keypoints."""
 
     least_extent: float = 2.0
-    """Least extent of pixels. If no coordinate of any view reaches it, the coordinates are shares
-    of the image.
+    """Least size of the largest coordinate of all views, pixels. If it is smaller, the coordinates
+    are shares of the image.
     """
     largest_pixel: float = 1e6
-    """Largest coordinate, pixels. Larger ones mean nothing, and would become inf in float32."""
+    """Largest coordinate, pixels. Larger ones mean nothing, and are replaced by this one, because
+    they could become inf in float32.
+    """
     outside: float = 0.5
     """Largest distance of a point from its image, as a share of the image's size. Detectors
     extrapolate a little beyond the image, but points further out mean nothing.
@@ -64,11 +67,11 @@ _PLAUSIBLE = _Plausible()
 
 
 def read_detections(path: Path) -> Detections:
-    """Returns the people in the images of a file or folder. It may have any format of `KEYPOINTS`:
-    the content decides which one.
+    """Returns the people in the images of a file or folder. Its content decides which format of
+    `KEYPOINTS` it has.
 
     All JSON files in a folder and its sub-folders are read together.
-    Raises: CaptureError if the content is not valid.
+    Raises: CaptureError if there is no such file or folder, or if the content is not valid.
     """
     if not path.exists():
         raise CaptureError(path, "", "no such file or folder")
@@ -112,7 +115,9 @@ def read_detections(path: Path) -> Detections:
 
 
 def _amount(content: Any) -> int:
-    """Returns how many people and images a JSON file has, without looking at them."""
+    """Returns 1 plus the number of people and images that a JSON file lists, without checking
+    them.
+    """
     lists = [content]
     if isinstance(content, dict):
         lists = [
@@ -130,7 +135,7 @@ def _amount(content: Any) -> int:
 def read_keypoints(
     path: str | Path, names: Sequence[str], width: int, height: int, *, person: int | None = None
 ) -> Keypoints:
-    """Read the keypoints of one person in the views of a capture.
+    """Reads the keypoints of one person in the views of a capture.
 
     Arguments:
         path: a file or folder in a format of `KEYPOINTS`.
@@ -141,12 +146,13 @@ def read_keypoints(
         person: number of the person to take where several people are seen, from 0 in the order of
             the file. None: the only person.
 
-    Returns: keypoints of v views and k points. Views that the file says nothing about have
-    confidence 0 and are in `missing`.
+    Returns: keypoints of v views and k points. Views without a usable point have confidence 0 and
+    are in `missing`.
 
     Raises: CaptureError, one line with file and field, if the file is damaged or has no known
     format, if its images match no view or have another size, if it shows several people and
-    `person` is None, or if no point is usable.
+    `person` is None, if no view has the person, or if no point is usable. ArgumentError if `person`
+    is negative.
     """
     path = Path(path)
     if person is not None and person < 0:
@@ -220,11 +226,11 @@ def _chosen_people(
     kind: KeypointSet,
     person: int | None,
 ) -> list[int | None]:
-    """Returns the index of the chosen person in each view, None where there is none. The chosen
-    person is the one with number `person`, or without a number the person with the most confidence,
-    if all others are ghosts.
+    """Returns the index of the chosen person in each view, or None for a view without this person.
+    The chosen person has the number `person`. If this is None, it is the person with the most
+    confidence, and all others have to be ghosts.
 
-    Raises: CaptureError if a view without `person` shows several people, or if no view has the
+    Raises: CaptureError if `person` is None and a view shows several people, or if no view has the
     number.
     """
     body = np.asarray([name in _TRUNK_AND_LIMBS for name in kind.names])
@@ -274,8 +280,8 @@ def _check_pixels(
 
 
 def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> str:
-    """Returns a line about an image and its view whose numbers differ, because one is counted from
-    0 and the other from 1. "" if there is none.
+    """Returns a line about the first image whose number differs from the number of its view,
+    because they are counted from different numbers. "" if there is no such image.
     """
     for image, name in zip(images, names, strict=True):
         if image is None:
@@ -291,10 +297,10 @@ def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> st
 def _images_of_views(
     path: Path, detections: Detections, names: Sequence[str], width: int, height: int
 ) -> list[DetectedImage | None]:
-    """Returns the image of each view, None where the file has none.
+    """Returns the image of each view, or None for a view without an image in the file.
 
-    Raises: CaptureError if an image has another size than the photos, or if no image matches a
-    view.
+    Raises: CaptureError if an image of a view has another size than the photos, if no image matches
+    a view, or if it is not clear which image matches a view.
     """
     try:
         views = match_views([image.image for image in detections.images], names)
@@ -333,8 +339,8 @@ def _images_of_views(
 
 
 def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
-    """Returns whether the points of trunk and limbs are those of a person, and not of a detector's
-    ghost. confidences: of these points.
+    """Returns whether a find of a detector is a person and not a ghost. confidences: confidences of
+    the points in `_TRUNK_AND_LIMBS`, (k,).
     """
     present = confidences[confidences > 0]
     # a person has more than a quarter of them, with a mean confidence of more than 0.3
@@ -415,8 +421,8 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
 
 
 def _shift_of_numbers(images: Sequence[str | int], names: Sequence[str]) -> int:
-    """Returns what has to be added to mere numbers to get the numbers in the views' names. It is 0,
-    unless there is one number for every view and neither numbers nor names have gaps.
+    """Returns the difference between the numbers in the views' names and mere numbers of images. It
+    is 0, unless there is one number for every view and neither numbers nor names have gaps.
     """
     numbers = sorted({image for image in images if isinstance(image, int)})
     of_names = sorted(number for number in map(_last_number, names) if number is not None)
