@@ -40,7 +40,7 @@ def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
 
 def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
     """Returns the name of the world's axis along which the y axis of the pelvis points on average.
-    Returns None if it clearly points along none.
+    Returns None if no axis is clearly that one, see `CLEARLY_UP`.
 
     Arguments: root: axis-angle of the pelvis in each frame, (m, 3), radians.
     """
