@@ -18,7 +18,7 @@ import pickletools
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, no_type_check
 
 import numpy as np
 
@@ -47,6 +47,7 @@ LONGEST_LIST = 1 << 24
 # --------------------------------------------------------------------------------------------------
 
 
+@no_type_check  # a call for each instruction: checks of types in tests would take most of the time
 class _Looked:
     """A file of pickles that checks each instruction before it hands the instruction out.
 
