@@ -379,8 +379,10 @@ def refine_limits(text: str) -> dict[str, Any]:
         raise UsageError(
             f'--refine {text!r}: expected how long to refine, as in "15s" or "100steps"'
         )
+    if in_steps and number:  # the head is sharpened only without other steps, as with seconds
+        return {"steps": int(number), "seconds": None, "head_steps": 0}
     if in_steps:
-        return {"steps": int(number), "seconds": None}
+        return {"steps": 0, "seconds": None}
     return {"steps": None, "seconds": number}
 
 

@@ -60,9 +60,8 @@ class Refinement:
     interrupted: bool = False
     """Whether Ctrl-C ended the run."""
     planned: int | None = None
-    """Number of steps that were planned. The run's configuration with `steps=planned` and
-    `seconds=None` repeats the run exactly. If the run was limited by seconds, which excludes steps
-    on the head, set `head_steps=0`, too. None: the run was cut short.
+    """Number of steps that were planned. `refine` with the same configuration and `steps=planned`
+    repeats a run that was limited by seconds, exactly. None: the run was cut short.
     """
     left_out: tuple[str, ...] = ()
     """Names of photos that contradict the others, and were not fitted."""
@@ -109,9 +108,9 @@ def refine(
     """Fits an avatar to the photos of a capture. Returns the fitted avatar, or the avatar itself if
     the fit is no better.
 
-    First come iterations of a learned optimizer, then steps of Adam. Without a limit in seconds, or
-    with `steps` 0, steps on the head alone follow if photos have 512 pixels or more
-    (`RefineConfig.head_steps`). Views whose mask does not show the person are left out, and
+    First come iterations of a learned optimizer, then steps of Adam. Steps on the head alone follow
+    if photos have 512 pixels or more (`RefineConfig.head_steps`), unless `steps` is above 0 or the
+    time is limited. Views whose mask does not show the person are left out, and
     exposure is made equal as in `reconstruct`. Ctrl-C ends the run; the best state until then is
     returned. `refine_with_report` also returns the steps, the seconds and the gain.
 
@@ -161,7 +160,9 @@ def refine_with_report(
     """
     config = config or RefineConfig()
     if seconds is not None or steps is not None:
-        config = dataclasses.replace(config, seconds=seconds, steps=steps)
+        # the head is sharpened only without other steps, so that `planned` repeats a run of seconds
+        head_steps = 0 if steps else config.head_steps
+        config = dataclasses.replace(config, seconds=seconds, steps=steps, head_steps=head_steps)
     _check(avatar, capture.capture if isinstance(capture, PreparedCapture) else capture)
     photos = prepare_capture(capture)
     views = crop_to_person(photos, config.image_size)
@@ -190,9 +191,10 @@ def refine_with_report(
     before = jax.tree.map(lambda x: x[best.used], each).together()
     fitted = [task.photos[i] for i in best.used]
     found_there = comparison(task, best.state.parameters, fitted, best.state.splat).together()
-    result, after, head_steps = avatar, before, 0
+    result, after, iterations, head_steps = avatar, before, 0, 0
     if found_there.loss < before.loss:
         result, after = avatar_of(best.state.parameters, task.avatar), found_there
+        iterations = best.iterations
 
     # and so are the steps on the head, by the whole photos, too
     if crops is not None and not interrupted:
@@ -213,7 +215,7 @@ def refine_with_report(
     seconds = clock.stopped()
     return Refinement(
         result,
-        best.iterations,
+        iterations,
         clock.done,
         seconds,
         clock.compile_seconds,

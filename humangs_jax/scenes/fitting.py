@@ -103,8 +103,8 @@ def fit_scene(
     Raises:
         ValueError: images that do not fit their cameras, are not in [0, 1] or are too small for
             SSIM; points that are not finite or not (n, 3), or more than the capacity.
-        FileError: a checkpoint that cannot be read, or is of other photos, cameras, points or
-            settings.
+        FileError: a checkpoint that cannot be read, or is of other photos, cameras, points,
+            settings or another background.
 
     Examples:
         >>> cameras = hg.load_cameras("garden/sparse/0")
@@ -130,7 +130,7 @@ def fit_scene(
     state = begin_scene(first_gaussians(points, views, config), config.capacity)
     about = ""
     if checkpoint is not None:
-        about = _about(config, photos, views, state)
+        about = _about(config, photos, views, color, state)
     state = _resumed(checkpoint, state, about)
     plans = _plans(drawn_gaussians(state.parameters, state.used), views, config)
     key, interrupted, saved = jax.random.key(config.seed), False, time.perf_counter()
@@ -214,12 +214,17 @@ def _mean_psnr(
 
 
 def _about(
-    config: SceneConfig, photos: Sequence[np.ndarray], views: Sequence[Camera], start: SceneState
+    config: SceneConfig,
+    photos: Sequence[np.ndarray],
+    views: Sequence[Camera],
+    background: Array,
+    start: SceneState,
 ) -> str:
-    """Returns a checksum of the photos, cameras, first Gaussians and settings of a run. The
-    background is no part of it.
+    """Returns a checksum of the photos, cameras, background, first Gaussians and settings of a
+    run.
     """
     arrays = {f"photo {i}": photo for i, photo in enumerate(photos)}
+    arrays["background"] = np.asarray(background)
     for name, tree in (("cameras", list(views)), ("start", start.parameters)):
         arrays |= {f"{name} {i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(tree))}
     return checksum(arrays, config_to_json(config), *(str(_kind(camera)) for camera in views))
@@ -243,7 +248,8 @@ def _resumed(path: str | os.PathLike[str] | None, state: SceneState, about: str)
             raise InvalidFileError("not a checkpoint of fit_scene: expected one, or no file")
         if str(arrays["about"]) != about:
             raise InvalidFileError(
-                "of other photos, cameras, points or settings: expected those it was begun with"
+                "of other photos, cameras, points, settings or another background: expected"
+                " those it was begun with"
             )
         leaves, tree = jax.tree.flatten(state)
         found = [arrays[str(i)] for i in range(len(leaves))]

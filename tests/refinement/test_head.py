@@ -134,3 +134,16 @@ def test_cameras_from_the_person_blur_a_face_unless_each_photo_has_a_pose():
     uncalibrated = dataclasses.replace(capture, calibrated=False)
     assert not shows_heads(uncalibrated, ALONE)
     assert shows_heads(with_own_poses(uncalibrated), ALONE)
+
+
+def test_steps_are_made_without_those_on_the_head_as_with_seconds(four, monkeypatch):
+    """A run of seconds makes none on the head, and its steps repeat it."""
+    monkeypatch.setattr(refinement, "_crops", lambda avatar, photos, config: crops(config))
+    seen = []
+
+    def crops(config):
+        seen.append(config.head_steps)
+
+    for steps in (0, 1):
+        refinement.refine_with_report(*four, ALONE, steps=steps)
+    assert seen == [20, 0]

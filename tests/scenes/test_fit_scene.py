@@ -86,10 +86,11 @@ def test_a_run_that_was_interrupted_continues_bit_for_bit(posed, tmp_path, monke
     for a, b in zip(jax.tree.leaves(rest.gaussians), jax.tree.leaves(whole.gaussians), strict=True):
         np.testing.assert_array_equal(a, b)
     assert fit(path).steps == 40  # finished: nothing to do
-    with pytest.raises(
-        FileError, match=r"scene\.npz: of other photos, cameras, points or settings"
-    ):
+    other = r"scene\.npz: of other photos, cameras, points, settings or another background"
+    with pytest.raises(FileError, match=other):
         hg.fit_scene(photos[:, ::-1], cameras, points, FAST, checkpoint=path)
+    with pytest.raises(FileError, match=other):
+        hg.fit_scene(photos, cameras, points, FAST, checkpoint=path, background="white")
     other = tmp_path / "mine.npz"
     np.savez(other, x=1)
     before = other.read_bytes()
