@@ -1,7 +1,7 @@
-"""Whether a calibration makes sense.
+"""Checks whether a calibration makes sense.
 
-A wrong convention gives plausible numbers, but not cameras around a person that all look at the
-person. Some cameras do stand otherwise: these checks only warn.
+A wrong convention gives plausible numbers, but the cameras do not stand around a person and look at
+the person. Cameras of a right calibration can stand otherwise, too, so these checks only warn.
 """
 
 import dataclasses
@@ -21,50 +21,60 @@ from humangs_jax.data.cameras import (
 )
 
 REPROJECTION_LIMIT = 2.0
-"""Pixels; calibrations are usually good to less than one."""
+"""Largest mean reprojection error without a warning, pixels. Calibrations usually have less than
+one.
+"""
 DISTANCES = (0.3, 30.0)
-"""Metres between which cameras stand from a person."""
+"""Least and largest distance of cameras from a person, metres."""
 UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres"}
-"""Units in which people calibrate."""
+"""Units in which people calibrate, by the number of metres in them."""
 USUAL_DISTANCE = 2.5
-"""Metres from a camera to a person: of several units, the one that comes nearest is likely."""
+"""Usual distance of a camera from a person, metres. Of several units, the one that comes nearest is
+likely.
+"""
 NEARLY_PARALLEL = np.sin(np.radians(2.0)) ** 2
-"""Axes within about 2 degrees of each other do not define a point where they meet."""
+"""Least eigenvalue of the mean projection across the axes. Axes within about 2 degrees of each
+other have less, and do not define a point where they meet.
+"""
 MISS = 0.5
-"""Axes of cameras around a person pass within this share of the distance: some look at the feet,
-others at the face.
+"""Distance at which axes of cameras around a person may pass the point where they meet, a share of
+its distance from the cameras. Some look at the feet, others at the face.
 """
 TILT_LIMIT = 45.0
-"""Degrees between the mean upward direction of the photos and +y."""
+"""Largest angle between the mean upward direction of the photos and +y without a warning,
+degrees.
+"""
 OFF_CENTER = 0.25
-"""Share of the image from its middle beyond which a principal point belongs to an image of another
-size.
+"""Distance of a principal point from the middle, a share of the image. From this one on it belongs
+to an image of another size.
 """
 COINCIDENT = 1e-3
-"""Cameras that meet within this share of their distance to the world's origin stand all in one
-place.
+"""Share of the largest distance of a camera from the world's origin. If the point where the axes
+meet is nearer to the cameras, all cameras stand in one place.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class Checks:
-    """What was measured, and warnings."""
+    """Measured properties of a calibration, and warnings."""
 
     reprojection: float | None
-    """The mean reprojection error over all observations, pixels; None without any."""
+    """Mean reprojection error over all observations, pixels. None without observations."""
     observations: int
-    """The number of observations."""
+    """Number of observations."""
     distance: float | None
-    """Median from the cameras to where their axes meet, metres; None where they are parallel (one
-    camera).
+    """Median distance of the cameras from the point where their axes meet, along these axes,
+    metres. None if the axes are parallel, or if there is one camera.
     """
     warnings: tuple[str, ...]
-    """One line for each thing that looks wrong."""
+    """Properties that look wrong, one line each."""
 
 
 def check_calibration(source: Calibration, converted: Calibration, up: str) -> Checks:
-    """Check cameras as their source has them, and as they came into the capture's convention with
-    that axis up.
+    """Checks the cameras of a calibration.
+
+    source: cameras as their source has them. converted: the same cameras in the convention of
+    captures. up: axis of the source that points up, such as "+y".
     """
 
     def matrices(calibration):
@@ -106,10 +116,11 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
 
 
 def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
-    """Gives the metres in a unit of a calibration, and a line about it unless it is 1 or unknown.
+    """Returns the metres in a unit of a calibration, and a line about the unit, or None if no line
+    is needed.
 
-    The format's unit is taken where it has one, else metres. If the cameras then stand too near to
-    a person or too far, it is the unit that puts them there, if one does.
+    The unit is that of the format, or metres if the format has no unit. If the cameras then stand
+    too near to a person or too far, the unit of `UNITS` that fits best is taken, if one fits.
     """
     known = calibration.unit or 1.0
     matrices = np.stack([camera.cam_from_world for camera in calibration.cameras])
@@ -138,10 +149,10 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
 
 
 def _mean_reprojection_error(calibration: Calibration) -> float | None:
-    """Pixels between where the calibration's points were seen and where its cameras see them; None
-    without points.
+    """Returns the mean distance of the pixels where points were seen from those where the cameras
+    see them, pixels. None without points.
 
-    Infinite where a point lies behind a camera that saw it.
+    It is infinite if a point lies behind a camera that saw it.
     """
     seen = calibration.observations
     if seen is None:
@@ -163,11 +174,11 @@ def _mean_reprojection_error(calibration: Calibration) -> float | None:
 def _axes_meeting(
     poses: Float[np.ndarray, "v 4 4"],
 ) -> tuple[Float[np.ndarray, " v"] | None, Float[np.ndarray, " v"] | None]:
-    """Depth of the point nearest to all optical axes before each camera, and its distance from each
-    axis.
+    """Returns the depth in each camera, (v,), of the point that is nearest to all optical axes, and
+    its distance from each axis, (v,). Depths are negative behind a camera.
 
-    (None, None) if the axes are nearly parallel: they meet nowhere. `poses` are cam_from_world, in
-    any unit.
+    If the axes are nearly parallel, and so meet nowhere, it returns (None, None). poses:
+    cam_from_world, (v, 4, 4), in any unit.
     """
     rotations, axes = poses[:, :3, :3], poses[:, 2, :3]
     centers = -np.einsum("vji,vj->vi", rotations, poses[:, :3, 3])
@@ -182,8 +193,9 @@ def _axes_meeting(
 
 
 def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:
-    """How far axes pass the point where they meet before all cameras, as a share of its distance;
-    infinite if none is.
+    """Returns the root mean square distance of the axes from the point where they meet, over the
+    median depth of the point. It is infinite if they meet nowhere, or behind a camera, or if the
+    ratio is `MISS` or more, or if all cameras stand in one place.
     """
     depths, misses = _axes_meeting(poses)
     farthest = np.linalg.norm(poses[:, :3, 3], axis=-1).max()
@@ -199,8 +211,11 @@ def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:
 
 
 def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> list[str]:
-    """Whether another meaning of the matrices in the file would let the cameras look at one
-    place.
+    """Returns a warning if the cameras do not look at one place before them. If they would with
+    another meaning of the matrices in the file, it names this meaning.
+
+    poses: cam_from_world as the source has them, (v, 4, 4). convention: meaning of the matrices in
+    the file.
     """
     if _axes_meeting(poses)[0] is None or np.isfinite(_miss(poses)):
         return []
@@ -219,8 +234,9 @@ def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> 
 
 
 def _up_warnings(poses: Float[np.ndarray, "v 4 4"], up: str) -> list[str]:
-    """The photos are upright, most of them: the mean of their upward directions tells which axis is
-    up.
+    """Returns a warning if the mean upward direction of the photos is far from +y. Most photos are
+    upright, so this direction shows which axis is up. poses: cam_from_world, (v, 4, 4). up: axis of
+    the source that was turned to y.
     """
     direction = -poses[:, 1, :3].mean(axis=0)
     length = np.linalg.norm(direction)

@@ -1,9 +1,11 @@
-"""Which frames of a video of one person become photos: sharp ones, from all sides.
+"""Chooses the frames of a video of one person that become photos. They are sharp, and show the
+person from all sides.
 
-Each of equal windows of time offers its sharpest frame. Where the person was found in these, the
-circle of directions from which they see the body is cut into equal parts, and each part gives the
-frame that is sharpest and whose pose is the usual one. Else that frame is taken which differs most
-from all that were taken, until none does.
+The frames that show something are cut into windows of equal length. Each window offers its sharpest
+frame. If the person was found in these frames and turns, the circle of directions is cut into equal
+parts. Each part gives the frame that is worth most, which is sharp, has the usual pose, and is near
+the middle of the part. Otherwise the next frame is always the one that differs most from all chosen
+ones, until no frame differs enough.
 """
 
 from collections.abc import Iterable
@@ -14,25 +16,31 @@ from humangs_jax.core.array_types import Float, Int, UInt
 from humangs_jax.io.reading import InvalidFileError
 
 PHOTOS = 8
-"""Photos of a video in which nobody was found: a person from all sides."""
+"""Largest number of photos of a video for which `choose_frames` chooses."""
 LONGER_SIDE = 480
-"""Pixels of the frames that are looked at: blur that does not show there does not hurt."""
+"""Longer side of the frames that are looked at, pixels. Blur that does not show there does no
+harm.
+"""
 _CELLS = 24
-"""Rows and columns of the thumbnails that are compared."""
+"""Number of rows and of columns of the thumbnails that are compared."""
 _NOTHING_SHOWN = 3.0
-"""Levels of 255: the standard deviation of a frame that is all of one color, but for noise."""
+"""Least standard deviation of a frame that shows something, levels of 255. A frame of one color has
+less, which is noise.
+"""
 NOTHING_NEW = 0.05
-"""Root mean square of the difference of two thumbnails, in standard deviations of one."""
+"""Least root mean square difference of a frame's thumbnail from those of the chosen frames, in
+standard deviations of a thumbnail, times the frame's worth. A frame with less shows nothing new.
+"""
 
 
 def looked_at(
     frames: Iterable[UInt[np.ndarray, "h w"]],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n p"]]:
-    """Sharpness and thumbnail of each grey frame; the thumbnails have mean 0 and variance 1, or are
-    0 where nothing is shown.
+    """Returns the sharpness, (n,), and the thumbnail, (n, p), of each grey frame. A thumbnail has
+    mean 0, and variance 1 or less. Sharpness and thumbnail of a frame that shows nothing are 0.
 
-    Sharpness is the mean square of the Laplacian over the variance of the frame: exposure does not
-    change it.
+    Sharpness is the mean square of the Laplacian over the variance of the frame, so that exposure
+    does not change it.
     """
     sharpness, thumbnails = [], []
     for frame in frames:
@@ -56,8 +64,8 @@ def looked_at(
 def offered_frames(
     sharpness: Float[np.ndarray, " n"],
 ) -> tuple[Int[np.ndarray, " o"], Float[np.ndarray, " o"]]:
-    """Numbers of the sharpest frame of each window of time, in order, and what each is worth, in
-    (0, 1]: of a window that is blurred as a whole less.
+    """Returns the number of the sharpest frame of each window, in order, (o,), and what each frame
+    is worth, (o,), in (0, 1]. Frames that are less sharp than the median of these are worth less.
 
     Raises: InvalidFileError if no frame shows anything.
     """
@@ -75,9 +83,10 @@ def offered_frames(
 def choose_frames(
     sharpness: Float[np.ndarray, " n"], thumbnails: Float[np.ndarray, "n p"], most: int
 ) -> list[int]:
-    """Numbers of at most `most` frames that look different, in order: where nobody tells which way
-    the person faces.
+    """Returns the numbers of at most `most` frames that look different, in order. It is used if the
+    person's directions are not known, or do not differ.
 
+    sharpness and thumbnails: see `looked_at`.
     Raises: InvalidFileError if no frame shows anything.
     """
     offered, worth = offered_frames(sharpness)
@@ -93,22 +102,25 @@ def choose_frames(
 
 
 FRAMES = 16
-"""Photos of a video: twice as many as the network reads, for the poses and for steps of
-refinement.
+"""Largest number of photos of a video that are chosen by direction. The network reads half as many.
+The others help poses and refinement.
 """
 USUAL = 0.15
-"""Share of the person's size by which a pose differs from the usual one when its frame is worth
-half.
+"""Difference of a pose from the usual one at which a frame's worth is halved, a share of the
+person's size.
 """
 WORTHLESS = 0.1
-"""Least worth of a frame in which the person strikes another pose than in most."""
+"""Least factor on the worth of a frame for an unusual pose."""
 
 
 def directions_of(
     world: Float[np.ndarray, "n k 3"], names: tuple[str, ...]
 ) -> Float[np.ndarray, " n"]:
-    """Radians about the vertical by which the person is turned in each frame, from landmarks in the
-    camera's axes (x right, y down, z away); 0 faces the camera.
+    """Returns the angle about the vertical by which the person is turned in each frame, (n,),
+    radians. It is 0 for a person who faces the camera.
+
+    world: landmarks in the camera's axes (x right, y down, z away), (n, k, 3). names: names of the
+    landmarks.
     """
 
     def from_right_to_left(part: str) -> Float[np.ndarray, "n 3"]:
@@ -123,8 +135,11 @@ def unusual(
     directions: Float[np.ndarray, " n"],
     seen: Float[np.ndarray, "n k"],
 ) -> Float[np.ndarray, " n"]:
-    """How much the pose of each frame differs from the median pose, a share of the person's
-    size. seen: weights of landmarks.
+    """Returns how much the pose of each frame differs from the median pose, (n,), a share of the
+    person's size.
+
+    world: landmarks in the camera's axes, (n, k, 3). directions: see `directions_of`. seen: weights
+    of the landmarks, (n, k).
     """
     c, s = np.cos(directions), np.sin(directions)
     turned = np.stack(
@@ -144,10 +159,11 @@ def unusual(
 def choose_by_direction(
     directions: Float[np.ndarray, " n"], worth: Float[np.ndarray, " n"], most: int
 ) -> list[int]:
-    """Rows of at most `most` frames, in order, evenly spread over the directions that there are;
-    none if these do not turn.
+    """Returns the indices of at most `most` frames, in order, evenly spread over the directions
+    that there are. The result is empty if these cover less than a quarter turn.
 
-    Arguments: directions: radians. worth: of each frame, 0 for one that is not to be taken.
+    Arguments: directions: direction of each frame, (n,), radians. worth: worth of each frame, (n,).
+    0 for a frame that must not be taken.
     """
     rows = np.flatnonzero(worth > 0)
     # somebody who is filmed from one side moves, but does not turn: directions have to cover a
@@ -167,7 +183,7 @@ def choose_by_direction(
 
 
 def _covered(directions: Float[np.ndarray, " n"]) -> float:
-    """Radians of the circle without its largest gap between directions."""
+    """Returns the size of the circle without its largest gap between directions, radians."""
     sorted_ = np.sort(np.mod(directions, 2 * np.pi))
     gaps = np.diff(np.append(sorted_, sorted_[0] + 2 * np.pi))
     return float(2 * np.pi - gaps.max())

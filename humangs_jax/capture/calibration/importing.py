@@ -142,7 +142,7 @@ def import_cameras(
     overwrite: bool = False,
     also: Mapping[str, object] | None = None,
 ) -> ImportReport:
-    """Write a capture folder of photos and their calibration. If anything fails, nothing is
+    """Writes a capture folder of photos and their calibration. If anything fails, nothing is
     written. The folder has no body.npz yet.
 
     Args:
@@ -150,14 +150,14 @@ def import_cameras(
             is.
         images: folder of the photos, or of a video of each camera (CAMERA.mp4).
         out: the capture folder.
-        masks: folder of the photos' masks, which have the photos' names. None: the masks that the
-            calibration names, if any.
+        masks: folder of the photos' masks, or of a video of masks of each camera, with the names of
+            the photos or videos. None: the masks that the calibration names, if any.
         others: folder of masks of other people and of things in front of the person, which have the
             photos' names. Photos in which nothing covers the person need none.
-        scale: metres per unit of the source. None: the unit of the format, or else the one that
-            puts the cameras near a person.
-        up: the axis of the source's world that points up, "+y", "-z", .... None: that of the
-            format.
+        scale: metres per unit of the source. None: the unit of the format, or metres. If the
+            cameras then stand too near to a person or too far, another unit is taken that fits.
+        up: the axis of the source's world that points up, "+y", "-z", .... None: as the format
+            says.
         pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0),
             "half": (0.5, 0.5). None: as the format says.
         every: step between the frames of videos.
@@ -168,8 +168,8 @@ def import_cameras(
 
     Returns: what was imported, and how.
 
-    Raises: ValueError for an option. CaptureError for everything else, in one line: file, field,
-    and what was expected.
+    Raises: ArgumentError for a wrong option. CaptureError for everything else, one line with file,
+    field, and what was expected.
     """
     source, images, out = Path(source), Path(images), Path(out)
     masks = None if masks is None else Path(masks)
@@ -208,8 +208,10 @@ def import_cameras(
 def photo_size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
     """Returns width and height of the photo that the source calls `name`.
 
-    If there is none, it returns the size of another photo: a camera without photo is left out
-    later.
+    If there is no such photo, it returns the size of another one, because a camera without a photo
+    is left out later.
+
+    Raises: CaptureError if the folder has no photos.
     """
     try:
         return photo_size(photo_of(images, name, source))
@@ -232,7 +234,9 @@ def import_calibration(
     pixel_centers: str | None = None,
     also: Mapping[str, object] | None = None,
 ) -> ImportReport:
-    """Imports a calibration in memory like `import_cameras`. A capture at `out` is replaced."""
+    """Imports photos and a calibration in memory. Arguments and result are those of
+    `import_cameras`. A capture at `out` is replaced.
+    """
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
     about_unit = None
     if scale is None:

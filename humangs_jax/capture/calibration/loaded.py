@@ -1,5 +1,5 @@
-"""Cameras of other tools as they stand in their world, with their lenses, for scenes of
-Gaussians (`load_cameras`).
+"""Loads cameras of other tools, with their lenses, for scenes of Gaussians (`load_cameras`). The
+cameras keep the axes of their world.
 """
 
 import dataclasses
@@ -26,31 +26,35 @@ from humangs_jax.io.reading import check_limit, reading
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SceneCameras(Mapping[str, Camera]):
-    """The cameras of a calibration by name, in the order of its file, and the points that it
-    found; a mapping.
+    """A mapping from names to the cameras of a calibration, in the order of its file, and the
+    points that the calibration found.
     """
 
     cameras: dict[str, Camera]
-    """Cameras by name, or by the path of their image where the format has one for each."""
+    """Cameras by name, or by the path of their image if the format has a camera for each image. If
+    a name is repeated, the second camera gets " (2)" after its name, the third " (3)", and so on.
+    """
     points: Float[np.ndarray, "n 3"]
-    """Points that the calibration found, (n, 3), metres; n = 0 where the format has none."""
+    """Points that the calibration found, (n, 3), in the unit of the cameras. n = 0 if there are no
+    points.
+    """
     colors: Float[np.ndarray, "n 3"]
-    """Colors of the points, (n, 3), RGB in [0, 1]; grey where the format has none."""
+    """Colors of the points, (n, 3), RGB in [0, 1]. Grey if the calibration has no colors."""
 
     def __getitem__(self, name: str) -> Camera:
-        """The camera of that name."""
+        """Returns the camera of this name."""
         return self.cameras[name]
 
     def __iter__(self) -> Iterator[str]:
-        """The names."""
+        """Yields the names."""
         return iter(self.cameras)
 
     def __len__(self) -> int:
-        """How many cameras there are."""
+        """Returns the number of cameras."""
         return len(self.cameras)
 
     def __repr__(self) -> str:
-        """On one line."""
+        """Returns the numbers of cameras and points, in one line."""
         return f"SceneCameras({len(self.cameras)} cameras, {len(self.points):,} points)"
 
 
@@ -63,21 +67,22 @@ def load_cameras(
     y_up: bool = False,
     scale: float = 1.0,
 ) -> SceneCameras:
-    """The cameras of a calibration of COLMAP, nerfstudio, OpenCV and the others of docs/cameras.md,
-    with their lenses.
+    """Returns the cameras of a calibration of COLMAP, nerfstudio, OpenCV and the other formats of
+    docs/cameras.md, with their lenses.
 
     Args:
-        path: A file or folder; its content decides which format it is.
-        images: The folder of the photos, for formats that do not say how large they are.
-        lenses: With the distortion that the file has, fisheyes included, as photos show it. False:
-            as pinholes, for photos that are undistorted; a fisheye is refused.
-        y_up: Turn the world from the axis that the format has up to y. False: it stays that of the
-            file, in which Gaussians of other programs stand, too.
+        path: File or folder. Its content decides which format it is.
+        images: Folder of the photos, for formats that do not state the photos' sizes.
+        lenses: Whether the cameras have the distortion of the file, fisheyes included, as photos
+            show it. False: they are pinholes, for photos that are undistorted, and a fisheye is
+            refused.
+        y_up: Whether the world is turned so that y is up. False: the axes are those of the file,
+            as for Gaussians of other programs.
         scale: Metres per unit of the file.
 
     Returns:
-        A mapping from names to cameras, pixel centres at +0.5, with the points that the calibration
-        found.
+        A mapping from names to cameras, with pixel centres at +0.5, and the points that the
+        calibration found.
 
     Raises:
         CaptureError: One line that names the file, the field and what was expected.
@@ -105,7 +110,10 @@ def load_cameras(
 
 
 def _camera(each: CalibratedCamera, source: Path, folder: Path | None, lenses: bool) -> Camera:
-    """Raises: CaptureError for one that is not as cameras are."""
+    """Returns a camera of the calibration. If the file has no size, that of its photo is taken.
+
+    Raises: CaptureError if the size is not known, or if `Camera` refuses the values.
+    """
     width, height = each.width, each.height
     if width is None or height is None:
         width, height = _size(source, folder, each.name)
@@ -124,7 +132,7 @@ def _size(source: Path, folder: Path | None, name: str) -> tuple[int, int]:
 
 
 def _points(found: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """Each point once, and its color."""
+    """Returns each point once, (n, 3), and its color, (n, 3), RGB in [0, 1]."""
     seen = found.observations
     if seen is None:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)

@@ -1,8 +1,8 @@
-"""Which frames of several videos show one moment: by time, because rates differ and phones drop
-frames.
+"""Finds the frames of several videos that show one moment. It uses times, because rates differ and
+phones drop frames.
 
-All videos begin at the same moment, time 0 of their files. The slowest one says which moments there
-are; each other camera gives the frame that is nearest in time, or none, where it has a gap.
+All videos have to begin at the same moment. The slowest video determines the moments. Each other
+camera gives the frame that is nearest in time, or no frame if it has a gap there.
 """
 
 import itertools
@@ -15,35 +15,37 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import counted
 
 NEAR = 0.6
-"""How far a frame may be from its moment, in steps of its camera: half a step, and a little more
-because the clocks of phones are not steady."""
+"""Largest distance in time of a frame from its moment, in steps of its camera. It is half a step,
+and a little more because the clocks of phones are not steady.
+"""
 _GAP = 1.5
 """If two frames are farther apart than this many steps, frames are missing between them."""
 _SAME_RATE = 0.01
 """Cameras have one rate if their steps differ by no more than this share."""
 _USUAL_STEP = 1 / 30
-"""Seconds between two frames, where no video says."""
+"""Step between two frames of videos that do not state their times, seconds."""
 
 
 class Moments(NamedTuple):
-    """Which frame of each camera shows each moment."""
+    """The frames of several cameras that show each of m moments."""
 
     times: Float[np.ndarray, " m"]
-    """Seconds after the first frames, (m,)."""
+    """Times of the moments after the first frames, (m,), seconds."""
     frames: dict[str, list[int | None]]
-    """Numbers of frames, from 0, one for each moment; None where a camera has none."""
+    """For each camera the number of its frame at each moment, from 0. None if it has no frame."""
     counts: dict[str, int]
     """Number of frames of each camera."""
     notes: tuple[str, ...]
-    """How frames were paired, a line each."""
+    """Notes on how frames were paired, one line each."""
     warnings: tuple[str, ...]
-    """What cameras lack, a line each."""
+    """Frames that cameras lack, one line each."""
 
 
 def find_moments(times: Mapping[str, Float[np.ndarray, " _n"]]) -> Moments:
-    """Finds the moments that several cameras show.
+    """Returns the moments that several cameras show.
 
-    Arguments: times: seconds at which each camera has its frames; NaN where that is not known.
+    Arguments: times: for each camera the times of its n frames, (n,), seconds. NaN where a time is
+    not known.
     """
     steps = {camera: _step(each) for camera, each in times.items()}
     known = [step for step in steps.values() if step is not None]
@@ -59,7 +61,9 @@ def find_moments(times: Mapping[str, Float[np.ndarray, " _n"]]) -> Moments:
 
 
 def _step(times: Float[np.ndarray, " n"]) -> float | None:
-    """Seconds between two frames; None if the times do not say."""
+    """Returns the mean step between two frames without gaps, seconds. None if the times do not show
+    it.
+    """
     apart = np.diff(times)
     if not len(apart) or not np.isfinite(apart).all() or not (apart > 0).all():
         return None
@@ -87,8 +91,11 @@ def _clock(
 def _all_moments(
     clocks: Mapping[str, Float[np.ndarray, " _n"]], steps: Mapping[str, float]
 ) -> Float[np.ndarray, " m"]:
-    """The times of the slowest camera, in seconds. Times at which it has no frame (before its
-    start, in its gaps, after its end) are added.
+    """Returns the times of the moments, (m,), seconds. They are those of the slowest camera's
+    frames. Moments before its start, in its gaps and after its end are added.
+
+    clocks: times of each camera's frames, seconds. steps: step between each camera's frames,
+    seconds.
     """
     slowest = max(steps.values())
     slow = [camera for camera, step in steps.items() if step > (1 - _SAME_RATE) * slowest]
@@ -104,9 +111,10 @@ def _all_moments(
 
 
 def nearest(times: Float[np.ndarray, " n"], moments: Float[np.ndarray, " m"]) -> list[int | None]:
-    """Returns the frame of a camera that is nearest to each moment, times in seconds.
+    """Returns the number of the camera's frame that is nearest to each moment.
 
-    None if that frame is too far from the moment, or nearer to another moment.
+    It is None if the frame is too far from the moment, or nearer to another moment. Times of frames
+    and moments are in seconds.
     """
     step = float(np.median(np.diff(times))) if len(times) > 1 else _USUAL_STEP
     found = np.searchsorted((times[1:] + times[:-1]) / 2, moments)
@@ -153,8 +161,8 @@ def _warnings(
 ) -> tuple[str, ...]:
     """Warns of each camera that lacks frames.
 
-    One line if a camera has no frame at a moment before its video ends, and one if its video ends
-    before those of others. Clocks and moments are in seconds.
+    A camera gets a line if it has no frame at a moment before its video ends, and a line if its
+    video ends two or more moments before the last one. Clocks and moments are in seconds.
     """
     found = []
     for camera, numbers in frames.items():
@@ -176,8 +184,8 @@ def _warnings(
 
 
 def progressions(numbers: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Arithmetic progressions (first, step, last) that ascending numbers are made of; the step of a
-    single number is 0.
+    """Returns the arithmetic progressions, (first, step, last), that ascending numbers consist of.
+    The step of a single number is 0.
     """
     found: list[tuple[int, int, int]] = []
     for number in numbers:

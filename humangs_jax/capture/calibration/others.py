@@ -1,5 +1,5 @@
-"""Where photos do not show the person: masks of other people and of things in front, and the pixels
-of an imported photo that the camera has not seen.
+"""Finds pixels of photos that do not show whether the person is there: masks of other people and of
+things in front, and pixels of an imported photo that the camera has not seen.
 
 A capture calls both unknown (docs/capture_format.md).
 """
@@ -28,8 +28,8 @@ from humangs_jax.io.images import PHOTO_SUFFIXES, orientation, read_grey
 
 
 def find_others(folder: Path | None, images: Path, photos: Sequence[Path]) -> dict[Path, Path]:
-    """Finds the masks of others in a folder, by photo. A photo without such a mask is not in the
-    result; without a folder the result is empty.
+    """Returns the masks of others in a folder, by photo. A photo without such a mask is not in the
+    result. Without a folder the result is empty.
 
     Raises: CaptureError if no picture in the folder is named like a photo.
     """
@@ -51,10 +51,10 @@ def find_others(folder: Path | None, images: Path, photos: Sequence[Path]) -> di
 def others_as_shown(
     folder: Path | None, images: Path, photos: Sequence[Path]
 ) -> list[Bool[np.ndarray, "_h _w"] | None]:
-    """Where others stand in front, in each photo as it is shown. None for a photo without a mask of
-    others.
+    """Returns for each photo which pixels show others in front, (h, w), as the photo is shown. None
+    for a photo without a mask of others.
 
-    Raises: see `find_others`; CaptureError for a mask of another size.
+    Raises: CaptureError as in `find_others`, and for a mask of another size.
     """
     found = find_others(folder, images, photos)
     return [
@@ -66,8 +66,8 @@ def others_as_shown(
 def others_imported(
     mask: Path, photo: Photo, turn: Turn, camera: CalibratedCamera, canvas: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """Where others stand in front, in an imported photo. The mask is turned, undistorted and padded
-    as the photo was.
+    """Returns which pixels of an imported photo show others in front, (h, w). The mask is turned,
+    undistorted and padded as the photo was. canvas: width and height of the imported photo.
 
     Raises: CaptureError for a mask of another size.
     """
@@ -80,8 +80,8 @@ def others_imported(
 def not_photographed(
     size: tuple[int, int], camera: CalibratedCamera, canvas: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """Where an imported photo has pixels that the camera has not seen: those beyond a distorted
-    lens, and those that were added to bring all photos to one size.
+    """Returns which pixels of an imported photo the camera has not seen, (h, w). They are beyond
+    the border of the distorted photo, or were added to bring all photos to one size.
 
     Arguments: size: width and height of the upright photo. canvas: width and height of the imported
     photo.
@@ -91,8 +91,8 @@ def not_photographed(
 
 
 def is_cut_off(person: Bool[np.ndarray, "h w"], unseen: Bool[np.ndarray, "h w"]) -> bool:
-    """Tells whether the person touches pixels that the camera has not seen. The person may then go
-    on there.
+    """Returns whether the person reaches within three pixels of what the camera has not seen. The
+    person may then go on there.
     """
     # three pixels: a mask that ends so near to what the camera has not seen is cut off there
     near = ndimage.binary_dilation(unseen, iterations=3)
@@ -102,8 +102,8 @@ def is_cut_off(person: Bool[np.ndarray, "h w"], unseen: Bool[np.ndarray, "h w"])
 def _as_imported(
     share: Float[np.ndarray, "h w"], camera: CalibratedCamera, canvas: tuple[int, int]
 ) -> Float[np.ndarray, "height width"]:
-    """Undistorts and pads an upright mask as the import does with its photo. The mask is 0 where
-    the camera has not seen anything.
+    """Returns an upright mask, undistorted and padded as the import does with its photo. The mask
+    is 0 where the camera has not seen anything.
 
     Arguments: canvas: width and height of the imported photo.
     """

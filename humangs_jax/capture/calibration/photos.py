@@ -4,8 +4,8 @@ is by its EXIF orientation.
 Phones store a portrait photo on its side, with a flag that says so, and about half of the other
 programs obey the flag. An import writes photos without a flag: it turns the pixels upright. If the
 camera was calibrated for the pixels as stored (COLMAP), the import turns the camera too. If it was
-calibrated for the turned photo (OpenCV), the sizes show it. No camera sees a mirrored photo: if the
-flag asks for mirroring, the photo is only turned.
+calibrated for the turned photo (OpenCV), the sizes show it. No camera sees a mirrored photo. If the
+flag asks for mirroring, and the calibration is of the pixels as stored, the photo is only turned.
 """
 
 import dataclasses
@@ -105,7 +105,7 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
 
 
 def _refuse_missing(calibration: Calibration, images: Path, name: str) -> None:
-    """Raises the error about a camera that has no photo. name: of the camera.
+    """Raises the error about a camera that has no photo. name: name of the camera.
 
     Raises: CaptureError.
     """
@@ -121,7 +121,8 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
 
     masks: a folder of masks. None: use the masks that the calibration names, if they are there.
     Raises: CaptureError if an image that the calibration names, a camera's photos or a mask is
-    missing, or if only some of the masks that the calibration names are there.
+    missing, if two images have one photo, or if only some of the masks that the calibration names
+    are there.
     """
     if calibration.per_image:
         owners: dict[Path, str] = {}
@@ -148,7 +149,7 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
 
 def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibration) -> list[Unused]:
     """Returns the files in the folder of photos that an import does not use, each with the reason.
-    Folders of masks are ignored.
+    The folders in `NO_PHOTOS` are ignored.
     """
     used = {
         file.resolve() for photo in photos for file in (photo.image, photo.mask) if file is not None
@@ -165,10 +166,11 @@ def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibratio
 
 
 def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
-    """Finds the masks that a calibration names, by number of the camera. They may be in the
-    calibration's folder, in the folder of photos or in its parent. Empty if none is there.
+    """Returns the masks that a calibration names, by number of the camera. They may be in the
+    calibration's folder, in the folder of photos or in its parent. If no mask is there, the result
+    is empty.
 
-    Raises: CaptureError if some are there and others are missing.
+    Raises: CaptureError if some masks are there and others are missing.
     """
     found: dict[int, Path] = {}
     for i, camera in enumerate(calibration.cameras):
@@ -216,8 +218,8 @@ def _photo_at(folder: Path, name: str) -> Path | None:
 
 
 def _any_suffix(path: Path) -> Path | None:
-    """Returns the file at a path. If there is none, looks for the name with another suffix of
-    photos in place of its own, or after it. None if there is no such file.
+    """Returns the photo at a path. If there is none, it returns the file whose name has another
+    suffix of photos in place of the path's, or after it. None if there is no such file.
     """
     stems, candidates = [path.name], []
     if is_photo(path):
@@ -259,7 +261,7 @@ def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
 
 def masks_named_like(masks: Path, images: Path) -> Callable[[Path], Path | None]:
     """Returns a function that finds the mask of a photo of `images`, at the same path in the folder
-    of masks. The function returns None if there is none.
+    of masks. The function returns None if there is no such mask.
 
     The mask has the photo's name, perhaps with another suffix, with one more suffix (COLMAP) or
     with a word for masks (RealityScan's IMG.jpg.mask.png, Metashape's IMG_mask.png). AvatarReX has
@@ -361,7 +363,9 @@ class Turn:
     mask: int
     """EXIF flag by which the mask is turned."""
     quarters: int
-    """Clockwise quarter turns of the camera; 0 for a calibration of the turned photo."""
+    """Number of clockwise quarter turns of the camera. 0 if the calibration is of the turned
+    photo.
+    """
     size: tuple[int, int]
     """Width and height of the turned photo, pixels."""
     certain: bool
@@ -374,7 +378,9 @@ class Turn:
     def upright(
         self, pixels: Float[np.ndarray, "h w *c"], flag: int
     ) -> Float[np.ndarray, "height width *c"]:
-        """Returns pixels turned as a flag asks. If `mirrored`, they are not mirrored."""
+        """Returns pixels turned and mirrored as a flag asks, and then mirrored back if
+        `mirrored`.
+        """
         return oriented(oriented(pixels, flag), MIRROR if self.mirrored else 1)
 
     @property
@@ -387,8 +393,8 @@ def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn,
     """Returns the turn of each photo.
 
     Raises: CaptureError if a photo has another size than the calibrated one, or a mask another size
-    than its photo. Also if a camera was calibrated for pixels as stored, but its photos have
-    different flags.
+    than its photo, or if a camera was calibrated for pixels as stored, and its photos ask for
+    different turns.
     """
     turns = tuple(
         _find_turn(calibration.cameras[photo.camera], photo, calibration.upright)
@@ -430,11 +436,12 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
 
 
 def mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, int]) -> int:
-    """Returns the EXIF flag by which a mask is turned. A mask with a flag, or with the size of the
-    turned photo, is turned by its own flag. Any other mask is turned by the photo's flag.
+    """Returns the EXIF flag by which a mask is turned. If its own flag gives it the size of the
+    turned photo, this is its own flag. If it has no flag and the size of the stored photo, this is
+    the photo's flag.
 
-    Where stored and turned photo have the same size, the mask is taken to be turned: most tools
-    that make masks obey the flag.
+    If stored and turned photo have the same size, a mask without a flag is taken to be turned,
+    because most tools that make masks obey the flag.
 
     flag: EXIF flag of the photo. stored and shown: width and height of the photo before and after
     it is turned, pixels.

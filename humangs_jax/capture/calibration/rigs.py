@@ -65,7 +65,9 @@ def _in_map(file: Path, name: str) -> Where:
 
 
 def recognizes_opencv(source: CalibrationFile) -> bool:
-    """Returns whether a file has K, R and T of cameras."""
+    """Returns whether a file has keys that begin with K_, or a map with K, R or T. The file has to
+    look like JSON or YAML.
+    """
     if not (
         source.text.lstrip().startswith(("{", "%YAML", "---"))
         or source.path.suffix in (".yml", ".yaml")
@@ -146,8 +148,8 @@ def _flat_cameras(
 def _renamed_camera(
     name: str, entry: Mapping[str, Any], keys: Mapping[str, str], file: Path, field: str
 ) -> CalibratedCamera:
-    """Reads a camera whose values have other keys than OpenCV's. keys: their key -> OpenCV's key.
-    Values with other keys are ignored. file and field: of the entry, for errors.
+    """Reads a camera whose values have other keys than OpenCV's. keys: key of the entry -> OpenCV's
+    key. Values with other keys are ignored. file and field: place of the entry, for errors.
     """
     theirs = {ours: key for key, ours in keys.items()} | {
         keys[key]: key for key in entry if key in keys
@@ -377,8 +379,9 @@ def recognizes_multical(source: CalibrationFile) -> bool:
 
 
 def read_multical(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """Reads lenses and poses of the cameras. The world's axes are those of the camera whose pose is
-    not relative to another camera.
+    """Reads lenses and poses of the cameras. A pose that is not relative to another camera is in
+    the world. If other poses are relative to a camera that has no pose, this camera's axes are
+    those of the world.
 
     Raises: CaptureError with the name of the key.
     """
@@ -419,8 +422,8 @@ def read_multical(source: CalibrationFile, format: CameraFormat) -> Calibration:
 
 
 def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
-    """Splits a key of `camera_poses`. Returns the camera that it places, and the camera in whose
-    axes the pose is, or None if the pose is in the world. names: of all cameras.
+    """Splits a key of `camera_poses`. Returns the camera that it places, and the camera that the
+    pose is relative to, or None if the pose is in the world. names: names of all cameras.
     """
     parts = key.split(_RELATIVE)
     for i in range(1, len(parts)):
@@ -499,7 +502,8 @@ def recognizes_qualisys(source: CalibrationFile) -> bool:
 def read_qualisys(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """Reads the cameras of a file.
 
-    Raises: CaptureError with the name of the camera and what is missing.
+    Raises: CaptureError with the name of the camera and what is missing. InvalidFileError if the
+    XML declares entities.
     """
     check_limit("slow_text_bytes", len(source.text), "characters of XML")
     if re.search(r"<!(DOCTYPE|ENTITY)", source.text):

@@ -418,8 +418,8 @@ def _find_moments(
     cameras.
 
     Raises: CaptureError with the name of the key, if some images lack the value, if a value is no
-    time, if two images of one camera are of one moment, or if a camera has several images and
-    nothing shows which images were taken together.
+    time, if two images with one name of a camera are of one moment, or if a camera has several
+    images and nothing shows which images were taken together.
     """
     # which moment and which camera an image is of, by the first of these keys that is there
     of_time = (
@@ -474,7 +474,7 @@ def _values(
     frames: Sequence[Mapping[str, Any]], keys: Sequence[str], file: Path
 ) -> tuple[str, list[Any]]:
     """Returns the first of the keys that an image has, and its values in all images, which are
-    numbers or names. "" and no values if no image has any of the keys.
+    numbers or names. If no image has any of the keys, it returns "" and no values.
 
     Raises: CaptureError if only some images have the key.
     """

@@ -35,7 +35,7 @@ from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import InvalidFileError, check_limit, limits, open_file, reading
 
 _LONGEST_SECONDS = 3600
-"""Seconds after which ffmpeg is stopped."""
+"""Time after which ffmpeg is stopped, seconds."""
 
 
 def find_videos(folder: Path) -> dict[str, Path]:
@@ -101,10 +101,11 @@ def photos_of_videos(
         images: folder of photos or videos.
         masks: folder of masks or of their videos. None: no masks.
         place: where the capture will be written.
-        every: step between frames, or between moments of several videos. The first is 0.
-        most: most photos of a camera. None: all.
-    Raises: CaptureError with the name of the video, or if every or most is given and there are no
-    videos.
+        every: step between frames, or between moments of several videos. The first frame or moment
+            is 0.
+        most: largest number of photos of a camera. None: all.
+    Raises: CaptureError with the name of the video, if a camera lacks the video of its photos or of
+    its masks, or if `every` or `most` is given and there are no videos.
     """
     # videos of photos, and those of masks, where there are any
     asked = every != 1 or most is not None
@@ -154,8 +155,8 @@ def photos_of_videos(
 
 
 def _meant_videos(folder: Path, asked: bool) -> dict[str, Path]:
-    """Returns the videos of a folder. Where the folder also holds photos, there are none unless
-    frames are asked for.
+    """Returns the videos of a folder by the name of their camera. If the folder also holds photos,
+    and no frames are asked for, the result is empty.
     """
     if not asked and scan_folder(folder).photos:
         return {}
@@ -164,10 +165,10 @@ def _meant_videos(folder: Path, asked: bool) -> dict[str, Path]:
 
 @contextlib.contextmanager
 def named_after(temporary: Path, folder: Path) -> Generator[None]:
-    """Replaces the path of a temporary folder in errors by the path of the folder that it was made
-    of, since the temporary one is gone when the errors are read.
+    """Replaces the path of a temporary folder in ValueErrors by the path of the folder that it was
+    made of, because the temporary folder is gone when the errors are read.
 
-    Raises: CaptureError.
+    Raises: CaptureError with the replaced path.
     """
     try:
         yield
@@ -199,9 +200,9 @@ def _moments(
 def _mask_frames(
     path: Path, camera: str, moments: Moments, seconds: float | None
 ) -> list[int | None]:
-    """Returns the numbers of a camera's masks at the moments, None where it has no photo. If there
-    are as many masks as photos, the numbers are those of the photos. Otherwise masks are found by
-    their times.
+    """Returns the number of a camera's mask at each moment, or None at moments without a photo or
+    mask. If there are as many masks as photos, or if the masks' times are not known, the numbers
+    are those of the photos. Otherwise masks are found by their times.
     """
     times = frame_times(path, seconds)
     if len(times) == moments.counts[camera] or not np.isfinite(times).all():
@@ -242,12 +243,12 @@ def split_video(
     chosen: Sequence[int | None] | None = None,
     mask_of: Path | None = None,
 ) -> int:
-    """Write frames of a video as 00000000.png, ... into a new folder, and return the pixels of all
-    frames so far.
+    """Writes frames of a video as 00000000.png, ... into a new folder. Returns the number of pixels
+    in all frames so far.
 
     Args:
         every: step between frames.
-        most: most frames. None: all.
+        most: largest number of frames. None: all.
         before: pixels of the frames of other videos, which count towards the limit `video_pixels`.
         chosen: number of the frame for each file, ascending, in place of `every` and `most`. There
             is no file for None.
@@ -333,17 +334,17 @@ _PIXEL_SHAPE = re.compile(r"\[SAR (\d+):(\d+) ")
 RATE = re.compile(r", ([\d.]+)(k?) fps\b")
 """Pattern of frames per second, perhaps in thousands."""
 PRIMARIES = {"bt2020": 9, "smpte432": 12}
-"""ffmpeg's names of primaries -> numbers of H.273. Videos with other primaries are shown as
-sRGB.
+"""ffmpeg's names of primaries -> numbers of H.273. Other primaries count as sRGB's, and unknown
+primaries of a video of high dynamic range as bt2020.
 """
 _TRANSFERS = {"smpte2084": 16, "arib-std-b67": 18}
-"""ffmpeg's names of transfer curves -> numbers of H.273. Videos with other curves are shown as
-sRGB.
+"""ffmpeg's names of the transfer curves of high dynamic range -> numbers of H.273. Other curves
+count as sRGB's.
 """
 _WIDEST_PIXEL = 4
 """Largest ratio of the sides of a pixel. The largest in use is 2."""
 _SQUARE = "scale=w=round(iw*max(sar\\,1)):h=round(ih*max(1/sar\\,1)),setsar=1"
-"""Filter that makes pixels square. It only makes frames larger: nothing is lost."""
+"""Filter that makes pixels square. It only enlarges frames, so that nothing is lost."""
 _TABLE = "colors.cube"
 """Name of the temporary file with the table of colors."""
 
@@ -426,8 +427,8 @@ def _check_pixels(pixels: int, count: int, width: int, height: int) -> None:
 
 
 def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
-    """Write frames of a video as frame_00000017.png, ... into a new folder. chosen: their numbers,
-    from 0 and ascending.
+    """Writes frames of a video as frame_00000017.png, ... into a new folder. chosen: numbers of the
+    frames, from 0 and ascending.
 
     Raises: CaptureError with the name of the video.
     """
@@ -452,8 +453,9 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
 def color_frames(
     path: Path, longer_side: int, chosen: Sequence[int] | None
 ) -> Iterator[UInt[np.ndarray, "h w 3"]]:
-    """Yields frames of a video in the stored colors, (h, w, 3). Larger frames are shrunk to
-    `longer_side` pixels. chosen: their numbers, from 0 and ascending. None: all.
+    """Yields frames of a video in the stored colors, (h, w, 3). Frames whose longer side exceeds
+    `longer_side` pixels are shrunk to it. chosen: numbers of the frames, from 0 and ascending.
+    None: all.
 
     Raises: CaptureError with the name of the video.
     """
@@ -532,8 +534,8 @@ def _ffmpeg(path: Path, filters: str) -> list[str]:
 
 
 def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int:
-    """Write at most `most` frames for which ffmpeg's expression `select` is not 0. Returns how many
-    were written.
+    """Writes at most `most` frames for which ffmpeg's expression `select` is not 0. Returns how
+    many were written.
     """
     table, filters = folder / _TABLE, [f"select={select}", *filter(None, [shown.shape])]
     if shown.encoding is not None:
