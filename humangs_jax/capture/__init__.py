@@ -1,4 +1,4 @@
-"""From photos to a capture: `detection` (people of a photo by BlazePose, their faces and hands),
-`keypoints` and `calibration` (readers of files), `fitting` (cameras from the person, the body from
-keypoints and masks, the motion of a video).
+"""Makes captures from photos. `detection` finds people in photos with BlazePose, and their faces
+and hands. `keypoints` and `calibration` read files of other programs. `fitting` finds cameras from
+the person, and fits the body to keypoints and masks, and the motion of a video.
 """

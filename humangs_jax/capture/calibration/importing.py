@@ -88,7 +88,7 @@ class ImportReport:
     undistorted: int
     """Number of photos of which lens distortion was removed."""
     turned: int
-    """Number of photos that were turned upright by their EXIF orientation."""
+    """Number of photos that were turned upright by their EXIF orientation, or their masks were."""
     heic: int
     """Number of photos that are HEIC or have a HEIC mask."""
     masks: bool
@@ -362,8 +362,8 @@ def _canvas(images: Path, photos: Sequence[Photo], turns: Sequence[Turn]) -> tup
     """Returns width and height of all photos that are written, pixels. They are the largest width
     and the largest height of all upright photos.
 
-    Raises: CaptureError if the photos of one camera have different sizes, or if the photos together
-    exceed the limits of pixels.
+    Raises: CaptureError if the photos of one camera have different sizes, or if photos that would
+    be padded exceed the limits of pixels.
     """
     first = {}
     for photo, turn in zip(photos, turns, strict=True):

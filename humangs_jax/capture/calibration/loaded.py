@@ -110,7 +110,7 @@ def load_cameras(
 
 
 def _camera(each: CalibratedCamera, source: Path, folder: Path | None, lenses: bool) -> Camera:
-    """Returns a camera of the calibration. If the file has no size, that of its photo is taken.
+    """Returns a camera of the calibration. If the file has no size, it takes the size of the photo.
 
     Raises: CaptureError if the size is not known, or if `Camera` refuses the values.
     """

@@ -121,8 +121,9 @@ def read_easymocap(source: CalibrationFile, format: CameraFormat) -> Calibration
 def _flat_cameras(
     values: Mapping[str, Any], file_of: Callable[[str], Path]
 ) -> list[CalibratedCamera]:
-    """Reads cameras whose names are at the end of their keys. The cameras are those of the list
-    `names`, or without it those that have a K. file_of: returns the file of a key, for errors.
+    """Reads cameras whose names are at the end of their keys. The list `names` has their names.
+    Without this list, the cameras that have a K are read. file_of: returns the file of a key, for
+    errors.
     """
     names = list(values.get("names") or (key[2:] for key in values if key.startswith("K_")))
     if not names:

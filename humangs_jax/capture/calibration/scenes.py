@@ -376,7 +376,7 @@ def _frame_intrinsics(
 
 def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str, Any]:
     """Returns the fields of a `CalibratedCamera` that describe the lens. For a lens that cannot be
-    undistorted, they hold the error for those who ask for photos without distortion.
+    undistorted, they include the error for commands that need photos without distortion.
 
     Raises: CaptureError if the model of the camera is not supported.
     """

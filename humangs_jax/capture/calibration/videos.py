@@ -396,8 +396,9 @@ def _with_colors(shown: _Shown, matrix: str, primaries: str, transfer: str) -> _
 
 
 def _shown_as_mask(path: Path, photos: Path) -> _Shown:
-    """Returns how a video of masks is shown. Its values are not converted as colors. If its frames
-    have the stored size of the photos' and it states no pixel shape, it gets that of the photos.
+    """Returns how a video of masks is shown. Its values are not converted as colors. If it states
+    no pixel shape, and its frames have the stored size of the video of photos, it gets the pixel
+    shape of that video.
     """
     own, theirs = _shown(path), _shown(photos)
     as_stored = _Shown()

@@ -1,4 +1,4 @@
-"""Finds face and hands of a person whom BlazePose has found: scores of ARKit's shapes, and 21
+"""Finds face and hands of a person that BlazePose has found: scores of ARKit's shapes, and 21
 landmarks of each hand, by mediapipe's networks in LiteRT.
 
 The networks look twice at a face or a hand. The first region follows from BlazePose's landmarks,

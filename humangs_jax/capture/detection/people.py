@@ -6,8 +6,8 @@ The result for each person is 33 landmarks in the image, 33 landmarks in metres,
 LiteRT runs two networks. The detector looks at a square window of the photo and finds, for each
 person, the middle of the hips and a point whose distance from it is the size of the body. The
 landmark network looks at the square around the person, turned so that the person stands upright.
-Pre- and postprocessing are those of mediapipe's pose graph, in numpy: samples are bilinear, begin
-at the crop's corner, and have no antialiasing. The networks depend on both.
+Pre- and postprocessing are those of mediapipe's pose graph, in numpy. Samples are bilinear, begin
+at the crop's corner, and have no antialiasing, because the networks depend on this.
 
 Pixels of the networks are mediapipe's: (x, y), with the centre of the first pixel at 0.
 `apps.detect` adds half a pixel for our convention.

@@ -1,4 +1,4 @@
-"""What fits write: fit.npz and fit.json beside the body.npz of a capture.
+"""Reads and writes the files of fits: fit.npz and fit.json beside the body.npz of a capture.
 
 fit.npz, the input of a fit to keypoints and how well its result is known:
 
@@ -36,7 +36,7 @@ from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, 
 from humangs_jax.io.reading import reading, write_json
 
 FIT_FILE = "fit.npz"
-"""File of the input of a fit to keypoints, and of how well its result is known."""
+"""Name of the file with the input of a fit to keypoints, and with how well its result is known."""
 _FOUND = ("noise", "joint_std", "determined", "shape_covariance")
 """Keys of fit.npz that are fields of `FitRecord`."""
 KEYS = ("set", "names", "points", "confidences", *_FOUND, "places", "certainty")

@@ -82,7 +82,9 @@ class Uncertainty(NamedTuple):
 def fit_uncertainty(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> Uncertainty:
-    """Returns the uncertainty of a fit to these observations, computed in float64."""
+    """Returns the uncertainty of a fit to these observations. It is computed in float64 from
+    derivatives in float32.
+    """
     # derivatives of the residuals by the pose of their frame and by the shape that all share
     model = replace(model, certainty=fit.certainty)
     derivatives = _derivatives(model, replace(observations, noise=fit.noise), fit)

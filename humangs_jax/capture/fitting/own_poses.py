@@ -60,7 +60,7 @@ they gain 0.005. A real man who turns before a camera gains 0.017.
 
 
 class Movement(NamedTuple):
-    """Whether a person moved between photos."""
+    """How well masks agree with a shared pose and with a pose for each photo."""
 
     before: float
     """Mean IoU of the masks and the body in the shared pose. NaN without masks."""

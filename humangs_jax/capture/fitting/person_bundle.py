@@ -383,7 +383,7 @@ class Step:
     """Shifts of the landmarks, (k, 3), metres."""
     views: Float[np.ndarray, "c 9"]
     """Changes of the views, (c, 9): turn (3, radians), place (3) and the mean of the view (3),
-    which follows from the rest. The changes of place are those of x over depth, y over depth and
+    which follows from the rest. A place changes by steps of x over depth, of y over depth, and of
     the logarithm of the depth.
     """
     focal: Float[np.ndarray, " g"]

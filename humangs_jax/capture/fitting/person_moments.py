@@ -202,7 +202,7 @@ class Explanation:
 
 def explain(seen: PersonViews) -> Explanation:
     """Returns the cameras that explain all photos, or all but one, by one person in one pose. If
-    there are none, each photo stands for itself.
+    there are no such cameras, each photo stands for itself.
     """
     every = tuple(range(len(seen.photos)))
 
@@ -380,8 +380,8 @@ def _focal_lengths(
     of cameras, (c,). Photos without a focal length get the median of the others, relative to the
     diagonal, or else the usual one.
 
-    All focal lengths from EXIF are of one kind. Those of photos without EXIF are of one kind for
-    each size of photos, which are taken to be from one camera.
+    All focal lengths from EXIF are of one kind. Photos of one size without EXIF are taken to be
+    from one camera, which is another kind.
     """
     diagonals = np.hypot(*np.asarray(seen.sizes, float).T)
     known = np.isfinite(seen.focal)

@@ -62,7 +62,7 @@ _LABELS = {
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """An error of the result, and that of the start if there was one."""
+    """An error of the result, and of the start if there was one."""
 
     after: float
     """Error of the result."""
@@ -110,7 +110,7 @@ class Violation:
 
 @dataclasses.dataclass(frozen=True)
 class FitReport:
-    """What came of a fit."""
+    """The report of a fit."""
 
     fitted: Literal["keypoints", "refinement"]
     """Evidence to which the body was fitted."""

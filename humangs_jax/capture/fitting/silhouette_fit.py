@@ -338,7 +338,7 @@ class Score:
     """How well the body of a capture agrees with the masks and keypoints of its photos."""
 
     ious: Float[np.ndarray, " v"]
-    """Intersection over union of body and mask in each view, (v,); NaN without a mask."""
+    """Intersection over union of body and mask in each view, (v,). NaN without a mask."""
     iou: float | None
     """Mean of `ious` over the views with a mask. None if no view has one."""
     keypoints: float | None
@@ -387,7 +387,7 @@ class SilhouetteFit:
     observations: Observations | None
     """Keypoints in pixels of the reduced size. None without keypoints."""
     scale: float
-    """Pixels of the reduced size for one pixel of the photo."""
+    """Ratio of the reduced size to the full size of the photos."""
     height: float
     """Height of the person in the image, pixels of the reduced size."""
     origin: Origin

@@ -284,7 +284,8 @@ class CameraState:
 
 @pytree_dataclass
 class FitState:
-    """The numbers that a fit moves, in units of `StateStd`. Parts that it does not move are None.
+    """The numbers that a fit moves, in units of `StateStd`. Parts that the fit does not move are
+    None.
 
     In a fit of m frames the poses have a leading axis (m, ...), and all frames share one shape. The
     number of free joints is a.

@@ -148,8 +148,8 @@ class Order(NamedTuple):
     source: Int[np.ndarray, "m c"]
     """Index of the camera from which they come, (m, c)."""
     mirrored: Bool[np.ndarray, "m c"]
-    """Whether left and right of the keypoints are exchanged, (m, c), by the camera from which they
-    come.
+    """Whether left and right of the keypoints are exchanged, (m, c). The second index is the camera
+    from which the keypoints come.
     """
 
     def exchanged(
@@ -384,8 +384,8 @@ def _together(trials: Sequence[_Trial]) -> _Trial:
 def _cameras(
     best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"], names: Sequence[str]
 ) -> Swap:
-    """Reports the best exchange as a swap. Other exchanges of the same frames that gain as much are
-    its alternatives.
+    """Returns the best exchange as a swap. Other exchanges of the same frames that gain nearly as
+    much are its alternatives.
     """
 
     def named(trial: _Trial) -> tuple[str, ...]:

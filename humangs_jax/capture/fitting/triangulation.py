@@ -42,7 +42,7 @@ def triangulate(
     """Triangulates points by least squares over all views. Returns the points, (k, 3), metres, and
     how many views see each, (k,).
 
-    Arguments: weights: of each point in each view, (c, k). None: the confidences.
+    Arguments: weights: weight of each point in each view, (c, k). None: the confidences.
     """
     weights = observations.confidences if weights is None else weights
     origins, directions = _rays(observations)

@@ -136,7 +136,9 @@ def look(
 def body_boundary(
     view: BodyView, faces: Int[np.ndarray, "f 3"], mesh: MeshEdges, count: int
 ) -> Boundary:
-    """Returns `count` points of the body's silhouette, or none if the image shows no silhouette."""
+    """Returns `count` points of the body's silhouette, or no points if the image shows no
+    silhouette.
+    """
     # faces that look at the camera, by their orientation in the image
     corners = view.pixels[faces]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -168,7 +170,8 @@ def body_boundary(
 def mask_boundary(
     mask: Float[np.ndarray, "h w"], count: int, hidden: Bool[np.ndarray, "h w"] | None = None
 ) -> Boundary:
-    """Returns `count` points where the coverage of a mask crosses one half, or none if it does not.
+    """Returns `count` points where the coverage of a mask crosses one half, or no points if there
+    is no such place.
 
     Contours along the image border are left out. hidden: pixels where something may stand in front
     of the person, (h, w). Contours through these pixels are left out, too.
