@@ -119,7 +119,8 @@ class Landmarks(NamedTuple):
     """Probability that a landmark is seen and not hidden, (33,)."""
     world: Float[np.ndarray, "33 3"]
     """Landmarks relative to the middle of the hips, (33, 3), metres. Axes are the camera's (x
-    right, y down, z away), and the person is taken to be of average size.
+    right, y down, z away), as if the camera looked straight at the person, who is taken to be of
+    average size.
     """
     presence: float
     """Probability that the crop shows a person."""

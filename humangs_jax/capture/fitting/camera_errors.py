@@ -36,7 +36,9 @@ _PRIOR = np.radians(1.0)
 change no residual.
 """
 _ITERATIONS = 8
-"""Number of iterations that reweight the residuals."""
+"""Number of iterations that reweight the residuals. As many iterations follow that move the points
+with fixed weights.
+"""
 
 
 @dataclasses.dataclass(frozen=True)

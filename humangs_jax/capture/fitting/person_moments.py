@@ -81,8 +81,8 @@ class _OneMoment:
     mirrored.
     """
     least_angle: float = 4.0
-    """Least angle between the directions from which photos see the person, degrees. If it is
-    smaller, each photo is taken alone.
+    """Least angle between the two directions that differ most, from which photos see the person,
+    degrees. If the angle is smaller, each photo is taken alone.
     """
     far: float = 0.2
     """Largest error that counts. Larger errors count as this one."""

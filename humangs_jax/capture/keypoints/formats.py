@@ -10,9 +10,10 @@ the set's name, and the names of the v views. `humangs detect` writes the people
             {"presence": 0.99, "pixels": [[x, y], ...], "visibility": [...], "world": [[x, y, z],
             ...]}, null]}]}
 
-world: metres from the middle of the hips in the camera's axes (x right, y down, z away), of a
-person of average size. The i-th entry of `people` is the same person in all images, or null if the
-person is not in the image. A person may also have "hands", see `SeenPerson.hands`.
+world: metres from the middle of the hips in the camera's axes (x right, y down, z away), as if the
+camera looked straight at the person, who is taken to be of average size. The i-th entry of `people`
+is the same person in all images, or null if the person is not in the image. A person may also have
+"hands", see `SeenPerson.hands`.
 """
 
 import dataclasses

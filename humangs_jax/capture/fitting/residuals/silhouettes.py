@@ -373,7 +373,8 @@ def silhouette_residuals(
     scales: tuple[Float[Array, ""], Float[Array, ""]],
     independent: float,
 ) -> Float[Array, " e"]:
-    """Returns the distances between the silhouettes, (e,), in standard deviations.
+    """Returns the robust distances between the silhouettes, (e,), in standard deviations, times the
+    roots of their weights.
 
     Args:
         matches: equations of the view.
