@@ -165,6 +165,7 @@ def fit_motion(
     Args:
         body: body model of the person.
         keypoints: keypoints of all frames, with the detector's 3D landmarks (`Keypoints.world`).
+            The set needs hips and the landmarks of `_FEET`.
         K: intrinsics of the camera, (3, 3), pixels.
         fps: frames per second.
         betas: shape of the person, (s,). None: the shape is fitted.

@@ -92,6 +92,7 @@ def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str])
 
     names: one name for each view, as in the capture.
     Raises: ValueError if the path does not end in .npz, or if there is not one name per view.
+    OSError if writing fails.
     """
     if len(names) != len(keypoints.points):
         raise ValueError(
@@ -177,7 +178,10 @@ class ImagePeople:
 
 
 def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
-    """Writes the people of images to a file. If writing fails, no partial file is left."""
+    """Writes the people of images to a file. If writing fails, no partial file is left.
+
+    Raises: OSError.
+    """
     described = []
     for image in images:
         people = [None if person is None else _described(person) for person in image.people]

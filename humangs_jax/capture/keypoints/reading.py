@@ -72,6 +72,7 @@ def read_detections(path: Path) -> Detections:
 
     All JSON files in a folder and its sub-folders are read together.
     Raises: CaptureError if there is no such file or folder, or if the content is not valid.
+    InvalidFileError if a limit is exceeded.
     """
     if not path.exists():
         raise CaptureError(path, "", "no such file or folder")
