@@ -118,6 +118,8 @@ PQ = 16
 """Number of the transfer function PQ in H.273."""
 HLG = 18
 """Number of the transfer function HLG in H.273."""
+UNSPECIFIED = 2
+"""Code point of H.273, for primaries as for curves, of a file that leaves them open."""
 
 
 def _xyz(xy: tuple[float, float]) -> np.ndarray:
@@ -136,6 +138,8 @@ def _to_xyz(primaries: tuple[tuple[float, float], ...], white: tuple[float, floa
 
 
 FROM_XYZ = np.linalg.inv(_to_xyz(SRGB, D65))
+OF_SRGB = Encoding((srgb_to_light,), np.eye(3))
+"""The encoding of sRGB."""
 
 
 def of_code_points(primaries: int, transfer: int) -> Encoding | None:

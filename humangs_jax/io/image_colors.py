@@ -11,6 +11,8 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.io.color_spaces import (
+    OF_SRGB,
+    UNSPECIFIED,
     Encoding,
     by_tables,
     is_srgb,
@@ -58,17 +60,22 @@ def colors_in_srgb(
 
 
 def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
-    """Returns the color encoding that numbers in a photo's header state. None if they state sRGB,
-    if there are no such numbers, or if something else decides.
+    """Returns the color encoding that numbers in a photo's header state. None if the ICC profile
+    decides, if there is one; without a profile, None stands for sRGB.
 
-    In a PNG, a cICP chunk decides first, then an ICC profile or an sRGB chunk, then gAMA and cHRM.
-    In other formats, an ICC profile decides first.
+    In a PNG, a cICP chunk decides first, then an ICC profile, then an sRGB chunk, then gAMA and
+    cHRM. A cICP chunk with a code point for "unspecified" decides only if its other code point
+    differs from sRGB's. In other formats, an ICC profile decides first.
     """
     if image.format == "PNG":
         chunks = png_chunks(data)
         points = chunks.get(b"cICP", b"")
         if len(points) >= 2:
-            return of_code_points(points[0], points[1])
+            encoding = of_code_points(points[0], points[1])
+            if encoding is not None:
+                return encoding
+            if UNSPECIFIED not in points[:2]:
+                return OF_SRGB
         if b"iCCP" in chunks or b"sRGB" in chunks:
             return None
         return of_gamma(image.info.get("gamma"), image.info.get("chromaticity"))

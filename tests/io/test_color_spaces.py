@@ -237,6 +237,13 @@ def test_numbers_in_a_png_say_how_colors_are_encoded(tmp_path):
         "cICP before another": png(
             p3, chunk(b"cICP", bytes([12, 13, 0, 1])), of_profile(WIDE["linear"])
         ),
+        "sRGB in cICP before another": png(
+            COLORS, chunk(b"cICP", bytes([1, 13, 0, 1])), of_profile(WIDE["linear"])
+        ),
+        "cICP that leaves it open": png(p3, chunk(b"cICP", bytes([2, 2, 0, 1])), of_profile(P3)),
+        "cICP that leaves the primaries open": png(
+            p3, chunk(b"cICP", bytes([2, 13, 0, 1])), of_profile(P3)
+        ),
         "cHRM": png(p3, gamma_chunk(0.45455), primaries((0.3127, 0.329), *profiles.P3)),
         "gAMA": png(light, gamma_chunk(1.0), depth=16),
         "sRGB": png(COLORS, chunk(b"sRGB", b"\0"), gamma_chunk(1.0)),
