@@ -7,12 +7,14 @@ printers, scanners, CMYK) are left to Little CMS. In images of high dynamic rang
 sheet of paper counts as 1, and light above 0.75 is compressed below 1.
 """
 
+import contextlib
 import io
 import struct
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.linalg import LinAlgError
 
 from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.io.reading import InvalidFileError
@@ -154,10 +156,11 @@ def of_code_points(primaries: int, transfer: int) -> Encoding | None:
 
 
 def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Encoding | None:
-    """Returns the encoding that PNG's gAMA and cHRM describe. None if it is sRGB's, or if the
-    chromaticities are those of no real colors.
+    """Returns the encoding that PNG's gAMA and cHRM describe. None if it is sRGB's.
 
-    chromaticities: x and y of white, red, green and blue, in this order.
+    A number that cannot be used, and chromaticities of no real colors, are read as sRGB's; the
+    other one of the two still counts. chromaticities: x and y of white, red, green and blue, in
+    this order.
     """
     curve, matrix = srgb_to_light, np.eye(3)
     # PNG files say 1 / 2.2 of sRGB; what programs write of videos (1 / 1.96) is shown as sRGB, too
@@ -165,14 +168,14 @@ def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> E
         curve = _power(1 / gamma)
     if chromaticities is not None and len(chromaticities) == 8:
         points = tuple(zip(chromaticities[::2], chromaticities[1::2], strict=True))
-        with np.errstate(all="ignore"):
-            try:
-                matrix = FROM_XYZ @ _to_xyz(points[1:], points[0])
-            except (ZeroDivisionError, np.linalg.LinAlgError):
-                return None
+        found = np.full((3, 3), np.inf)
+        with np.errstate(all="ignore"), contextlib.suppress(ZeroDivisionError, LinAlgError):
+            found = FROM_XYZ @ _to_xyz(points[1:], points[0])
+        # larger factors are of primaries that do not exist
+        if np.abs(found).max() < 10:
+            matrix = found
     encoding = Encoding((curve,), matrix)
-    # larger factors are of primaries that do not exist
-    if not np.abs(matrix).max() < 10 or is_srgb(encoding):
+    if is_srgb(encoding):
         return None
     return encoding
 

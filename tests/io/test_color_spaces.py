@@ -249,6 +249,21 @@ def test_numbers_in_a_png_say_how_colors_are_encoded(tmp_path):
         "sRGB": png(COLORS, chunk(b"sRGB", b"\0"), gamma_chunk(1.0)),
         "as of old": png(COLORS, gamma_chunk(0.45455)),
         "nonsense": png(COLORS, gamma_chunk(0), primaries((0, 0), (0, 0), (0, 0), (0, 0))),
+        "gAMA beside nonsense": png(
+            light, gamma_chunk(1.0), primaries((0, 0), (0, 0), (0, 0), (0, 0)), depth=16
+        ),
+        "gAMA beside points on a line": png(
+            light,
+            gamma_chunk(1.0),
+            primaries((0.3, 0.3), (0.1, 0.1), (0.2, 0.2), (0.3, 0.3)),
+            depth=16,
+        ),
+        "gAMA beside no real colors": png(
+            light,
+            gamma_chunk(1.0),
+            primaries((0.3127, 0.329), (0.4, 0.4), (0.41, 0.4), (0.4, 0.42)),
+            depth=16,
+        ),
         "points on a line": png(COLORS, primaries((0.3, 0.3), (0.1, 0.1), (0.2, 0.2), (0.3, 0.3))),
         "short": png(COLORS, chunk(b"cICP", b"\x0c")),
     }
