@@ -1,9 +1,9 @@
 """A calibration of any format in memory: its cameras, their conversion to the convention of
 captures, lens distortion, and checks.
 
-Readers return a `Calibration`: OpenCV axes (x right, y down, z forward), but lengths, the world's
-up axis and the place of pixel centres still those of the source. `in_capture_convention` makes
-metres, y up and pixel centres at +0.5 of them.
+Readers return a `Calibration`. Its cameras have OpenCV's axes (x right, y down, z forward). Its
+lengths, the world's up axis and the place of pixel centres are those of the source.
+`in_capture_convention` changes these to metres, y up and pixel centres at +0.5.
 """
 
 import dataclasses
@@ -40,7 +40,7 @@ ROTATION_TO_Y_UP = {
     "+z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     "-z": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
 }
-"""The proper rotation that takes each axis of the source that can point up to +y."""
+"""For each axis that may point up in the source, the rotation that takes it to +y."""
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """The matrix that turns axes y down, z forward into y up, z backward; it is its own inverse."""
 CAM_FROM_WORLD = "cam_from_world, OpenCV axes"
@@ -79,8 +79,8 @@ class CalibratedCamera:
     height: int | None = None
     """The height of the image, pixels; None where the format does not say."""
     distortion: Float[np.ndarray, " coefficients"] | None = None
-    """OpenCV's k1 k2 p1 p2 k3. Where there is a `refusal`: 8 or 12 numbers, or 4 of a fisheye.
-    None: the lens does not distort.
+    """OpenCV's k1 k2 p1 p2 k3. Where there is a `refusal`: 8 or 12 numbers, or at least 4 of a
+    fisheye. None: the lens does not distort.
     """
     frame: int = 0
     """The frame of the image, counted from 0, where there is one camera for each image."""
@@ -96,12 +96,8 @@ class CalibratedCamera:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Observations:
-    """Points that the calibration saw, one row for each time: the evidence that reprojection is
-    checked against.
-
-    points: (n, 3) in the world. cameras: (n,) which camera saw it. pixels: (n, 2) where, distortion
-    included.
-    colors: (n, 3) of the points, 0 to 255; None where the format has none.
+    """Points that the cameras saw while they were calibrated. There is a row for each time that a
+    camera saw a point. The reprojection of the points is checked against them.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -266,8 +262,8 @@ def _read(path: Path, photo_size: Callable[[str], tuple[int, int]]) -> Calibrati
 def in_capture_convention(
     calibration: Calibration, scale: float, up: str, pixel_centers: str
 ) -> Calibration:
-    """Returns the cameras and points in metres, with y up, pixel centres at +0.5 and orthonormal
-    rotations.
+    """Returns the calibration with cameras and points in metres, y up and pixel centres at +0.5.
+    Rotations that were rounded become orthonormal, see `nearest_rotation`.
 
     Arguments:
         scale: metres per unit of the source.
@@ -486,8 +482,8 @@ def _in_photo(
     K: Float[np.ndarray, "3 3"],
     coefficients: Float[np.ndarray, "5"],
 ) -> Float[np.ndarray, "*n 2"]:
-    """Returns where the lens puts pixels, in pixels of the photo, whose edges are whole numbers.
-    Pixels that the photo does not show are put far outside.
+    """Returns where in the photo the lens puts pixels of a pinhole camera with the same K. Both are
+    in pixels, with pixel centres at +0.5. Pixels that the lens cannot show are put far outside.
     """
     plane = (pixels - K[:2, 2]) / np.diag(K)[:2]
     source = distort(plane, coefficients) * np.diag(K)[:2] + K[:2, 2]
@@ -496,7 +492,7 @@ def _in_photo(
 
 
 def _squared_reach(coefficients: Sequence[float | int] | np.ndarray) -> float:
-    """Returns the r^2 up to which r (1 + k1 r^2 + ..) grows.
+    """Returns the r^2 up to which r (1 + k1 r^2 + ..) grows; infinity if it always grows.
 
     Beyond it the formula folds the image back over itself.
     """

@@ -3,8 +3,8 @@ folder on disk.
 
     me/capture.json       {"format": "humangs-capture", "version": 1, "body": "body.npz",
                           "views": [...]}
-    me/body.npz           body (name or file of the model), betas and shape_names (s,), rotations
-                          (m, j, 3), translations (m, 3) and perhaps displacement (n, 3)
+    me/body.npz           body (name or file of the model), betas (s,), rotations (m, j, 3),
+                          translations (m, 3), perhaps shape_names (s,) and displacement (n, 3)
     me/images/*.png ...   one photo per view, all of one size; the same for masks
 
 docs/capture_format.md describes the format in full. Whatever is wrong in a folder is a
@@ -97,9 +97,8 @@ class Capture:
     each view, (v, 3); None: the colors are as they were photographed.
     """
     unknown: Bool[np.ndarray, "v h w"] | None = None
-    """Where somebody or something in front may hide the person; masks are 0 there.
-
-    Nothing is concluded from these pixels.
+    """Where somebody or something in front may hide the person, (v, h, w); masks are 0 there.
+    Nothing is concluded from these pixels. None: nowhere.
     """
 
     __repr__ = short_repr
@@ -119,8 +118,9 @@ class Capture:
     def check(self, owner: str) -> None:
         """Check a capture that may have been made by hand.
 
-        Raises: ValueError, one line that begins with `owner`, unless there are a photo, a mask, a
-        camera and a frame for each view, a body that fits the poses, and finite numbers in range.
+        Raises: ValueError, one line that begins with `owner`, unless there are a photo, a camera
+        and a frame for each view, a mask for each view or none at all, a body that fits the poses,
+        and finite numbers in range.
         """
         if self.view_count == 0:
             raise ValueError(f"{owner}: 0 views; at least one photo is needed")
@@ -134,7 +134,7 @@ class Capture:
     def pose(self, frame: int) -> BodyPose:
         """Returns the pose of one frame. The pose of a view is `pose(capture.frames[view])`.
 
-        Raises: IndexError.
+        Raises: IndexError for a frame that does not exist.
         """
         return self.poses[frame]
 
@@ -346,7 +346,8 @@ def capture_checksum(path: str | Path) -> str:
 
     Captures of the same name with other contents have other checksums.
 
-    Raises: CaptureError, as `load_capture` does; OSError for a file that cannot be read.
+    Raises: CaptureError if capture.json or body.npz is wrong, or a file cannot be read. Other files
+    are not checked.
     """
     folder = capture_folder(path)
     with reading(folder / "capture.json", "capture", CaptureError):
@@ -364,7 +365,8 @@ def capture_checksum(path: str | Path) -> str:
 
 @checked_arguments
 def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False) -> None:
-    """Write a capture folder: PNG images and masks, capture.json, body.npz; all of it or nothing.
+    """Write a capture folder: PNG images and masks, capture.json and body.npz. If writing fails,
+    the folder stays as it was.
 
     The model file of a body other than the default one is referred to by its relative path, never
     copied.
@@ -427,8 +429,10 @@ def _load_model(file: object, name: str, folder: Path | None = None) -> BodyMode
 
 
 def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
-    """Read the model's name in body.npz, and the arrays that `body_parameters` checks, as they are
-    in the file.
+    """Returns the name of the model in a body.npz, and the arguments that `body_parameters` takes,
+    which are not checked yet.
+
+    Raises: CaptureError.
     """
     try:
         values, pickled = read_npz(file)
@@ -521,7 +525,7 @@ def _write_folder(folder: Path, capture: Capture, target: Path) -> None:
 
 
 def capture_parameters(folder: Path, capture: Capture) -> dict[str, np.ndarray]:
-    """Returns the arrays of a capture's body.npz, see `parameter_arrays`."""
+    """Returns the arrays of a capture's body.npz by their keys, see `parameter_arrays`."""
     poses = capture.poses
     arrays = parameter_arrays(
         folder, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation
@@ -539,8 +543,8 @@ def parameter_arrays(
     rotations: Any,
     translations: Any,
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays of body.npz of a capture that will be in `folder`. A model file is named
-    relative to this folder.
+    """Returns the arrays of body.npz for a capture that will be in `folder`, by their keys. A model
+    file is named relative to this folder.
     """
     if body_file != DEFAULT_BODY:
         body_file = Path(os.path.relpath(Path(body_file).resolve(), folder.resolve())).as_posix()

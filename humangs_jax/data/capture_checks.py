@@ -24,15 +24,16 @@ such as 0 to 255.
 
 
 LARGEST_TURN = 1e3
-"""The largest angle of a rotation, radians."""
+"""The largest magnitude of a component of an axis-angle rotation, radians."""
 LARGEST_DISTANCE = 1e4
-"""The largest distance from the origin, metres. Farther away float32 loses millimetres, and the
-numbers are hardly metres.
+"""The largest magnitude of a component of a translation, metres. Farther away float32 loses
+millimetres, and the numbers are hardly metres.
 """
 LARGEST_BETA = 100.0
-"""The largest shape coefficient. Bodies that exist have less than 10."""
+"""The largest magnitude of a shape coefficient. Bodies that exist have less than 10."""
 LARGEST_DISPLACEMENT = 0.5
-"""The largest distance that clothes put between a body and its surface, metres."""
+"""The largest magnitude of a component of a displacement, metres. Clothes are nearer to the body.
+"""
 
 
 class CaptureError(FileError):
@@ -44,7 +45,9 @@ class CaptureError(FileError):
 
 
 def checked_text(file: Path, missing: str = "no such file") -> str:
-    """Returns the text of a file. missing: the text of the error if there is no file."""
+    """Returns the text of a file. missing: the text of the error if there is no file. Raises:
+    CaptureError.
+    """
     try:
         return read_text(file)
     except FileNotFoundError:
@@ -55,7 +58,7 @@ def checked_text(file: Path, missing: str = "no such file") -> str:
 
 def checked_json(file: Path, text: str | None = None, missing: str = "no such file") -> Any:
     """Returns the value in a JSON file. text: the text of the file, if it is known. missing: the
-    text of the error if there is no file.
+    text of the error if there is no file. Raises: CaptureError.
     """
     with reading(file, "JSON file", CaptureError):
         return parse_json(checked_text(file, missing) if text is None else text)
@@ -63,7 +66,7 @@ def checked_json(file: Path, text: str | None = None, missing: str = "no such fi
 
 def checked_path(folder: Path, name: object, where: object) -> Path:
     """Returns the path of a photo that a file in `folder` names, see `io.reading.inside`. where:
-    the place that errors name.
+    the place that errors name. Raises: CaptureError.
     """
     with reading(where, "path", CaptureError):
         return inside(folder, str(name), photo=True)
@@ -151,7 +154,9 @@ numbers = functools.partial(file_numbers, dtype=np.float32)
 def floats(
     value: Any, file: object, field: str, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "*shape"]:
-    """Returns finite float64 numbers, nested in any way, reshaped to `shape` in row-major order."""
+    """Returns finite float64 numbers, nested in any way, reshaped to `shape` in row-major order.
+    Raises: CaptureError for another count of numbers.
+    """
     array = file_numbers(value, file, field)
     if array.size != np.prod(shape):
         wanted = " x ".join(map(str, shape)) or "one"
@@ -162,8 +167,8 @@ def floats(
 def in_unit_range(
     array: Float[np.ndarray, "*shape"], file: object, field: str
 ) -> Float[np.ndarray, "*shape"]:
-    """Returns colors or coverage in [0, 1]. Values that overshoot by less than `COLOR_SLACK` are
-    clipped.
+    """Returns colors or coverage in [0, 1]. Values that overshoot by at most `COLOR_SLACK` are
+    clipped. Raises: CaptureError for values farther outside.
     """
     low, high = float(array.min()), float(array.max())
     if low < -COLOR_SLACK or high > 1 + COLOR_SLACK:
@@ -178,7 +183,9 @@ def in_unit_range(
 def checked_camera(
     K: np.ndarray, cam_from_world: np.ndarray, width: int, height: int, file: object, prefix: str
 ) -> Camera:
-    """Returns a camera whose pose is rigid and right-handed."""
+    """Returns the camera with these matrices, see `Camera.from_opencv`. Raises: CaptureError, for
+    example for a pose that is not rigid or not right-handed.
+    """
     try:
         return Camera.from_opencv(K, cam_from_world, width, height)
     except ValueError as error:
@@ -186,7 +193,9 @@ def checked_camera(
 
 
 def checked_frame(frame: Any, count: int, file: object, field: str) -> int:
-    """Returns the number of a pose, an integer from 0 to `count` - 1."""
+    """Returns the number of a pose, an integer from 0 to `count` - 1. Raises: CaptureError for
+    other values.
+    """
     if not 0 <= expect(frame, int, file, field) < count:
         raise CaptureError(
             file, field, f"expected 0 to {count - 1} (there are {count} poses), got {frame}"
@@ -208,8 +217,8 @@ def body_parameters(
     Float[np.ndarray, "m 3"],
     Float[np.ndarray, "n 3"] | None,
 ]:
-    """Returns betas, rotations, translations and displacement in float32, checked to have the sizes
-    that the body has.
+    """Returns betas, rotations, translations and displacement in float32, after checking that they
+    fit the body and are in range. betas are those of the body's first directions.
 
     Arguments: shape_names: see `shape_coefficients`. displacement: see `Capture`; None: there is
     none.
@@ -296,7 +305,9 @@ def shape_coefficients(
 
 
 def check_names(names: Sequence[str], count: int, file: object) -> None:
-    """Check the names of views: one for each view, all different, and safe as file names."""
+    """Check that views have one name each, that all names differ, and that they are safe as file
+    names. Raises: CaptureError.
+    """
     if len(names) != count or len(set(names)) < count:
         raise CaptureError(file, "names", f"expected {count} different names, got {list(names)}")
     for name in names:

@@ -1,9 +1,9 @@
 """Makes the exposure and the white balance of the photos of one person equal.
 
 Cameras that meter for themselves show one skin in several colors. A gain for each channel makes
-them agree. What two photos both show of the body should have one color in both. The gains are those
-that bring the medians of the ratios nearest to 1; their logarithms have the mean 0 over the photos.
-Where little is shared they stay near 1.
+them agree. A point of the body that two photos show should have one color in both. The gains bring
+the medians of the colors' ratios nearest to 1. The logarithms of the gains have the mean 0 over the
+photos. Gains of photos that share few points stay near 1.
 
 Photos of the front and of the back share no point of the body, nor do photos of the left and of the
 right side. Groups of photos that are linked by shared points are compared by the parts of the body:
@@ -94,7 +94,7 @@ def equalize_exposure(capture: Capture) -> Capture:
 
 def exposure_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
     """Returns the gains by which a rendered avatar gets the exposure of each camera, (v, 3): one
-    for each view and channel.
+    for each view and channel. They are 1 for views that do not show the person.
     """
     if capture.gains is not None:
         return 1 / capture.gains
@@ -110,7 +110,8 @@ def exposure_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
 def points_of(
     capture: Capture,
 ) -> tuple[Float[np.ndarray, "v n 3"], Bool[np.ndarray, "v n"]]:
-    """Returns the colors of the body's vertices in each photo, and which vertices it shows.
+    """Returns the colors of the body's vertices in each photo, (v, n, 3) in [0, 1], and which
+    vertices the photo shows, (v, n).
 
     capture: photos on white, with masks, all of which show the person.
     """
@@ -131,8 +132,8 @@ def _looks(capture: Capture) -> Iterator[tuple[Any, ...]]:
 
 
 def calls_of_exposure(capture: Capture) -> Iterator[Call]:
-    """Yields the program that finds the colors of the body in photos. The program does not depend
-    on where the body is.
+    """Yields the call that finds the colors of the body in the first photo. Its compiled program
+    does not depend on where the body is.
     """
     yield _seen_colors, next(_looks(capture))
 
@@ -229,8 +230,8 @@ def _known(
 
 
 def body_parts(body: BodyModel) -> Int[np.ndarray, " n"]:
-    """Returns the part of the body that each vertex moves with, an index into `PARTS`; -1 for none
-    of them.
+    """Returns the part of the body that each vertex moves with most, an index into `PARTS`; -1 if
+    it is none of these parts.
     """
     of_joint = [
         next((i for i, words in enumerate(PARTS) if any(word in name for word in words)), -1)
@@ -250,11 +251,12 @@ def gains_between(
     body's parts.
 
     Arguments:
-        colors: in [0, 1], equal within each group.
+        colors: in [0, 1], in equal exposure within each group.
         seen: which points each view shows.
         parts: the part of each point, see `body_parts`.
         groups: the group of each view, see `linked_views`.
-        frames: the frame of each view. Groups that share a frame are in one light.
+        frames: the frame of each view. If any two groups share a frame, all photos count as of one
+            light. Gains are then 1 if the white balances hardly differ.
     """
     count = int(groups.max()) + 1
     medians = part_colors(colors, seen, parts, groups)

@@ -56,7 +56,7 @@ class Reason:
     noun: str
     """The kind of the files, in the singular."""
     because: str
-    """The rest of the phrase, behind the kind."""
+    """The words that follow the kind, such as "beside photos"."""
 
 
 CLIP = Reason("video", "beside photos")
@@ -85,10 +85,10 @@ class FolderScan:
     folder: Path
     """The folder that was searched."""
     photos: tuple[Path, ...]
-    """The photos, in order."""
+    """The photos, sorted by path."""
     unused: tuple[Unused, ...] = ()
-    """The files that are not used, in order. Files that nobody takes for a photo or a video are not
-    among them.
+    """The files and folders that are not used, sorted by path. Files that nobody takes for a photo
+    or a video are not among them.
     """
     masks: tuple[Path, ...] = ()
     """The masks of the photos, where each photo has one in its folder. If only some photos have
@@ -99,8 +99,8 @@ class FolderScan:
 def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False) -> FolderScan:
     """Find the photos of a folder and its subfolders, and the files that are not used.
 
-    Arguments: skip: whether a subfolder holds something else than photos. Raises: CaptureError if
-    the folder cannot be read.
+    Arguments: skip: whether a subfolder holds something else than photos; it is then not searched.
+    A folder that does not exist has no photos. Raises: CaptureError if the folder cannot be read.
     """
     if not folder.is_dir():
         return FolderScan(folder, ())

@@ -48,12 +48,14 @@ class SourceFormat(Format):
         return self.about
 
     def fits(self, source: Any) -> bool:
-        """Returns whether a source, a file, is of this format."""
+        """Returns whether the content of a source, one file, is of this format. False for formats
+        whose files are read together.
+        """
         return not self.folder and imported(str(self.code).replace(":read", ":recognizes"))(source)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Returns the usual names of files, without those of folders."""
+        """Returns the usual names of files, without the folders before them."""
         return tuple(dict.fromkeys(Path(file).name for file in self.files))
 
 
@@ -91,7 +93,9 @@ class SourceFormats(Formats[F]):
         return None
 
     def of_name(self, file: Path) -> F | None:
-        """Returns the first format of several files to which the name of this one belongs."""
+        """Returns the first format that reads the files of a folder together and usually names one
+        of them like this file; None if there is none.
+        """
         named = (
             each
             for each in self.values()
@@ -100,8 +104,8 @@ class SourceFormats(Formats[F]):
         return next(named, None)
 
     def of_content(self, source: Any) -> F | None:
-        """Returns the first format whose reader recognizes a source, a file. Formats of its suffix
-        are tried before the others.
+        """Returns the first format that recognizes the content of a source, one file; None if there
+        is none. Formats of its suffix are tried before the others.
         """
         asked = sorted(
             self.values(), key=lambda each: source.path.suffix.lower() not in each.suffixes
@@ -265,7 +269,9 @@ class ArrayKeys:
     keys: tuple[str, ...]
     """A file that has all of these keys is of this format."""
     poses: dict[str, str]
-    """The key of the rotations of each part in `PLACES`; axis-angles or rotation matrices."""
+    """The key of the rotations of each part that files have, by the name of the part in `PLACES`.
+    The rotations are axis-angles or rotation matrices.
+    """
     moves: tuple[str, ...] = ("trans", "transl")
     """The keys of positions; the first one that a file has is used. For files without any see
     `stays`.
@@ -481,8 +487,8 @@ class DataSetFormat(Format):
 
 
 def _data_set(about: str, place: str, **options: bool) -> DataSetFormat:
-    """Returns a data set whose functions are open_NAME and find_NAME of a module. place:
-    "MODULE:NAME".
+    """Returns a data set that is read by the functions open_NAME and find_NAME of a module in
+    `data.datasets`. place: "MODULE:NAME". options: `lists` and `scans` of the format.
     """
     code, find = (
         f"humangs_jax.data.datasets.{place.replace(':', f':{do}_')}" for do in ("open", "find")

@@ -39,8 +39,8 @@ trunk are too thin for holes.
 AREA = 0.005
 """The least area of a hole, square metres."""
 EDGE = 0.01
-"""Metres inside the edge of the silhouette up to which a hole is extended that was found further
-inside.
+"""Holes that were found further inside are extended up to this distance inside the silhouette's
+edge, metres.
 """
 RIM = 0.03
 """Metres by which a hole is enlarged. The thing in front hides clothes as well, and the mask's edge
@@ -51,14 +51,15 @@ INTO_MASK = 0.008
 LOOSE = 0.04
 """Metres outside the silhouette up to which the mask may show clothes and hair."""
 NEARBY = 0.25
-"""Metres around a hole in which the mask may not show the person beside the body."""
+"""Metres around a hole in which the area of the person beside the body is measured, see `BESIDE`.
+"""
 BESIDE = 0.35
 """The largest area of the person beside the body near a hole, as a share of the area of the hole.
 With more, the hole is a part of the body that has another pose.
 """
 AGREES = 0.75
-"""The least share of the mask that lies on the body. With less, the body is not where the person
-is.
+"""The least share of the mask that lies on the body or within `LOOSE` of it. With less, the body is
+not where the person is.
 """
 SHOWN = 0.3
 """The least share of the body's silhouette that the mask shows. With less, most of the body would
@@ -103,8 +104,9 @@ def hidden_line(before: Capture, after: Capture) -> str | None:
 
 
 def hidden_parts(capture: Capture) -> Bool[np.ndarray, "v h w"] | None:
-    """Returns the pixels of each photo at which something is in front of the posed body and which
-    are not unknown already; None if nothing is found.
+    """Returns the pixels of each photo at which something is in front of the posed body, (v, h, w);
+    None if there are none, or no masks. Holes are not looked for in pixels that are unknown
+    already, but the rim around a hole may contain such pixels.
     """
     if capture.masks is None:
         return None

@@ -67,7 +67,9 @@ sector.
 OF_TEXTURE = 1.0
 """Colors also change more by this share of the change beside the edge."""
 SEEN_APART = 1.5
-"""Pixels within which an edge counts as the mask's."""
+"""The largest distance of a sector's edge from the place where the silhouette would move, in these
+units. Masks that are off by fewer pixels than this are not searched for an edge where they end.
+"""
 CLEAR = 1.3
 """Pixels within which a blurred edge ends."""
 THIN = 0.0007
@@ -102,8 +104,10 @@ def masks_at_edges(
     coverage in [0, 1].
 
     A mask is kept, with 0, if it is empty, full or a line, if it is off by less than `LEAST`, or if
-    its photo shows no background. It is also kept if the silhouette has an edge where the mask
-    ends, if its sectors do not agree, or if most views are right as they are.
+    its photo shows no background. It is also kept if too few sectors of the silhouette vote for the
+    move, in its view or in all views that are off in the same direction. So it is if fewer than
+    half of the views are off in this direction, or if these have many parts thinner than their
+    excess allows (`THIN`).
     """
     found = [_shift(image, mask) for image, mask in zip(images, masks, strict=True)]
     seen = [shift for shift in found if shift is not None]
@@ -340,8 +344,8 @@ def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 RIM_HEIGHT = 440
 """Lengths below are in units of the pixels of a person who is that many pixels high."""
 DEPTH = 2.0
-"""Pixels that are nearer to the edge than this are cleaned, by the mean colors further inside and
-further outside.
+"""Pixels outside the mask, and those inside that are nearer to its edge than this, are cleaned by
+the mean colors of pixels at least this far inside and this far outside.
 """
 SPREAD = 1.5
 """Standard deviation of the Gaussian that weights these means, pixels."""
@@ -389,7 +393,7 @@ def clean_rims(
 
 def _depth(inside: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Returns the distance of each pixel's centre to the edge of the mask, pixels, negative
-    outside. The border of the photo is no edge.
+    outside. The border of the photo does not count as an edge.
     """
 
     def of(part):

@@ -1,9 +1,9 @@
 """The photos of a capture folder: capture.json, then images, masks and cameras, and the frame that
 each view shows.
 
-No body is needed for these: it is what `humangs import cameras` writes and `humangs fit` finds the
-body for. Every fault is a `CaptureError`, one line with file and field. docs/capture_format.md
-describes the format.
+No body is needed to read them. `humangs import cameras` writes such a folder without a body, and
+`humangs fit` adds the body. Every fault is a `CaptureError`, one line with file and field.
+docs/capture_format.md describes the format.
 """
 
 import contextlib
@@ -110,8 +110,8 @@ def load_photos(path: str | Path, *, fit_masks: bool = False) -> Photos:
 
 
 def capture_folder(path: str | Path) -> Path:
-    """Returns the path as a folder. "demo_capture" means the capture that comes with the package,
-    unless there is a folder of that name.
+    """Returns the path as a folder. A path that begins with "demo_capture" means the capture that
+    comes with the package, unless the path exists.
     """
     folder = Path(path)
     if not folder.exists() and folder.parts[:1] == (DEMO_CAPTURE,):
@@ -124,9 +124,10 @@ def capture_folder(path: str | Path) -> Path:
 
 
 def read_description(file: Path) -> dict[str, Any]:
-    """Read capture.json, and check all of its keys and types, except the matrices.
+    """Read capture.json, and check its keys and the types of its values. The frames and matrices of
+    the views are not checked.
 
-    The paths in it must stay inside the folder.
+    The paths in it must stay inside the folder. Raises: CaptureError.
     """
     description = checked_json(
         file, missing="no such file: a capture is a folder with a capture.json"
@@ -241,9 +242,10 @@ def read_frames_and_matrices(
     views: Sequence[dict[str, Any]], poses: int, file: Path
 ) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "v 3 3"], Float[np.ndarray, "v 4 4"]]:
     """Returns the frame of each view of a description, and the matrices K and cam_from_world as
-    they are written.
+    they are in the file.
 
-    poses: the number of frames. A view may leave its frame out if there is one frame.
+    poses: the number of frames. A view may leave its frame out if there is one frame. Raises:
+    CaptureError.
     """
     frames, matrices = [], []
     for i, view in enumerate(views):
@@ -344,7 +346,7 @@ def _read_unknown(
     folder: Path, views: Sequence[dict[str, Any]], size: tuple[int, int]
 ) -> Bool[np.ndarray, "v h w"] | None:
     """Read where something in front may hide the person in each photo. Returns None if no view
-    names such an image, or all of these images are black.
+    names such an image, or if no pixel in these images reaches `LEAST_UNKNOWN`.
     """
     unknown = np.zeros((len(views), *size), bool)
     for i, view in enumerate(views):
@@ -390,11 +392,11 @@ def _check_orientations(
 
 
 def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) -> None:
-    """Raise CaptureError if the photos of a description need more than the limits allow, before
-    they are read.
+    """Raise CaptureError if a description has more or larger photos than the limits allow, or has
+    one photo in too many views. No pixels are read.
 
-    together: whether all photos are to be in memory at one time. Then only the size of the first
-    one is looked at, since all must have it.
+    together: whether all photos will be in memory at one time. Only then are their number and size
+    checked; the size is that of the first photo, since all must have it.
     """
     file = folder / "capture.json"
     check_repeats(file, [folder / view["image"] for view in views])
@@ -425,7 +427,12 @@ def check_repeats(file: Path, photos: Sequence[Path]) -> None:
 def _read_images(
     folder: Path, views: Sequence[dict[str, Any]], on_white: bool, fit_masks: bool
 ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
-    """Read the images, and the masks or None, of all views, which must have one size."""
+    """Read the images of all views, on white where there are masks, and the masks. All must have
+    one size. The second result is None if there are no masks, or only opaque alpha channels.
+
+    on_white: whether images that have a mask file are on white already. fit_masks: see
+    `read_photos`. Raises: CaptureError.
+    """
     images, masks, searched = None, None, []
     for i, view in enumerate(views):
         image, mask, on_background = read_view(folder, view, on_white)
@@ -479,8 +486,9 @@ def read_view(
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, bool]:
     """Read the image and the mask (or None) of a view.
 
-    The third result is whether the image still has its background although there is a mask; else
-    the image is on white, or there is no mask.
+    The third result is True if there is a mask and the image still shows its background. It is
+    False if the image is on white, or if there is no mask. on_white: whether images that have a
+    mask file are on white already.
     """
     image, alpha = read_checked(read_image, folder / view["image"])
     if alpha is not None:
@@ -544,8 +552,9 @@ def cut_out(
 
 
 def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:
-    """Returns file names without folder and suffix, made of letters, digits, '.', '_' and '-'.
-    Names that would be ambiguous contain their folders.
+    """Returns a unique name for each path, made of letters, digits, '.', '_' and '-'. It is the
+    file name without suffix. If two of these are equal, all names contain their folders, and if two
+    are still equal, all begin with their numbers.
     """
 
     def plain(name, i):

@@ -47,20 +47,23 @@ class PreparedCapture:
     up: str
     """The axis that points up in the world of `given`: "y", "z", "-z" and the like."""
     chosen: bool = False
-    """Whether further views were left out because they add little to what the others show."""
+    """Whether only some of the views that show the person are used, see `select`."""
     body: BodyModel | None = None
     """The body that carries the Gaussians, with a skirt where the photos show one.
 
     None: prepared without a network, as `refine` needs it.
     """
     displacement: Float[np.ndarray, "n 3"] | None = None
-    """How far the vertices of the shaped `body` move in the T-pose, (n, 3), metres. None: no mask
-    says anything, or the network does not allow it.
+    """The displacements of the vertices of the shaped `body` in the T-pose, (n, 3), metres. None:
+    the capture has neither masks nor a displacement, the network does not allow it, or there is no
+    body.
     """
     skirt: bool = False
     """Whether `body` has a skirt, whose vertices are its last."""
     network: tuple[Any, ...] | None = None
-    """All of the network's configuration that `body` and `displacement` depend on."""
+    """All of the network's configuration that `body` and `displacement` depend on. None: there is
+    no body.
+    """
 
     __repr__ = short_repr
 
@@ -92,7 +95,9 @@ class PreparedCapture:
         return PreparedCapture(self.given, smaller, self.left_out, self.up, self.chosen)
 
     def with_body(self, config: HumanGSConfig) -> "PreparedCapture":
-        """Returns the capture with the body that carries the Gaussians of a network."""
+        """Returns the capture with the body that carries the Gaussians of a network, and its
+        displacement.
+        """
         capture = self.capture
         body = gaussian_body(capture.body, config)
         moved, skirted = None, None
@@ -126,20 +131,22 @@ def prepare_capture(
 ) -> PreparedCapture:
     """Decide which photos are used and how, once for `reconstruct`, `refine` and `check`.
 
-    What is prepared is not prepared again: a `PreparedCapture` is returned as it is, or with the
-    body for `config` if it was prepared for another network or for none.
+    What is prepared is not prepared again. A `PreparedCapture` loses views if `views` asks for
+    fewer, and gets the body for `config` if it was prepared for another network or for none.
+    Otherwise it is returned as it is.
 
     Args:
         capture: photos, cameras, poses, and masks if there are some.
         config: of the network that will read the photos; None leaves the body alone.
-        views: how many photos are used at most, those that show the body best; "auto": as many as
-            add to what the others show. None: all.
+        views: the most photos that are used; those that together show the body best are chosen.
+            "auto": as many as add to what the others show. None: all.
 
     Returns:
         The prepared capture.
 
     Raises:
-        CaptureError: one line that names the views, if none shows the person.
+        CaptureError: one line that names the views, if none shows the person. ValueError: for
+            `views` below 1.
 
     Examples:
         >>> variables, config = hg.load_weights()
@@ -181,7 +188,7 @@ def prepare_capture(
 
 def allows_vertex_offsets(config: HumanGSConfig) -> bool:
     """Returns whether the body may be displaced and get a skirt. It may if the network looks at the
-    person's pixels alone.
+    person's pixels alone and `runtime.displacement` is not False.
     """
     return config.runtime.displacement is not False and config.conventions.pixels == "person"
 

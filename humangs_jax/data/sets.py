@@ -73,7 +73,7 @@ def begin_set(
 
     Arguments: made_with: what the whole set is made with; its entry `SETTINGS` is a dictionary.
     alone: whether a new set needs an empty folder. Raises: CaptureError for a set that was made
-    with something else; ValueError.
+    with something else; ValueError if `alone` and the folder of a new set is not empty.
     """
     if not (folder / MANIFEST).is_file():
         if (
@@ -151,13 +151,14 @@ def made(
     workers: int,
     load: Callable[[], object],
 ) -> Iterator[tuple[K, Exception | None]]:
-    """Run tasks in parallel. Yields the name of each task as it ends, with None or the error that
-    it raised. An OSError ends all tasks, because the disk may be full.
+    """Run tasks in parallel. Yields the name of each task as it ends, with None or the ValueError,
+    ArithmeticError or LookupError that it raised. Any other error ends all tasks, such as an
+    OSError of a full disk.
 
     Arguments: work: called as work(what `load` has returned, *arguments of the task). tasks: the
     arguments by name. workers: the number of processes, which use the CPU; `load` is called once in
-    each. All of it is pickled, and the calling script has to be guarded by `if __name__ ==
-    "__main__"`.
+    each. With several processes all arguments are pickled, and the calling script has to be guarded
+    by `if __name__ == "__main__"`.
     """
     once = functools.partial(_attempt, work)
     if workers > 1 and len(tasks) > 1:

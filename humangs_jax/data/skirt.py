@@ -66,7 +66,9 @@ skirts from wide trousers, which look worse with a skirt.
 CLEAR = 0.06
 """Metres by which such a point is beside both legs."""
 LONG_CLEAR = 0.1
-"""The same distance where no photo shows the legs apart below the hem, metres."""
+"""Metres by which such a point is beside both legs if no photo shows the legs apart below the hem.
+It takes the place of `CLEAR`.
+"""
 REACH = OffsetFitConfig(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)
 HELD = 1e4
 """Weight of no displacement of the body's vertices in the fit of the skirt."""
@@ -75,8 +77,8 @@ HELD = 1e4
 def add_skirt(
     body: BodyModel, capture: Capture, displacement: Float[np.ndarray, "n 3"]
 ) -> tuple[BodyModel, Float[np.ndarray, "m 3"]] | None:
-    """Returns the body with a skirt, and the displacement of the vertices of both, metres; None if
-    the photos show no skirt.
+    """Returns the body with a skirt, and the displacement of all its vertices, metres; None if the
+    photos show no skirt, or if the body has a map of its surface.
 
     Arguments: body: one of `data.views.gaussian_body`; its vertices come first in the result.
     capture: has masks. displacement: of the vertices of `body`, metres.
@@ -109,8 +111,8 @@ def add_skirt(
 
 
 def find_hem(body: BodyModel, capture: Capture) -> float | None:
-    """Returns how far down the legs the photos show a skirt, from `TOP` to `BOTTOM`; None if they
-    show none.
+    """Returns the height down to which the photos show a skirt, in the measure of `TOP`, from `TOP`
+    to `BOTTOM`; None if they show no skirt.
     """
     legs = _legs(body)
     if legs is None or capture.masks is None:
@@ -164,8 +166,8 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
 
 
 def with_tube(body: BodyModel, hem: float) -> BodyModel:
-    """Returns the body with the vertices of a tube around its legs, from `TOP` down to `hem`,
-    behind its own vertices.
+    """Returns the body with a tube around its legs, from `TOP` down to `hem`. The tube's vertices
+    come after those of the body.
 
     Raises: ValueError if the body has no legs that hang in the T-pose.
     """
@@ -220,8 +222,8 @@ def _legs(body: BodyModel) -> Int[np.ndarray, "2 3"] | None:
 def _along(
     joints: Float[np.ndarray, "j 3"], legs: Int[np.ndarray, "2 3"], levels: Float[np.ndarray, " r"]
 ) -> Float[np.ndarray, "2 r 3"]:
-    """Returns the points on the lines from hip to knee to ankle at some heights, in the measure of
-    `TOP`, (2, r, 3).
+    """Returns the points on the line from hip to knee to ankle of each leg, (2, r, 3), metres.
+    levels: their heights, in the measure of `TOP`.
     """
     lines = np.zeros((len(legs), len(levels), 3))
     for side, leg in enumerate(legs):
@@ -237,7 +239,9 @@ def _radii(
     legs: Int[np.ndarray, "2 3"],
     levels: Float[np.ndarray, " r"],
 ) -> Float[np.ndarray, "2 r"]:
-    """Returns the mean distance of the skin of each leg from the lines of `_along`, metres."""
+    """Returns the mean horizontal distance of the skin of each leg from its line, (2, r), metres.
+    Each vertex counts at the nearest of the heights, see `_along`.
+    """
     lines = _along(joints, legs, levels)
     radii = np.zeros(lines.shape[:2])
     for side, leg in enumerate(legs):

@@ -32,7 +32,7 @@ KEYS_SHOWN = 6
 
 
 def binary_kind(file: Path) -> str | None:
-    """Returns in words what kind of file has no text; None for a file of text."""
+    """Returns the kind of a binary file in words; None for a file of text."""
     with open_file(file) as opened:
         head = opened.read(HEAD)
     known = (kind for start, kind in BINARIES.items() if head.startswith(start))
@@ -41,9 +41,7 @@ def binary_kind(file: Path) -> str | None:
 
 
 def described(text: str) -> str:
-    """Returns in words what a text that is no calibration seems to be; nothing for an empty
-    text.
-    """
+    """Returns in words what a text that is no calibration seems to be; "" for an empty text."""
     if not text.strip():
         return ""
     keys = KEY.findall(text.replace("{", "\n").replace(",", "\n"))

@@ -33,7 +33,9 @@ STEP = 0.0025
 WEAKNESS = 0.002
 """Weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette."""
 HELD = 20.0
-"""Weight of no displacement for vertices of hands and head."""
+"""Weight of no displacement for vertices of hands and head, times the share of their skinning
+weights that belongs to these parts.
+"""
 HELD_JOINTS = ("head", "jaw", "eye", "wrist", "index", "middle", "pinky", "ring", "thumb")
 NEAR = 2.5
 """Pixels. A vertex may be on the body's silhouette if it is no farther from the silhouette's
@@ -55,17 +57,17 @@ contain them by the inset.
 WRAP_ROUNDS = 6
 """How often the moves of the last step are averaged over the neighbours."""
 OUTSIDE = 0.01
-"""Metres outside of a mask from which on a vertex counts as outside."""
+"""A vertex is outside of a mask if it is farther outside than this, metres."""
 MISFIT = 0.025
-"""A body does not fit its masks if more than this share of its vertices (no head, no hands) lies
+"""A body does not fit its masks if at least this share of its vertices (no head, no hands) lies
 more than OUTSIDE outside of a mask. Clothes never cause that: of true bodies the share is 0. It was
 at least 0.03 for bodies that are a centimetre off, 0.02 to 0.06 for a real man fitted to keypoints
 alone, and at most 0.02 for his fits refined by the masks.
 """
 LONGEST = 480
-"""Pixels of the window around the person in which silhouettes are compared."""
+"""The longest side of the window around the person in which silhouettes are compared, pixels."""
 MARGIN = 0.12
-"""The room around the person, as a share of its height."""
+"""The room on each side of the person, as a share of the longer side of the person's box."""
 
 
 Points = Float[np.ndarray, "n 3"]
@@ -125,8 +127,9 @@ class MaskedView:
     def seen(
         self, points: Float[np.ndarray, "*n 3"], index: np.ndarray | slice = slice(None)
     ) -> tuple:
-        """Projects points of the rest pose. Returns their pixels (*n, 2), the pixels per metre
-        there, and which points the photo shows.
+        """Projects points of the rest pose. Returns their pixels (*n, 2), the pixels per metre at
+        each point (*n), and which points the photo shows (*n). index: the vertices whose transforms
+        move the points.
         """
         posed = np.einsum("nab,n...b->n...a", self.linear[index], points)
         posed += self.offset[index].reshape(len(posed), *[1] * (points.ndim - 2), 3)
@@ -146,8 +149,8 @@ def fit_vertex_offsets(
     *,
     always: bool = True,
 ) -> Float[np.ndarray, "n 3"]:
-    """Returns how far the vertices of a person's shaped body move in the T-pose to fill the masks,
-    metres. Moves are bounded.
+    """Returns the displacements of the vertices of a person's shaped body in the T-pose that fill
+    the masks, (n, 3), metres. Their lengths are bounded.
 
     Arguments: body: the capture's body, or one of `data.views.gaussian_body`. capture: has masks;
     frames and worlds may be any. inset: the least and the most that the surface may lie inside the
@@ -179,8 +182,8 @@ def fit_vertex_offsets(
 def to_edges(
     views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: OffsetFitConfig
 ) -> Points:
-    """Returns how far the vertices of a surface in the T-pose move along its normals to the masks'
-    edges, metres. The moves are smooth.
+    """Returns the displacements of the vertices of a surface in the T-pose along its normals to the
+    masks' edges, (n, 3), metres. They are smooth.
 
     held: the weight of no displacement of each vertex, beside 1 for each photo that shows it on the
     silhouette.
@@ -194,8 +197,9 @@ def to_edges(
 
 
 def masked_views(body: BodyModel, rest: Points, capture: Capture) -> list[MaskedView]:
-    """Returns the views of a capture whose masks are not empty, cut to the person. rest: the
-    vertices of the body in the T-pose, metres.
+    """Returns the views of a capture whose masks are not empty, cut to the person. Views whose body
+    has numbers that are not finite are left out. rest: the vertices of the body in the T-pose,
+    metres.
     """
     assert capture.masks is not None
     joints = np.asarray(body.joint_regressor, float) @ rest
@@ -284,7 +288,8 @@ def _targets(
     views: list[MaskedView], rest: Points, normals: Points, faces: Faces, how: OffsetFitConfig
 ) -> tuple[PerVertex, PerVertex]:
     """Returns for each vertex the number of photos that show it on the silhouette, and the sum of
-    its distances to the edges of the masks there, metres.
+    the moves that these photos ask for, metres. A photo asks for the move after which the surface
+    is as far inside the mask's edge as `how.inset` allows.
     """
     count, summed = np.zeros(len(rest)), np.zeros(len(rest))
     reach = np.arange(-how.inwards, how.outwards + STEP / 2, STEP)
@@ -308,8 +313,12 @@ def _targets(
 def _crossing(
     depths: Float[np.ndarray, "e r"], reach: Float[np.ndarray, " r"]
 ) -> tuple[Float[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
-    """Returns where the mask ends along each normal. It is the crossing nearest to the start:
-    outwards from a start inside the mask, inwards from one outside.
+    """Returns how far along each normal the edge of a silhouette is, metres, and whether it was
+    found. It is the edge nearest to the start: outwards from a start inside, inwards from a start
+    outside.
+
+    depths: signed distances to the edge at the places `reach` along each normal, positive inside;
+    NaN where the photo shows nothing. reach: metres.
     """
     zero = int(np.argmin(np.abs(reach)))
     distance, found = np.zeros(len(depths)), np.zeros(len(depths), bool)
@@ -397,7 +406,8 @@ def _outside(
     inset: tuple[float, float],
     free: Bool[np.ndarray, " n"],
 ) -> PerVertex:
-    """Returns how far each vertex moves inwards until all masks contain it, metres. The moves are
+    """Returns how far each vertex moves inwards so that all masks contain it, metres. Only free
+    vertices outside of a mask, and vertices near them, move, by at most `WRAP`. The moves are
     smooth over the mesh.
     """
     reach = np.arange(0, WRAP + STEP / 2, STEP)

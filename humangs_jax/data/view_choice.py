@@ -25,13 +25,13 @@ It counts only if no number of photos is given.
 
 
 def best_views(capture: Capture, count: int | None) -> list[int]:
-    """Returns the numbers of `count` photos, in ascending order, that together show the body best;
-    those of all photos if there are no more.
+    """Returns the numbers of the `count` photos that together show the body best, in ascending
+    order. If there are no more than `count`, all are returned.
 
-    Greedy: each next photo adds most to the sum, over the vertices, of area times the best
-    `view_quality`. The sum is submodular, so the choice reaches at least 63 % of the best one
-    (Nemhauser, Wolsey, Fisher 1978, https://doi.org/10.1007/BF01588971). What a photo shows outside
-    its mask does not count.
+    The choice is greedy: each further photo is the one that adds most to the sum, over the
+    vertices, of area times the best `view_quality`. The sum is submodular, so the choice reaches at
+    least 63 % of the best one (Nemhauser, Wolsey, Fisher 1978, https://doi.org/10.1007/BF01588971).
+    What a photo shows outside its mask does not count.
 
     Arguments:
         capture: photos that all show the person.
@@ -54,8 +54,9 @@ def best_views(capture: Capture, count: int | None) -> list[int]:
 
 
 def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0.0) -> list[int]:
-    """Returns rows of a matrix, one after the other. Each raises the sum of the columns' maxima
-    most. It stops before a row that raises the sum by less than the share `least`.
+    """Returns the numbers of at most `count` rows of a matrix, in the order of their choice. Each
+    next row raises the sum of the columns' maxima most. The choice stops before a row that raises
+    the sum by less than the share `least`.
     """
     chosen, best = list[int](), np.zeros(quality.shape[1])
     for _ in range(min(count, len(quality))):
@@ -72,8 +73,9 @@ def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0
 def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
     """Returns how well every view shows every vertex, in [0, 1].
 
-    This is the cosine between normal and line of sight, times the pixels per metre as a share of
-    the most of all views. It is 0 where the vertex is hidden or outside of the mask.
+    This is the cosine between normal and line of sight times the pixels per metre, divided by the
+    largest such product of all views and vertices. It is 0 where the vertex is hidden or outside of
+    the mask.
     """
     config = presets.small().with_conventions(pixels="person")
     inputs = prepare_inputs(body, views, config)

@@ -60,8 +60,8 @@ class SubjectViews:
     betas: Float[Array, " s"]
     """Shape coefficients, (s,)."""
     view_count: Int[Array, ""] | None = None
-    """The number of views; those after them are padding (see `pad_views`). None: there is no
-    padding.
+    """The number of views that are not padding. The views after these are padding, see `pad_views`.
+    None: there is no padding.
     """
     depths: Float[Array, "v h w"] | None = None
     """The mean z of the person in each pixel where the mask is not 0, (v, h, w), metres; 0: unknown
@@ -78,8 +78,8 @@ class SubjectViews:
 
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
-    """Returns `count` views: the given ones, then copies of the last one, which are ignored.
-    Subjects with fewer views can thus share a batch.
+    """Returns `count` views: the given ones, then copies of the last one as padding. Subjects with
+    different numbers of views can thus share a batch. `depths` and `unknown` are not padded.
 
     Raises: ValueError if there are no views, or more than `count`.
     """
@@ -96,12 +96,13 @@ def pad_views(views: SubjectViews, count: int) -> SubjectViews:
 
 @checked_arguments
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
-    """Returns the body whose vertices carry the Gaussians. It is decimated, then long edges are
-    split, as the weights need it. It has a map of its surface if the network works on one.
+    """Returns the body whose vertices carry the Gaussians. As the weights need it, it is decimated,
+    and then its long edges are split. It has a map of its surface if the network works on one.
 
     Its `relative_vertex_spacing` is relative to the mesh that the weights were trained with: 1
     unless `runtime.max_edge_length` asks for more vertices or `runtime.body_vertices` for fewer.
-    The last four results are kept: making one takes as long as a small network does on a CPU.
+    The last four results are kept, because making one takes as long as a small network does on a
+    CPU. A body that `has_mesh_of` accepts is returned as it is.
 
     Raises: ValueError if `runtime` has both.
     """
@@ -285,7 +286,8 @@ CROP_MARGIN = 0.04
 def _crop_boxes(masks: Float[np.ndarray, "v h w"] | None) -> list[tuple[int, int, int]] | None:
     """Returns the square (left, top, side) around the person in each mask, pixels.
 
-    Returns None if there are no masks, if one is empty, or if no square is smaller than its photo.
+    Returns None if there are no masks, if one is empty, or if no square has a side below the longer
+    side of the photos.
     """
     if masks is None:
         return None
@@ -303,8 +305,9 @@ def _crop_boxes(masks: Float[np.ndarray, "v h w"] | None) -> list[tuple[int, int
 
 def cropped(capture: Capture, size: int) -> Capture:
     """Returns the capture with each photo cut to a square around the person in its mask, and
-    resized to `size` pixels. Returns the capture as it is where `_crop_boxes` finds no such
-    squares.
+    resized to `size` pixels. Pixels beyond a photo's edges become unknown if the person touches the
+    edge of a photo, or if the capture has unknown pixels. Returns the capture as it is if
+    `_crop_boxes` finds no such squares.
     """
     boxes = _crop_boxes(capture.masks)
     if boxes is None or capture.masks is None:
@@ -356,7 +359,9 @@ def _squares(
 def _window(
     image: Float[np.ndarray, "h w *c"], left: int, top: int, side: int, fill: float
 ) -> Float[np.ndarray, "side side *c"]:
-    """Returns a square of an image; pixels beyond the image get the value `fill`."""
+    """Returns a square of an image, float32. Pixels beyond the image get the value `fill`. left,
+    top, side: the place and the side of the square, pixels.
+    """
     height, width = image.shape[:2]
     window = np.full((side, side, *image.shape[2:]), fill, np.float32)
     rows = slice(max(top, 0), min(top + side, height))
@@ -416,7 +421,7 @@ def to_network_views(
     displacement: Float[np.ndarray, "n 3"] | None = None,
 ) -> SubjectViews:
     """Returns a capture's photos in the form that the network takes: padded with white to a centred
-    square and resized to `size` pixels.
+    square, or cropped, and resized to `size` pixels. Unknown pixels are not passed on.
 
     Camera matrices follow the pixels. Without masks only what the posed body covers will count as
     foreground. crop: whether photos are cut to the person where that is less than the photo, see

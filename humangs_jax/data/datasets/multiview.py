@@ -87,7 +87,7 @@ PARAMETERS = "smpl_params.npz"
 MISSING = "missing_img_files.txt"
 """File that lists images that are missing."""
 ON_PERSON = 128.5 / 255
-"""The least mask value, in [0, 1], of a pixel on the person: bytes above 128."""
+"""A pixel whose mask value, in [0, 1], is above this is on the person: bytes above 128."""
 PHOTO = re.compile(r"(?:[\w-]+_(?:rgb|mask))?(\d+)\.\w+")
 """Matches the file names of photos and masks, those of ActorsHQ included; the group is the frame.
 """
@@ -147,8 +147,8 @@ def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
 
 
 def _checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
-    """Returns the cameras after checking them: sizes are known, poses are rigid, the camera is no
-    farther than `FARTHEST` from the origin, and its name can be the name of a folder.
+    """Returns the cameras after checking that each has a size, valid matrices, a name that can be
+    the name of a folder, and a distance of at most `FARTHEST` from the origin.
 
     Raises: CaptureError naming the camera.
     """
@@ -180,8 +180,9 @@ def _checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
 
 
 def numbered(folder: Path) -> dict[int, Path]:
-    """Returns the photos of a folder by frame. The name of a photo is the number of its frame,
-    perhaps behind NAME_rgb or NAME_mask. Empty if the folder does not exist.
+    """Returns the paths of the photos in a folder, by frame. The name of a photo is the number of
+    its frame, perhaps after NAME_rgb or NAME_mask. The result is empty if the folder does not
+    exist.
     """
     listed = ()
     if folder.is_dir():
@@ -195,7 +196,7 @@ def _read_missing(file: Path) -> set[tuple[str, int]]:
     """Read the (camera, frame) pairs of the photos that the authors list as missing. Paths may have
     slashes or backslashes.
 
-    Returns an empty set if there is no such file.
+    Returns an empty set if there is no such file. Raises: CaptureError naming the line.
     """
     if not file.is_file():
         return set()
@@ -221,13 +222,13 @@ def _video_subject(
     listed: Set[tuple[str, int]] = frozenset(),
     digits: int = 8,
 ) -> Subject:
-    """Returns a subject with the photos that have both a mask and a pose, ordered by frame, then by
-    camera.
+    """Returns a subject with the photos that have both a mask and a pose and are not in `listed`,
+    ordered by frame, then by camera.
 
     photos, masks: for each camera a mapping from frame to whatever `read` takes. read: called with
     a photo and its mask; returns the image on white and the mask as 0 and 1. listed: the (camera,
-    frame) pairs known to be missing. digits: the digits of the frame in the name of a view. Raises:
-    CaptureError if there is no photo.
+    frame) pairs that the authors list as missing. digits: the digits of the frame in the name of a
+    view. Raises: CaptureError if there is no photo.
     """
     count = len(parameters.translations)
     missing = {"listed as missing": 0, "no photo": 0, "no mask": 0, "no pose": 0}
@@ -381,13 +382,13 @@ find_avatarrex, open_avatarrex = (
 CALIBRATION = "calibration.csv"
 """File with the cameras of one size of images."""
 SCALES = ("4x", "2x", "1x")
-"""Folders of images, those of the smallest images first."""
+"""The folders of images of one size, smallest images first."""
 COLUMNS = ["w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"]
 
 
 def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
-    """Returns the sequences in a folder of one actor or of several, sorted; the folder itself if it
-    is a sequence; empty if there are none.
+    """Returns the sequences in a folder of one actor or of several actors, sorted. If the folder is
+    a sequence, it is the only result. If there are no sequences, the result is empty.
     """
     return _subfolders(
         folder,
@@ -466,9 +467,7 @@ GROUPS = ("Camera_5mp", "Camera_12mp")
 
 
 def find_dna_rendering(folder: str | Path) -> tuple[Path, ...]:
-    """Returns the main files of a folder that has main/ and annotations/, sorted; empty if there
-    are none.
-    """
+    """Returns the .smc files in the folder main/ of a folder, sorted; empty if there are none."""
     return tuple(sorted(visible(Path(folder).glob("main/*.smc"))))
 
 

@@ -74,7 +74,9 @@ class SceneFrame(NamedTuple):
 
 
 def find_scene_list(path: str | Path) -> tuple[Path, ...]:
-    """Returns the path if it is a list of scenes or a folder that holds one; else nothing."""
+    """Returns the path, as a tuple of one, if it is a .json file or a folder with a train.json or
+    test.json; else an empty tuple. The file is not read.
+    """
     path = Path(path)
     found = (path.is_file() and path.suffix == ".json") or any(
         (path / name).is_file() for name in LISTS
@@ -93,8 +95,8 @@ def _list_of(path: str | Path) -> Path:
 
 
 def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
-    """Read the scenes of a list by name, as they stand in the list. path: the JSON file, or a
-    folder (train.json, else test.json).
+    """Returns the JSON objects of the scenes of a list, by name. Only the names are checked. path:
+    the JSON file, or a folder (train.json, else test.json).
 
     Raises: CaptureError naming file and key.
     """
@@ -118,7 +120,8 @@ def open_scene_list(
     path: str | Path, body: FileBody, size: int | None = None
 ) -> tuple[Person, ...]:
     """Returns the people of a list. Each is opened when it is first asked for. size: the side of
-    the stored squares, pixels; None: that of the images.
+    the stored squares, pixels. None: the longer side of the first scene's image that exists, or
+    `STORED_SIZE` if no scene's first image exists.
 
     Raises: CaptureError if the list cannot be read.
     """
@@ -145,7 +148,8 @@ def open_scene_list(
 
 
 def _open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) -> Subject:
-    """Open one scene of a list, in metres. Images that do not exist are left out and counted.
+    """Open one scene of a list, in metres. Views whose image or arrays do not exist are left out
+    and counted.
 
     Raises: CaptureError.
     """
@@ -268,7 +272,9 @@ def _not_white(image: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
 def scene_entry(
     name: str, mesh_transform: Float[np.ndarray, "4 4"], frames: Sequence[SceneFrame]
 ) -> dict[str, Any]:
-    """Returns a scene as it stands in a list."""
+    """Returns the JSON object of a scene, for train.json or test.json. Numbers are rounded to
+    `SIGNIFICANT` digits.
+    """
     return {
         "scene_name": name,
         "mesh_transform": rounded(mesh_transform),
@@ -303,7 +309,9 @@ def write_arrays(
     faces: np.ndarray,
     joint_transforms: Float[np.ndarray, "j 4 4"],
 ) -> None:
-    """Write the npz of a frame."""
+    """Write the npz of a frame. posed, rest: the vertices, written as v_posed and v_cano. All
+    lengths are in units of the scene.
+    """
     arrays = {"v_posed": posed, "v_cano": rest, "joint_transforms": joint_transforms}
     write_npz(
         path,
@@ -313,7 +321,8 @@ def write_arrays(
 
 
 def read_evaluation(path: str | Path) -> dict[str, dict[str, list[int]]]:
-    """Read the context and target views of each scene.
+    """Returns the numbers of the context and target views of each scene, by its name, from an
+    evaluation_N.json.
 
     Raises: CaptureError naming file and key.
     """

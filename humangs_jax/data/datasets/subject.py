@@ -30,15 +30,17 @@ from humangs_jax.io import arrays as array_files
 from humangs_jax.io.images import resized, to_uint8
 
 LARGEST_ANGLE = 4 * np.pi
-"""The largest angle of a rotation vector, radians. Fits go beyond 2 pi now and then; degrees are
-far above.
+"""The largest magnitude of a component of a rotation vector, radians. Fits go beyond 2 pi now and
+then; degrees are far above.
 """
 FARTHEST = 100.0
-"""The largest distance of a translation or a camera from the origin, metres. Millimetres are far
-above.
+"""The largest distance of a camera from the origin, and the largest magnitude of a component of a
+translation, metres. Millimetres are far above.
 """
 LARGEST_COEFFICIENT = 30.0
-"""The largest coefficient of shape and expression, standard deviations; usually below 5."""
+"""The largest magnitude of a coefficient of shape or expression, standard deviations. It is usually
+below 5.
+"""
 
 open_arrays = functools.partial(array_files.ArrayFile.open, error=CaptureError)
 checked_numbers = functools.partial(file_numbers, some=True)
@@ -88,7 +90,7 @@ class FileBody:
     def arrays(
         self,
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 s"], Float[np.ndarray, "j n"]]:
-        """The template, the shape directions and the joint regressor, float64."""
+        """The template in metres, the shape directions and the joint regressor, float64."""
         model = self.model
         template = model.template
         directions = model.shape_directions
@@ -209,7 +211,8 @@ def recover_shape(
     """Returns the scale and the shape coefficients of a T-pose `v_cano`, by least squares: rest =
     scale (template + directions betas).
 
-    If the fit of all vertices fails, the hands are left out, which the release bends by accident.
+    rest: the vertices of the T-pose, (n, 3). The release bends the hands by accident, so they are
+    left out if the fit of all vertices fails.
     Raises: CaptureError if the arrays are not of this body.
     """
     template = body.arrays[0]
@@ -260,8 +263,9 @@ def recover_pose(
     transforms: Float[np.ndarray, "j 4 4"],
     file: object,
 ) -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "3"]]:
-    """Returns the rotations (radians) and the translation (metres) of a person from
-    `joint_transforms`, which take the scaled T-pose to the pose.
+    """Returns the rotations (axis-angle, radians) and the translation (metres) of a person.
+    transforms: the `joint_transforms` of a file, which take the T-pose to the pose, both scaled by
+    `scale`.
 
     Raises: CaptureError if the linear part of a transform is no rotation.
     """

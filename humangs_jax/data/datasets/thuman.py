@@ -66,8 +66,8 @@ class Fit:
     parameters: BodyParameters
     """The parameters of the one pose."""
     scale: float
-    """Scan units per metre: a vertex V of the posed body (translation included) lies at V scale in
-    the scan.
+    """Scan units per metre. A vertex V of the posed body in metres, translation included, lies at V
+    times `scale` in the scan.
     """
 
 
@@ -86,7 +86,9 @@ class Scan:
 
 
 def find_thuman(folder: str | Path) -> tuple[Path, ...]:
-    """Returns the folder if it holds scans; else nothing."""
+    """Returns the folder, as a tuple of one, if it has the folders model/ and smplx/; else an empty
+    tuple.
+    """
     folder = Path(folder)
     if (folder / "model").is_dir() and (folder / "smplx").is_dir():
         return (folder,)
@@ -102,7 +104,7 @@ def open_thuman(folder: str | Path) -> tuple[list[str], dict[str, str]]:
     """Returns the names of the scans in a folder that holds model/ and smplx/, sorted, and the
     reasons why others cannot be used, by name.
 
-    Raises: CaptureError if there are none.
+    Raises: CaptureError if no scan can be used.
     """
     folder = Path(folder)
     if not (folder / "model").is_dir():

@@ -140,7 +140,7 @@ class StoredPerson(Protocol):
     def decode(
         self, views: Sequence[int]
     ) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
-        """Returns the images and masks of some views.
+        """Returns the images and masks of some views, in this order, as bytes.
 
         Raises: as `summary`.
         """
@@ -355,13 +355,15 @@ class CaptureSource:
         return self._found(seed, index, input_count)[1]
 
     def describe(self, seed: int, index: int, input_count: int) -> str:
-        """See `Source`: the folder."""
+        """Returns the name of the person whom the example shows, see `Source`."""
         return str(self._found(seed, index, input_count)[0])
 
     def unusable(self) -> dict[str, str]:
-        """Returns the people that no example can be made of: what is wrong with each, by name.
+        """Returns the people that are broken so far, and those of which no example with the most
+        input views can be made: what is wrong with each, by name.
 
-        Their files may be wrong, or they lack views or sizes. No photo is decoded.
+        Their files may be wrong, or they may have too few views or too small photos. No decoded
+        photo is kept. Raises: ValueError if no person can be used.
         """
         problems = {}
         for i in range(len(self.cache)):

@@ -1,5 +1,5 @@
-"""Makes the examples to learn from: some views of a subject are the input, others the targets. Also
-has the order of examples, and mixtures of sources.
+"""Makes the examples to learn from: some views of a subject are the input, others the targets. The
+module also has the order of examples, and mixtures of sources.
 
 All of it is numpy, and pure functions of (seed, number). Example e = step * batch + i is the i-th
 of its batch, so that a run resumes from its step alone. Each purpose draws from a separate stream
@@ -137,7 +137,9 @@ class Source(Protocol):
         ...
 
     def describe(self, seed: int, index: int, input_count: int) -> str:
-        """Names the person and views of that example for reports; may take as long as `example`."""
+        """Returns in words which person, or which person and views, this example shows, for
+        reports. It may take as long as `example`.
+        """
         ...
 
 
@@ -195,7 +197,7 @@ def _draw_from_window(generator: np.random.Generator, count: int, wanted: int) -
 
 
 def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray, "v size size *c"]:
-    """Returns bytes averaged by area to size x size pixels, in [0, 1].
+    """Returns images of bytes averaged by area to size x size pixels, in [0, 1].
 
     Raises: ValueError unless the images are squares of at least that size.
     """
@@ -272,7 +274,7 @@ block becomes one example.
 
 
 def subject_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " count"]:
-    """Returns the order of subjects in one pass over them."""
+    """Returns the order of subjects in one pass over them: a permutation of 0 to `count` - 1."""
     return np.random.default_rng([ORDER_STREAM, seed, epoch]).permutation(count)
 
 
@@ -290,7 +292,7 @@ def block_counts(weights: Sequence[float | int]) -> Int[np.ndarray, " sources"]:
     """Returns how many of `MIX_BLOCK` examples come from each source; every source has at least
     one.
 
-    Raises: ValueError unless the weights are positive and finite.
+    Raises: ValueError unless there are 1 to `MIX_BLOCK` weights, all positive and finite.
     """
     shares = np.asarray(weights, np.float64)
     if (

@@ -68,7 +68,7 @@ INPUT_COUNTS = (1, 2, 4, 6)
 TARGETS = 4
 """Number of target views that are compared for each number of inputs."""
 EVERY = 10
-"""Every how many frames one is taken from a video."""
+"""A frame of a video is taken if its number is a multiple of this."""
 
 
 def smallest_rotation(
@@ -149,8 +149,8 @@ def scan_cameras(
 
 
 def split_ids(names: Sequence[T], train: int = TRAIN, test: int = TEST) -> tuple[list[T], list[T]]:
-    """Returns the first `train` names, and the next `test` names, of all sorted names after numpy's
-    shuffle of seed 42.
+    """Returns the names to train with and the names to test with. All names are sorted and shuffled
+    by numpy with seed 42. The first `train` names and the next `test` names are taken.
     """
     order = sorted(names)  # ty: ignore[invalid-argument-type]  strings
     np.random.RandomState(SPLIT_SEED).shuffle(order)  # the published one
@@ -158,11 +158,11 @@ def split_ids(names: Sequence[T], train: int = TRAIN, test: int = TEST) -> tuple
 
 
 def evaluation_indices(counts: Mapping[str, int], inputs: int) -> dict[str, dict[str, list[int]]]:
-    """Returns {scene: {"context": [...], "target": [...]}}. counts: the number of views of each
-    scene, in file order.
+    """Returns {scene: {"context": [...], "target": [...]}}, where the lists hold numbers of views
+    in ascending order. counts: the number of views of each scene, in the order of the test list.
 
-    Python's generator of seed 777 draws `inputs` views, then `TARGETS` of the others. Raises:
-    ValueError for a scene with too few views.
+    One generator of Python, with seed 777, draws for each scene in turn `inputs` views, then
+    `TARGETS` of the others. Raises: ValueError for a scene with too few views.
     """
     generator, found = random.Random(EVALUATION_SEED), {}
     for name, count in counts.items():
@@ -201,7 +201,7 @@ class ScanRenderer:
     faces: Int[Array, "f 3"]
     """Vertex indices, (f, 3), padded."""
     uvs: Float[Array, "n 2"]
-    """Texture coordinates, (n, 2)."""
+    """Texture coordinates, (n, 2), padded."""
     scan: Scan
     """The scan that the texture comes from."""
     texel: float
@@ -234,7 +234,9 @@ class ScanRenderer:
     def render(
         self, cam_from_world: Float[np.ndarray, "4 4"], size: int, supersample: int
     ) -> tuple[UInt8[np.ndarray, "size size 3"], UInt8[np.ndarray, "size size"]]:
-        """Returns the image on white and the coverage, as bytes."""
+        """Returns the image on white and the coverage, as bytes. supersample: samples along each
+        side of a pixel.
+        """
         sample = 2 * np.tan(0.5 * VERTICAL_FOV) * cam_from_world[2, 3] / (size * supersample)
         level = max(0, int(np.floor(np.log2(max(sample / self.texel, 1e-9)))))
         K, pose = (jnp.asarray(x, jnp.float32) for x in (intrinsics(size), cam_from_world))

@@ -8,11 +8,12 @@ the lists and the manifest of all.
     OUT/skipped/NAME.json        why one was skipped; it is tried again by the next run
     OUT/train.json, test.json, evaluation_N.json    of the layout "scenes"
 
-A scene's folder holds images/ and masks/ of each view, smpl/ of each frame, and scene.json: its
-entry for the list, and what is known of it. Everything is written under a temporary name first, so
-that the folder is whole or not there. Finished folders are kept, so that the same command continues
-an interrupted set (`data.sets`). Shards of one set may run at the same time. A run without shards,
-after them, finds nothing to make and lists everything.
+A folder holds images/ and masks/ of each view, and scene.json with what is known of the scene. In
+the layout "scenes" it also has smpl/ of each frame, and scene.json has its entry for the list. In
+the layout "capture" it has capture.json and body.npz. A folder is written under a temporary name
+and renamed when it is complete. Finished folders are kept, so that the same command continues an
+interrupted set (`data.sets`). Shards of one set may run at the same time. A later run without
+shards makes what is still missing, and lists everything.
 """
 
 import dataclasses
@@ -79,9 +80,9 @@ from humangs_jax.io.reading import write_json
 
 SKIPPED = "skipped"
 SCENE = "scene.json"
-"""File of a scan in the layout "scenes"."""
+"""The file with what is known of a scene. In the layout "scenes" it marks a finished folder."""
 CAPTURE = "capture.json"
-"""File of a scan as a capture."""
+"""The file that marks a finished folder in the layout "capture"."""
 Layout = Literal["scenes", "capture"]
 
 
@@ -102,11 +103,11 @@ class PreprocessConfig:
     supersample: int = 3
     """Samples along each side of a pixel, for scans."""
     every: int = EVERY
-    """Every how many frames one is taken from a video."""
+    """A frame of a video is taken if its number is a multiple of this."""
     train: int = TRAIN
-    """Scans of the training list."""
+    """The number of scans in the training list."""
     test: int = TEST
-    """Scans of the test list."""
+    """The number of scans in the test list."""
 
     @property
     def mark(self) -> str:
@@ -125,9 +126,9 @@ class Report:
     scenes: int
     """The number of scenes in all."""
     views: int
-    """Why people were left out, by their names."""
+    """The number of views in all."""
     skipped: dict[str, str]
-    """Why people were left out, by name."""
+    """The reasons why people were left out, by their names."""
 
     def __str__(self) -> str:
         lines = [
@@ -147,13 +148,14 @@ def preprocess(
     workers: int = 1,
     progress: bool = True,
 ) -> Report:
-    """Make or continue a set.
+    """Make or continue a set. Returns what was made and what the set holds.
 
     Arguments: source: the data set; of "thuman" the folder that holds model/ and smplx/. body_file:
-    the model of its fits. shard: (i, n): the i-th of n parts, from 0. workers: processes, for
-    scans.
-    Raises: ValueError if there is nobody, `out` holds another set, or (at the end) nobody could be
-    made.
+    the model of its fits. shard: (i, n): only the i-th of n parts, counted from 0, is made.
+    workers: the number of processes that make scans; videos are made in this one.
+    Raises: ValueError for a wrong shard, if `out` lies in the data set or holds another set, if
+    there is nobody, if a finished scene was made from other files, or, at the end, if nobody could
+    be made.
     """
     source, out = Path(source).resolve(), Path(out)
     index, count = shard
@@ -245,8 +247,8 @@ def _source_key(name: str, source: Path, settings: PreprocessConfig) -> str:
 
 
 def _check_source(file: Path, name: str, source: Path, settings: PreprocessConfig) -> None:
-    """Check that a finished scene was made from the files that the data set holds now. A scene.json
-    without a checksum passes.
+    """Check that a finished scene was made from the files that the data set holds now. It passes if
+    there is no scene.json, or one without a checksum. file: the scene.json.
 
     Raises: CaptureError if the files differ.
     """
@@ -287,7 +289,9 @@ def _read_scene(file: Path, settings: PreprocessConfig) -> dict[str, Any]:
 def _write_lists(
     out: Path, names: Sequence[str], settings: PreprocessConfig, made_with: dict[str, Any]
 ) -> dict[str, Any]:
-    """Write the lists and the manifest of all finished scenes, and return the manifest."""
+    """Write the manifest of all finished scenes and, in the layout "scenes", their lists. Returns
+    the manifest.
+    """
     # all that lies in the folder counts, whichever run has made it
     scenes = {
         name: _read_scene(out / name / SCENE, settings) for name in finished(out, settings.mark)
@@ -480,8 +484,8 @@ def _make_video(
 def _write(
     folder: Path, content: Content, body: FileBody, settings: PreprocessConfig, made_from: str
 ) -> None:
-    """Write the photos and masks of a scene, then the files of the layout. The folder appears whole
-    or not at all. made_from: what `_source_key` returns.
+    """Write the photos and masks of a scene, then the files of the layout. The folder appears when
+    it is complete. made_from: what `_source_key` returns.
     """
 
     def write(temporary: Path) -> None:
