@@ -176,10 +176,10 @@ def _standing(
 
 
 def has_scores(path: Path) -> bool:
-    """Says whether a JSON file is one of scores.
+    """Says whether a JSON file is one of scores. It is one even if some scores are no numbers,
+    which `read_scores` refuses.
 
-    Raises: FileNotFoundError; FileError if it is not JSON; InvalidFileError for a score that is no
-    number.
+    Raises: FileNotFoundError; FileError if it is not JSON.
     """
     return _frames_of(read_json(path)) is not None
 
@@ -196,7 +196,7 @@ def read_scores(path: Path, options: Reading) -> Poses:
         known = np.zeros((len(seen), len(ARKIT)))
         for row, i in enumerate(seen):
             for name, score in frames[i].items():
-                known[row, ARKIT.index(name)] = score
+                known[row, ARKIT.index(name)] = _number_of(name, score)
         # frames in which nobody was seen lie between the others
         every = np.arange(seen[0], seen[-1] + 1)
         values = np.stack([np.interp(every, seen, column) for column in known.T], axis=1)
@@ -211,8 +211,8 @@ def read_scores(path: Path, options: Reading) -> Poses:
         return _standing(values, np.zeros((len(values), 3)), fps, None, note)
 
 
-def _frames_of(content: Any) -> list[dict[str, float]] | None:
-    """Returns the scores of each frame by name, empty where nobody was seen.
+def _frames_of(content: Any) -> list[dict[str, Any]] | None:
+    """Returns the scores of each frame by name, empty where nobody was seen. See `_scores_of`.
 
     None: the content has no scores.
     """
@@ -227,20 +227,18 @@ def _frames_of(content: Any) -> list[dict[str, float]] | None:
     return frames if any(frames) else None
 
 
-def _scores_of(frame: Any, depth: int) -> dict[str, float]:
-    """Returns the scores of one frame by ARKit's names; empty if there are none.
+def _scores_of(frame: Any, depth: int) -> dict[str, Any]:
+    """Returns the scores of one frame by ARKit's names, as the file has them; empty if there are
+    none.
 
     The scores may be an object of numbers by name or a list of categories, at most `_DEEPEST`
-    levels down. Raises: InvalidFileError for a score that is no number.
+    levels down. At least one of them is a number: other files have texts or lists by these names.
     """
     if depth > _DEEPEST:
         return {}
     # an object of scores, a list of categories, or either further inside
     if isinstance(frame, dict):
         named = {arkit_name(str(name)): value for name, value in frame.items()}
-        named.pop(None, None)
-        if len(named) >= _FEWEST:
-            return {str(name): _score(name, value) for name, value in named.items()}
         inner = list(frame.values())
     elif isinstance(frame, list):
         named = {}
@@ -249,12 +247,12 @@ def _scores_of(frame: Any, depth: int) -> dict[str, float]:
                 keys = ("categoryName", "category_name", "displayName", "display_name", "name")
                 name = next((str(each[key]) for key in keys if each.get(key)), "")
                 named[arkit_name(name)] = each["score"]
-        named.pop(None, None)
-        if len(named) >= _FEWEST:
-            return {str(name): _score(name, value) for name, value in named.items()}
         inner = frame
     else:
         return {}
+    named.pop(None, None)
+    if len(named) >= _FEWEST and any(map(_is_number, named.values())):
+        return {str(name): value for name, value in named.items()}
     for each in inner[:_MOST_COLUMNS]:
         found = _scores_of(each, depth + 1)
         if found:
@@ -262,10 +260,14 @@ def _scores_of(frame: Any, depth: int) -> dict[str, float]:
     return {}
 
 
-def _score(name: object, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InvalidFileError(f"{name}: expected a number, got {shown(value)}")
-    return float(value)
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _number_of(name: str, score: Any) -> float:
+    if not _is_number(score):
+        raise InvalidFileError(f"{name}: expected a number, got {shown(score)}")
+    return float(score)
 
 
 # Animations

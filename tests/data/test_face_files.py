@@ -20,6 +20,7 @@ from humangs_jax.body.motion import Motion
 from humangs_jax.core.pytree import replace
 from humangs_jax.io.mesh import GlbWriter
 from humangs_jax.motion import MotionError, load_motion
+from humangs_jax.motion.face_files import has_scores
 from humangs_jax.motion.face_tracks import ARKIT, arkit_name, of_preset
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -101,6 +102,26 @@ def test_scores_of_mediapipe_are_read(tmp_path, layout):
     for name in ("jawOpen", "noseSneerRight"):
         np.testing.assert_allclose(coefficients(motion, name), scores[name], atol=1e-6)
     assert not coefficients(motion, "tongueOut").any()
+
+
+def test_a_score_that_is_no_number_is_named_by_the_reader_and_not_by_the_recognizer(tmp_path):
+    file = tmp_path / "scores.json"
+    scores = dict.fromkeys(ARKIT[:6], 0.5)
+    for bad in ("high", None, True, [0.5]):
+        file.write_text(json.dumps([scores | {ARKIT[2]: bad}]))
+        assert has_scores(file)
+        with pytest.raises(MotionError, match=f"scores.json: {ARKIT[2]}: expected a number, got"):
+            load_motion(file)
+
+
+def test_a_motion_beside_texts_by_the_names_of_shapes_is_a_motion(tmp_path):
+    file = tmp_path / "motion.json"
+    texts = dict.fromkeys(ARKIT[:6], "a mesh")
+    content = {"poses": [0.0] * 165, "trans": [0.0] * 3, "mocap_framerate": 30.0}
+    file.write_text(json.dumps(content | {"shapes": [texts]}))
+    assert not has_scores(file)
+    motion = load_motion(file)
+    assert len(motion.translations) == 1 and motion.expressions is None
 
 
 def test_expressions_of_smplx_keep_their_numbers(tmp_path):
