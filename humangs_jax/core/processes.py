@@ -132,8 +132,9 @@ def in_processes(
 
     Arguments: work: a function. tasks: the arguments of `work` by name. workers: largest number of
     processes. prepare: called as prepare(*given) when a process starts. All of these are pickled.
-    If the caller stops, by Ctrl-C or otherwise, unfinished tasks are dropped and the processes end.
-    Raises: OSError if a process is killed; anything that `work` raises.
+    If the caller stops, by Ctrl-C or otherwise, unfinished tasks are dropped and the processes end;
+    other processes of the caller go on. Raises: OSError if a process is killed; anything that
+    `work` raises.
     """
     import concurrent.futures.process
 
@@ -150,8 +151,9 @@ def in_processes(
                 "a working process was killed, perhaps for want of memory: try fewer workers"
             ) from error
         except BaseException:
+            started = list(pool._processes.values())  # Python 3.14 has terminate_workers
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
+            for process in started:
                 process.terminate()
             raise
 

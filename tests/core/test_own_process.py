@@ -1,6 +1,8 @@
 """The peak of memory, interrupts that wait, and workers that end with their process."""
 
+import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -10,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from humangs_jax.core.processes import peak_memory, started_deaf, undisturbed
+from humangs_jax.core.processes import in_processes, peak_memory, started_deaf, undisturbed
 
 PROGRAM = """
 import resource
@@ -102,6 +104,21 @@ def test_a_process_that_is_started_deaf_survives_an_interrupt():
         ends[deaf] = program.communicate()[0]
     assert ends == {True: b"alive\n", False: b""}
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, set())
+
+
+def test_work_that_ends_early_ends_its_own_processes_and_no_others():
+    context = multiprocessing.get_context("spawn")
+    other = context.Process(target=time.sleep, args=(60,), daemon=True)
+    other.start()
+    try:
+        # work that cannot be pickled fails while its processes are still starting
+        with pytest.raises((pickle.PicklingError, AttributeError), match="lambda"):
+            list(in_processes(lambda: 0, {"one": (), "two": ()}, 2, print))
+        other.join(0.2)
+        assert multiprocessing.active_children() == [other]
+    finally:
+        other.kill()
+        other.join()
 
 
 POOL = """
