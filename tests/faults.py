@@ -36,6 +36,8 @@ FAULTS = [
     (ATOMIC, "_being_written.discard(temporary.absolute())\n        _remove(temporary)", "pass"),
     (ATOMIC, "            else:\n                _remove(entry)", ""),
     (ATOMIC, "entry.rename(original)", "_remove(entry)"),
+    (ATOMIC, "                    old.replace(path)", "                    pass"),
+    (ATOMIC, "path.is_dir() and not path.is_symlink()", "False"),
     (ATOMIC, "age > ABANDONED_SECONDS or", ""),
     (ATOMIC, "(machine == MACHINE and not _runs(pid))", "not _runs(pid)"),
     (ATOMIC, "new.sort(key=lambda file: file == Path(last))", "pass"),

@@ -81,7 +81,8 @@ def replace_files(writers: Mapping[str | os.PathLike[str], Callable[[Path], obje
     paths.
 
     Files are renamed only after all of them are written, so none appears if one cannot be written.
-    A temporary name has the suffix of its path. Folders that do not exist are made.
+    If one cannot be renamed, the files renamed before it are put back as they were. A temporary
+    name has the suffix of its path. Folders that do not exist are made.
 
     Raises: OSError, which names the path, if a file cannot be written or renamed; anything that
     `write` raises.
@@ -98,9 +99,54 @@ def replace_files(writers: Mapping[str | os.PathLike[str], Callable[[Path], obje
             with _naming(path, temporary):
                 write(temporary)
         with undisturbed():
-            for path, temporary in temporaries.items():
-                with _naming(path, temporary):
-                    temporary.replace(path)
+            _move_all(temporaries)
+
+
+def _move_all(sources: Mapping[Path, Path | None], beside: Path | None = None) -> None:
+    """Renames the source of each path to the path, in order, or deletes the path if its source is
+    None. If one of them fails, the paths changed before it are put back as they were.
+
+    Arguments: beside: the folder in which old files are kept until the end; None: that of each.
+    Raises: OSError, which names the path. If a path is a folder, nothing is changed before.
+    """
+    for path in sources:
+        if path.is_dir() and not path.is_symlink():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    final = list(sources)[-1:]  # nothing fails after it
+    kept: dict[Path, Path] = {}
+    changed: list[Path] = []
+    try:
+        for path, source in sources.items():
+            if path not in final and os.path.lexists(path):
+                kept[path] = (beside or path.parent) / f".{path.name}.old-{_tag()}"
+                with _naming(path, kept[path]):
+                    _keep(path, kept[path])
+            if source is None:
+                path.unlink(missing_ok=True)
+            else:
+                with _naming(path, source):
+                    source.replace(path)
+            changed.append(path)
+    except OSError:
+        for path in reversed(changed):
+            old = kept.pop(path, None)
+            with contextlib.suppress(OSError):
+                if old is None:
+                    path.unlink(missing_ok=True)
+                else:
+                    old.replace(path)
+        raise
+    finally:
+        for old in kept.values():
+            _remove(old)
+
+
+def _keep(path: Path, second: Path) -> None:
+    """Gives a file a second name, or copies it where a disk has no hard links."""
+    try:
+        os.link(path, second, follow_symlinks=False)
+    except (OSError, NotImplementedError):
+        shutil.copy2(path, second, follow_symlinks=False)
 
 
 @contextlib.contextmanager
@@ -310,8 +356,9 @@ def add_files(
     """Calls write(temporary folder), then moves the files in it to the same places in `folder`.
     Other files of `folder` stay.
 
-    The folder is made if needed. Nothing is moved if `write` raises. The moves follow each other at
-    once, so a kill seldom falls between two of them, and the moves of two processes do not mix. The
+    The folder is made if needed. Nothing is moved if `write` raises. If a file cannot be moved, the
+    files moved or deleted before it are put back as they were. The moves follow each other at once,
+    so a kill seldom falls between two of them, and the moves of two processes do not mix. The
     folder may be a mount point or the working folder.
 
     Arguments: paths of files are relative to `folder`. without: files that are out of date. Those
@@ -321,7 +368,7 @@ def add_files(
     first. It shows that the others are ours. ours: says whether an existing file may be replaced,
     or deleted as one of `without`; None: all may be. It is not asked about `invalid`.
     Raises: ValueError for a file that would be replaced and is not ours, see `check_ours`; OSError,
-    which names `folder`, if a file cannot be written; anything that `write` raises.
+    which names `folder` or the file, if a file cannot be written; anything that `write` raises.
     """
     folder = Path(folder)
     # in it where it exists: then on the same disk, even if others hold what is beside it
@@ -349,11 +396,12 @@ def add_files(
                     check_ours((folder / file for file in new), ours)
                     without = [file for file in without if ours(folder / file)]
                 # what must not lie beside them goes first, what is out of date last
-                for file in invalid:
-                    (folder / file).unlink(missing_ok=True)
-                for file in new:
-                    (folder / file).parent.mkdir(parents=True, exist_ok=True)
-                    (temporary / file).replace(folder / file)
+                moves: dict[Path, Path | None] = {folder / file: None for file in invalid}
+                moves |= {folder / file: temporary / file for file in new}
+                with contextlib.ExitStack() as made:
+                    for parent in sorted({(folder / file).parent for file in new}):
+                        made.enter_context(_made_folder(parent))
+                    _move_all(moves, beside=temporary)
                 for file in {Path(file) for file in without}.difference(new):
                     (folder / file).unlink(missing_ok=True)
 

@@ -228,6 +228,74 @@ def test_if_one_of_several_files_fails_none_appears(tmp_path):
     assert names(tmp_path) == ["a.csv", "b.html"] and (tmp_path / "a.csv").read_text() == "new"
 
 
+def unreplaceable(monkeypatch, name):
+    """Makes files of this name ones that cannot be replaced."""
+    replace = Path.replace
+
+    def refused(self, target):
+        if Path(target).name == name:
+            raise PermissionError(errno.EPERM, "Operation not permitted", str(self), str(target))
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", refused)
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_if_one_of_several_files_cannot_be_renamed_all_are_as_before(tmp_path, monkeypatch, links):
+    for name in ("a.csv", "c.html"):
+        (tmp_path / name).write_text("old")
+    texts = {tmp_path / name: "new" for name in ("a.csv", "b.csv", "c.html", "d.csv")}
+    if not links:
+        monkeypatch.setattr(atomic.os, "link", no_links)
+    with monkeypatch.context() as patch:
+        unreplaceable(patch, "c.html")
+        with pytest.raises(PermissionError, match=r"not permitted: '[^']*/c\.html'$"):
+            atomic.write_texts(texts)
+    assert names(tmp_path) == ["a.csv", "c.html"]
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"old"}
+    atomic.write_texts(texts)
+    assert names(tmp_path) == ["a.csv", "b.csv", "c.html", "d.csv"]
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"new"}
+
+
+def no_links(*names, **options):
+    raise OSError(errno.EPERM, "no hard links on this disk")
+
+
+def test_a_folder_in_the_place_of_a_file_is_found_before_the_first_rename(tmp_path, monkeypatch):
+    (tmp_path / "a.csv").write_text("old")
+    (tmp_path / "b.html").mkdir()
+    monkeypatch.setattr(Path, "replace", lambda *paths: pytest.fail("a file was renamed"))
+    with pytest.raises(IsADirectoryError, match=r"'[^']*/b\.html'$"):
+        atomic.write_texts({tmp_path / "a.csv": "new", tmp_path / "b.html": "new"})
+    with pytest.raises(IsADirectoryError, match=r"'[^']*/b\.html'$"):
+        atomic.add_files(
+            tmp_path, lambda folder: (folder / "b.html").write_text("new"), invalid=("a.csv",)
+        )
+    assert names(tmp_path) == ["a.csv", "b.html"] and (tmp_path / "a.csv").read_text() == "old"
+
+
+def test_if_one_of_the_added_files_cannot_be_moved_all_are_as_before(tmp_path, monkeypatch):
+    for name in ("a", "c", "invalid", "outdated"):
+        (tmp_path / name).write_text("old")
+
+    def write(folder):
+        (folder / "deep").mkdir()
+        for name in ("a", "b", "c", "deep/d"):
+            (folder / name).write_text("new")
+
+    unreplaceable(monkeypatch, "d")
+    with pytest.raises(PermissionError, match=r"not permitted: '[^']*/deep/d'$"):
+        atomic.add_files(tmp_path, write, without=("outdated",), invalid=("invalid",))
+    assert names(tmp_path) == ["a", "c", "invalid", "outdated"]
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"old"}
+    # a file in the place of a folder is found before the first move
+    (tmp_path / "deep").write_text("old")
+    with pytest.raises(NotADirectoryError, match="deep: is no folder"):
+        atomic.add_files(tmp_path, write, invalid=("invalid",))
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"old"}
+
+
 @pytest.mark.parametrize("replaced", [False, True])
 def test_a_folder_has_one_writer_at_a_time(tmp_path, replaced):
     place = tmp_path / "place"
