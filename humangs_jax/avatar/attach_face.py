@@ -71,7 +71,9 @@ NEAR = {"mouth": 0.06, "lid": 0.04}
 where teeth or lids belong.
 """
 FEWEST = 12
-"""The least number of vertices for an affine map; fewer give a shift."""
+"""The least number of vertices for an affine map. If fewer are near, that many nearest ones are
+taken.
+"""
 
 
 # Bodies of avatars
@@ -125,7 +127,7 @@ def _has_face(avatar: Avatar, body: BodyModel) -> bool:
 
 def with_face(avatar: Avatar, body: BodyModel | None = None) -> Avatar:
     """Returns the avatar with a face, see `Avatar.with_face`. An avatar that has a face is returned
-    as it is.
+    as it is. Raises: ValueError.
     """
     if avatar.face is not None:
         return avatar
@@ -192,8 +194,9 @@ def _face(avatar: Avatar, body: BodyModel, of_arkit: bool) -> Face:
 def _stretching(
     avatar: Avatar, vertices: Int[np.ndarray, " m"], row: Int[np.ndarray, " n"]
 ) -> tuple[Int[np.ndarray, "m k"], Float[np.ndarray, "m k 3"]]:
-    """Returns for each vertex that moves the rows of its neighbours, and their w, see
-    `avatar.face`.
+    """Returns for each vertex that moves the rows of at most `BESIDE` neighbours, and their w, see
+    `avatar.face`. vertices: the vertices that move. row: the row of each vertex among these, m for
+    a vertex that stays.
     """
     edges, _ = mesh_edges(np.asarray(avatar.faces))
     pairs = np.concatenate([edges, edges[:, ::-1]])
@@ -313,7 +316,9 @@ def _map_around(
     reach: float,
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Returns the affine map that takes the vertices `before` near some points to the vertices
-    `after`; a shift if few vertices are near. reach: metres within which vertices are near.
+    `after`, all in metres. At least `FEWEST` vertices count as near, even beyond `reach`. With
+    fewer vertices in all, the map is a shift. reach: the distance from the middle of the points
+    within which vertices are near, metres.
     """
     middle = points.reshape(-1, 3).mean(axis=0)
     distance = np.linalg.norm(before - middle, axis=1)
@@ -327,7 +332,9 @@ def _map_around(
 
 
 def _skin_around(avatar: Avatar, eye: str, follows: np.ndarray) -> Float[np.ndarray, "3"]:
-    """Returns the median color of the skin below and beside an eye. eye: the name of its joint."""
+    """Returns the median color of the skin around and below an eye; that of all Gaussians if there
+    is none. eye: the name of its joint. follows: which Gaussians move with the face.
+    """
     offset = (
         np.asarray(avatar.gaussians.means)
         - np.asarray(avatar.rest_joints)[avatar.joint_names.index(eye)]

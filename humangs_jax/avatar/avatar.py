@@ -198,8 +198,8 @@ _OPTIONAL = {"low_pass": "pixel_footprint", "harmonics": "harmonics"}
 class Avatar(Batchable):
     """A person who can be animated: Gaussians in the T-pose (theta = 0).
 
-    Or a batch of people, leading axes on every array: it can be indexed and iterated over, and
-    functions are mapped over it with `jax.vmap`.
+    An avatar may also be a batch of people, with leading axes on every array. A batch can be
+    indexed and iterated over, and functions are mapped over it with `jax.vmap`.
 
     Examples:
         >>> avatar = hg.Avatar.load("avatar.npz")
@@ -243,8 +243,8 @@ class Avatar(Batchable):
 
     @property
     def gaussians_per_vertex(self) -> int | None:
-        """The number of Gaussians of each vertex. None where refinement has added some, which do
-        not stand with those of their vertex.
+        """The number of Gaussians of each vertex. None if refinement has added Gaussians, which do
+        not stand with the others of their vertex.
         """
         weights, vertices = np.asarray(self.skinning_weights), len(self.rest_vertices)
         if len(weights) % vertices:
@@ -285,7 +285,7 @@ class Avatar(Batchable):
         return with_face(self, body)
 
     def select(self, index: Array | np.ndarray) -> "Avatar":
-        """The avatar with the Gaussians at `index` alone."""
+        """Returns the avatar with the Gaussians at `index` alone."""
         light = self.light
         if light is not None:
             light = replace(
@@ -301,13 +301,13 @@ class Avatar(Batchable):
         )
 
     def save(self, path: str | os.PathLike[str], *, made_from: str | None = None) -> None:
-        """Write one compressed `.npz` (no pickle); it appears whole or not at all.
+        """Write one compressed `.npz` (no pickle). If writing fails, the path stays as it was.
 
         Arguments: made_from: a checksum of what the avatar was made from, for `recorded_source`.
 
         Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and if the
-        Gaussians are deformed, as those of a pose are: avatars are in the T-pose; FileError if
-        `load` would refuse the file, as it does numbers that are not finite.
+        Gaussians have deformations, which those of a T-pose do not have; FileError if `load` would
+        refuse the file, for example for numbers that are not finite; OSError.
         """
         require_concrete("Avatar.save", "writes a file", self)
         # a file holds one avatar in the T-pose

@@ -34,9 +34,9 @@ def file_cameras(path: Path, shot: FrameSettings, upright: bool = False) -> dict
     Images are as large as the file says. Where it does not say, or the shot has a width or a
     height, they are those of the shot.
 
-    Arguments: upright: turn the world from the axis that the format has up to y. False: it stays
-    that of the file.
-    Raises: CaptureError, one line that names the file.
+    Arguments: upright: whether the world is turned so that the axis that is up in the format
+    becomes y. If not, it stays as it is in the file.
+    Raises: FileError, one line that names the file.
     """
     with reading(path, "calibration"):
         found = read_calibration(path, lambda name: shot.resolution)

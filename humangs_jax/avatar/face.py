@@ -40,7 +40,9 @@ class Face(Batchable):
     """
 
     row: Int[Array, " g"]
-    """The row of `expressions.directions` that each Gaussian follows; m for Gaussians that stay."""
+    """The row of `expressions.directions` that each Gaussian follows, (g,); m for Gaussians that
+    stay.
+    """
     eyes: Float[Array, "g 2"]
     """The shares by which each Gaussian belongs to the left and to the right eye, (g, 2), in [0,
     1].
@@ -50,12 +52,12 @@ class Face(Batchable):
     stretching: Float[Array, "m k 3"]
     """The w of each of these neighbours, (m, k, 3), 1 / metres."""
     hidden_normals: Float[Array, "q 3"]
-    """Unit normals of the hidden Gaussians, for the light."""
+    """Unit normals of the hidden Gaussians, (q, 3), for the light."""
     hidden_directions: Float[Array, "q 3 e"]
     """How the hidden Gaussians move, (q, 3, e), metres per unit of a coefficient."""
     hidden_shown: Float[Array, "q e"]
-    """The opacity that each hidden Gaussian gets for a unit of a coefficient, (q, e). The sum is
-    clipped to [0, 1].
+    """The share of the opacity of each hidden Gaussian that a unit of a coefficient shows, (q, e).
+    The sum is clipped to [0, 1]. Gaussians of the mouth do not use it.
     """
     in_mouth: Float[Array, " q"]
     """1 for Gaussians of the mouth, which are seen between the lips alone, 0 for lids; (q,)."""
@@ -82,8 +84,8 @@ class Face(Batchable):
 
 
 def moved_hidden(face: Face, expression: Float[Array, " e"]) -> Gaussians:
-    """Returns the hidden Gaussians in T-pose, moved by an expression, with opacities by how much it
-    shows them.
+    """Returns the hidden Gaussians in T-pose, moved by an expression. Their opacities are
+    multiplied by how much the expression shows them, from 0 to 1.
     """
     moves = jnp.einsum("qae,e->qa", face.hidden_directions, expression, precision=EXACT)
     shown = jnp.clip(jnp.einsum("qe,e->q", face.hidden_shown, expression, precision=EXACT), 0, 1)
@@ -131,8 +133,9 @@ def moved_gaussians(
 
 
 def with_hidden(gaussians: Gaussians, hidden: Gaussians) -> Gaussians:
-    """Returns the Gaussians and the hidden ones behind them. hidden: has no harmonics and no
-    low-pass; it gets harmonics of 0 and the median low-pass where the others have these.
+    """Returns the Gaussians, and after them the hidden ones. hidden: has no harmonics, low-pass and
+    deformations. If the other Gaussians have these, the hidden ones get harmonics of 0, the median
+    low-pass and the identity.
     """
     fields = {}
     if gaussians.harmonics is not None:

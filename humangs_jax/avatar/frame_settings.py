@@ -46,7 +46,10 @@ class FrameSettings:
 
     def check(self) -> None:
         # not on construction: the command line would make a box of it
-        """Raises: ValueError naming what is out of range."""
+        """Check that all settings are in range.
+
+        Raises: ValueError naming the setting that is not.
+        """
         for field in dataclasses.fields(self):
             check_range(FrameSettings, field.name, getattr(self, field.name), field.name)
         self.color()

@@ -125,8 +125,9 @@ def splatting_of(shot: FrameSettings, avatar: Avatar) -> SplatConfig:
 def composite_over(
     rendering: Rendering, color: tuple[float, float, float] | None
 ) -> Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w 4"]:
-    """Returns a rendering onto black as an image in [0, 1]. color: the background, (h, w, 3) is
-    returned; None: transparent, (h, w, 4) with straight alpha is returned, as PNG and WebM have it.
+    """Returns a rendering onto black as an image in [0, 1]. color: the background of the image,
+    whose shape is then (h, w, 3). None: the image has straight alpha, as PNG and WebM have it, and
+    the shape (h, w, 4).
     """
     rgb, alpha = np.asarray(rendering.rgb), np.asarray(rendering.alpha)[..., None]
     if color is not None:
@@ -177,8 +178,8 @@ def shot_cameras(
     azimuths: Float[np.ndarray, " v"],
     smoothing: float | None,
 ) -> Camera:
-    """Returns a batch of cameras, one for each azimuth, that show all points of their frame from
-    the same distance.
+    """Returns a batch of cameras, one for each azimuth, all at one distance from the middle of
+    the points of their frames.
 
     Arguments: points: the points of each frame, metres; those of a single frame are used for all
     cameras. azimuths: degrees, added to the azimuth of the shot. smoothing: the standard deviation,

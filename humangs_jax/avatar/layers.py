@@ -120,8 +120,8 @@ def write_views(
     exposure_gains: of the cameras, see `data.exposure`. names: of the images, instead of view_000
     and so on.
 
-    The files appear together when all are drawn; other views of an earlier call are removed.
-    Returns the number of views.
+    The files appear together when all are drawn. Images view_*.png and a views.exr of an earlier
+    call are removed. Returns the number of views.
 
     Raises: ValueError if the layers of all views are more than an EXR file may hold (see
     docs/security.md); OSError.
@@ -254,7 +254,9 @@ def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.nda
 
 
 def gaussian_parts(avatar: Avatar) -> Int[np.ndarray, " g"]:
-    """Returns the joint that each Gaussian follows most."""
+    """Returns the number of the joint that each Gaussian follows most, the joint of its largest
+    skinning weight.
+    """
     return np.asarray(avatar.skinning_weights).argmax(axis=-1)
 
 
@@ -281,7 +283,7 @@ def _posed_normals(
 
 
 def write_exr(path: str | Path, views: Sequence[ExrView], half: bool = False) -> None:
-    """Write views of one size as the parts of one file, which appears whole or not at all.
+    """Write views of one size as the parts of one file. If writing fails, the path stays as it was.
 
     half: see `ExrLayers`; numbers beyond 65504 become infinite there. Raises: OSError if the file
     cannot be written.

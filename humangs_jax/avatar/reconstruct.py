@@ -91,11 +91,12 @@ def reconstruct(
     rounded up to few sizes; a program is compiled for each.
 
     Worlds that are not y-up are turned for the network; the avatar then has no light, whose
-    directions would be those of another world. The body is displaced first
-    (`Runtime.displacement`): by the capture's displacement; without one, to the masks where it
-    sticks out of them. Where masks show a skirt, the avatar's body has one (`data.skirt`). What no
-    photo shows is guessed from what they show (`avatar.unseen`). For a network with a driver this
-    is the avatar before any correction of a frame.
+    directions would be those of another world. For a network that looks at the person's pixels
+    alone, the body is displaced first, unless `Runtime.displacement` is False: by the capture's
+    displacement, or without one to the edges of the masks. The latter is done if the body does not
+    fit the masks, or if `Runtime.displacement` is True. Where masks show a skirt, the avatar's body
+    has one (`data.skirt`). What no photo shows is guessed from what they show (`avatar.unseen`).
+    For a network with a driver this is the avatar before any correction of a frame.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -138,8 +139,9 @@ def reconstruct(
 def calls_of_reconstruct(
     variables: Variables, config: HumanGSConfig, capture: Capture
 ) -> Iterator[Call]:
-    """Yields the programs of `reconstruct` for a capture with masks, whatever its body. Yields none
-    where the sizes depend on the body. Bodies with a skirt need other programs.
+    """Yields the jitted calls that `reconstruct` makes for a capture with masks. They fit any body
+    without a skirt that has as many vertices. If the sizes of the programs depend on where the body
+    is, nothing is yielded.
     """
     body, moved = gaussian_body(capture.body, config), None
     if allows_vertex_offsets(config):
@@ -192,9 +194,11 @@ def reconstruct_batch(
     views.
 
     A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the
-    number of people. People in skirts, whose bodies have more vertices, are reconstructed alone,
-    as those are whose body model or whose upright axis is not that of the others. A capture that
-    cannot be used does not stop the others.
+    number of people. People in skirts are reconstructed alone, because their bodies have more
+    vertices. The others of a batch must be like the first of them to be reconstructed together:
+    they must have the same body model, and a world with y up if the first has one, else a world
+    with another axis up. Whoever differs is reconstructed alone. A capture that cannot be used does
+    not stop the others.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -204,8 +208,8 @@ def reconstruct_batch(
         batch: captures at a time.
 
     Yields:
-        Each capture with its avatar, in their order; in place of both the ValueError or OSError
-        that a capture, or the function that loads it, has raised.
+        Each capture with its avatar, in the order of the captures. A ValueError or OSError that a
+        capture, or the function that loads it, has raised takes the place of both.
 
     Examples:
         >>> made = hg.reconstruct_batch(*hg.load_weights(), captures)
@@ -264,8 +268,8 @@ def stack_captures(
 
     Returns:
         The body that carries the Gaussians; the photos as the network wants them (leading axis b,
-        padded to the largest number of views); `config` with room for as many tokens as these
-        photos need.
+        padded to one number of views); `config` with room for as many tokens as these photos need,
+        and without light if no world is y-up.
 
     Raises:
         ValueError: if there is no capture, one has no view or values that are not finite or out of
@@ -342,8 +346,9 @@ def reconstruct_views(
     """Returns the avatar of one subject's views. This is the pure function behind `reconstruct`;
     batch it with `jax.vmap`.
 
-    Weights files record no token capacity, and the default has room for all patches, which takes
-    the time of all; `stack_captures` sizes it.
+    Weights files do not record a token capacity. The default has room for all patches, so that
+    every patch costs time. `stack_captures` returns a configuration with the capacity that its
+    photos need.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -521,7 +526,8 @@ def with_blended_leg_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Av
 def _check(given: Capture | PreparedCapture, name: str) -> None:
     """Check that `given` is a capture that can be reconstructed.
 
-    Raises: TypeError for other types; ValueError.
+    Raises: TypeError for other types; ValueError for too many views, or for a capture that is not
+    valid.
     """
     capture = given.capture if isinstance(given, PreparedCapture) else given
     if not isinstance(capture, Capture):

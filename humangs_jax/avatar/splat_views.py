@@ -51,7 +51,7 @@ def circle_cameras(
     """Returns cameras in a circle around the middle of the Gaussians, by name.
 
     form: the format of the file that the Gaussians are from. At azimuth 0 the first camera sees the
-    front of a person that `export` wrote. If the shot has no distance, the images hold all
+    front of a person that `export` wrote. If the shot has no distance, the images hold all opaque
     Gaussians but outliers.
     """
     means = np.asarray(gaussians.means)[

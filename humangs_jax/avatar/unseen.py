@@ -9,9 +9,10 @@ and over their mirror images:
     guess(u) = sum_v softmax_v(log sure(v) - |f(u) - f(v)|^2 / (2 SPREAD^2)) value(v)
 
 The features f are the position in the T-pose, in metres, where depths from front to back count
-little, and the skinning weights, because a sleeve is not like the trunk behind it. On the head the
-plain position is the feature, and the face is no source: the back of a head gets hair, not a second
-face. Faces and hands stay as the network made them.
+little, and the skinning weights, because a sleeve is not like the trunk behind it. On the head and
+the hands the plain position is the feature. On the head only hair is a source, so that the back of
+a head gets hair and not a second face. The face stays as the network made it. Hands take guesses
+from hands alone.
 """
 
 from typing import NamedTuple
@@ -57,11 +58,15 @@ PART = 0.6
 as.
 """
 MIRRORED = 0.05
-"""Metres that are added to the distance of a source on the other side of the body."""
+"""Metres. The square of this is added to the squared distance of a source on the other side of the
+body.
+"""
 FARTHEST = 0.5
 """The largest distance of a source in the space of the features, metres."""
 APART = 10.0
-"""The distance between the head and the rest in the space of the features, metres."""
+"""The distance of the head, and of the hands, from the rest in the space of the features,
+metres.
+"""
 CROWN = 0.93
 """Share of the head's height above which the crown begins."""
 FACE = 0.5
@@ -84,8 +89,8 @@ TINY = 1e-6
 def with_guesses(
     outputs: HumanGSOutputs, inputs: HumanGSInputs, body: BodyModel, config: HumanGSConfig
 ) -> HumanGSOutputs:
-    """Returns the outputs with guesses for what no photo shows. Returns the outputs as they are if
-    photos show all.
+    """Returns the outputs with guesses for what no photo shows. Nothing is guessed if photos show
+    all but `LEAST_HIDDEN` of the vertices.
 
     Outputs are also returned as they are for networks that read whole photos, not the person alone,
     and for networks whose Gaussians are not on vertices. Gradients do not pass through the choice

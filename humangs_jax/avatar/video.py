@@ -84,12 +84,12 @@ def write_video(
     frames: Float[np.ndarray, "m h w c"] | UInt8[np.ndarray, "m h w c"] | Iterable[Frame],
     fps: float | int,
 ) -> int:
-    """Write frames as a video or as PNG files; all appears at the end, or nothing does.
+    """Write frames as a video or as PNG files. They appear when all frames are written. If writing
+    fails, nothing changes.
 
-    Frames are asked for one by one: a .gif keeps one byte a channel of all in memory, the others
-    none. Video codecs want even
-    sides: odd ones get one more row or column, a copy of the last. A GIF of more than 50 frames a
-    second leaves out frames to keep its speed.
+    Frames are asked for one by one. A .gif keeps one byte for each channel of all frames in memory,
+    other formats keep no frame. Video codecs want even sides: odd ones get one more row or column,
+    a copy of the last. A GIF of more than 50 frames a second leaves out frames to keep its speed.
 
     Args:
         path: .mp4, .webm or .gif; without a suffix a folder of frame_00000.png and so on, which
@@ -99,7 +99,7 @@ def write_video(
         fps: frames per second.
 
     Returns:
-        The number of frames.
+        The number of frames that were given.
 
     Raises:
         ValueError: if there is no frame, they differ in shape, a number is not in [0, 1], they hold

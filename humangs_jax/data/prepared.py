@@ -145,8 +145,8 @@ def prepare_capture(
         The prepared capture.
 
     Raises:
-        CaptureError: one line that names the views, if none shows the person. ValueError: for
-            `views` below 1.
+        CaptureError: one line that names the views, if none shows the person.
+        ValueError: for `views` below 1.
 
     Examples:
         >>> variables, config = hg.load_weights()

@@ -35,12 +35,14 @@ from humangs_jax.network.weights import load_weights
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 HELD_OUT = "held_out"
-"""The folder in a capture folder with a second capture, whose views are no inputs. `humangs synth`
-writes such folders.
+"""The name of a folder in a capture folder. It holds a second capture, whose views are no inputs.
+`humangs synth` writes such folders.
 """
 DEFAULT_INPUTS = 4
 MOST_TARGETS = 2000
-"""The most views of one person that are compared, since all are in memory together."""
+"""The most views of one person of a data set that are compared, since all are in memory
+together.
+"""
 Indices = Mapping[str, Mapping[str, Sequence[int]]]
 """For each person the numbers of views in the capture: "context" are the inputs, "target" the views
 to compare with.
@@ -63,7 +65,7 @@ class Choice(NamedTuple):
     """The rule by which input views are chosen, see `find_people`."""
 
     inputs: int | None = None
-    """How many photos are inputs; None: the usual number."""
+    """How many photos are inputs; None: see `find_people`."""
     indices: Indices | None = None
     """The numbers of the inputs and targets of each person; None: inputs are evenly spaced."""
     reconstructs: bool = True
@@ -112,17 +114,20 @@ def find_people(
         source: a capture folder or a folder of them; a scene list or a data set of
             `data.formats.DATASETS`; a capture; cases; or a `Source`, whose examples give inputs and
             targets.
-        body: the model that the parameters of data sets and sources belong to, or its file
-            (default: the one that comes with the package). Captures name their own.
-        inputs: the number of photos that are inputs. They are evenly spaced around the person and
-            show the first view's frame. Default: 4, or all of them where a capture with a folder
-            held_out has fewer.
-        indices: the inputs and targets of each person, in place of `inputs`.
+        body: the model that the parameters belong to, or its file. None: capture folders name their
+            own, and for data sets and sources it is the one that comes with the package. A
+            `Capture` and cases have their own in any case.
+        inputs: the number of photos that are inputs, see `spread_views`. None: 4, but all views of
+            the first view's frame if a capture with a folder held_out has fewer of them. For a
+            `Source`: 4 if it has examples with 4 inputs, else its first number.
+        indices: the inputs and targets of each person of captures and data sets, in place of
+            `inputs`.
         reconstructs: whether the method needs inputs. One that does not, and is given neither
             `inputs` nor `indices`, is compared with every view of a capture that has nothing held
             out.
 
-    Raises: ValueError naming what is wrong; CaptureError when a capture is loaded.
+    Raises: ValueError naming what is wrong; TypeError for cases that are no `Case`; CaptureError
+    when a capture is loaded.
     """
     if isinstance(source, Case):
         return People((source.name,), lambda index: source)
@@ -201,8 +206,9 @@ def _find_in_data_set(path: Path, choice: Choice, body: BodyModel | str | Path |
 
 
 def _short_names(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Returns the last parts of paths, as many as are needed so that no two names are equal.
-    ActorsHQ, for example, has a Sequence1 of every actor.
+    """Returns a name for each path: its last parts, as many as are needed so that no two names are
+    equal. If no number of parts suffices, names are numbers. ActorsHQ, for example, has a Sequence1
+    of every actor.
     """
     for parts in range(1, 1 + max(len(path.parts) for path in paths)):
         names = tuple("_".join(path.parts[-parts:]) for path in paths)
@@ -226,7 +232,8 @@ def choose_views(
     cam_from_world: Float[np.ndarray, "v 4 4"],
     choice: Choice = ANY,
 ) -> tuple[list[int], list[int]]:
-    """Returns the numbers of the views that are inputs, and of the views to compare with.
+    """Returns the numbers of the views that are inputs, and of the views to compare with. name: the
+    person, as in the indices.
 
     Raises: ValueError naming the person.
     """
@@ -253,8 +260,9 @@ def choose_views(
 def spread_views(
     name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int
 ) -> list[int]:
-    """Returns the numbers of `count` views that show the first view's frame and are evenly spaced
-    around the person, in ascending order. The first view is among them.
+    """Returns the numbers of `count` views that show the first view's frame, in ascending order.
+    The views of this frame are put in their order around the person, beginning with the first view.
+    Of this order, `count` evenly spaced places are taken, the first among them.
 
     Raises: ValueError if too few views show this frame.
     """
@@ -315,7 +323,9 @@ def capture_of(views: SubjectViews, body: BodyModel) -> Capture:
 
 
 def predict_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Predicted:
-    """Draws an avatar in the poses and from the cameras of a capture."""
+    """Returns images of an avatar in the poses and from the cameras of a capture. background: the
+    grey value behind the avatar.
+    """
     drawn = capture_renderings(avatar, views, from_host(np.full(3, background), np.float32))[1]
     images = np.stack([np.clip(np.asarray(rendering.rgb), 0, 1) for rendering in drawn])
     alpha = np.stack([np.asarray(rendering.alpha) for rendering in drawn])
@@ -370,9 +380,8 @@ def _weights_method(variables: Variables, config: HumanGSConfig) -> Method:
 
 def predictions_method(folder: str | Path, people: int) -> Method:
     """Returns the method that reads the images of another program: FOLDER/PERSON/VIEW.png, or
-    FOLDER/VIEW.png if there is one person.
-
-    The suffix may be any suffix of photos.
+    FOLDER/VIEW.png if there is one person and no folder FOLDER/PERSON. The suffix may be any suffix
+    of photos.
 
     VIEW is the file name of the true photo without its suffix, or view_NNN as `humangs render`
     numbers them. An alpha channel is the coverage, and its image is put on the background. An image
@@ -516,7 +525,9 @@ def _seen(
 
 
 def calls_of_painted_body(inputs: Capture, views: Capture) -> Iterator[Call]:
-    """Yields the programs of `painted_body` and `draw_painted_body`."""
+    """Yields a call of each jitted function that draws: one that `painted_body` makes, and one that
+    `draw_painted_body` makes.
+    """
     body = inputs.body
     rest = shape_body(body, from_host(inputs.betas))
     first, drawn = inputs.pose(int(inputs.frames[0])), views.pose(int(views.frames[0]))
@@ -526,8 +537,8 @@ def calls_of_painted_body(inputs: Capture, views: Capture) -> Iterator[Call]:
 
 
 def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.ndarray, "v h w 3"]:
-    """Draws the body with a color for each vertex on white, in the poses and from the cameras of a
-    capture.
+    """Returns images of the body on white, with a color for each vertex, in the poses and from the
+    cameras of a capture.
     """
     body = views.body
     rest = shape_body(body, from_host(views.betas))

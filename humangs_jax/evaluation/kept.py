@@ -38,8 +38,9 @@ CaseKey = Callable[[Case], str]
 
 
 class KeptScores:
-    """The scores in a folder. ordered: whether the scores of a person also depend on the people
-    before, as the images of a page do.
+    """The scores that are kept in a folder. method: returns what the prediction of a case depends
+    on. ordered: whether the results of a person also depend on the people before, as the images of
+    a page do.
 
     Raises: CaptureError for a folder of scores that were made with other settings.
     """
@@ -84,7 +85,9 @@ def _file_key(file: Path) -> str:
 
 
 def case_key(case: Case) -> str:
-    """Returns a checksum of the name of a case and of all that is in its captures."""
+    """Returns a checksum of the name of a case and of its captures: photos, masks, unknown pixels,
+    cameras, frames, poses, body, betas, displacement and names.
+    """
     inputs = "none"
     if case.inputs is not None:
         inputs = _capture_key(case.inputs)
@@ -118,7 +121,7 @@ def indices_key(indices: Mapping[str, Any] | None) -> str | None:
 
 
 def body_key(body: BodyModel | str | Path | None) -> str | None:
-    """Returns a short checksum of a given body; None for the shipped body."""
+    """Returns a short checksum of a body model or of its file; None if no body is given."""
     if body is None:
         return None
     if isinstance(body, BodyModel):

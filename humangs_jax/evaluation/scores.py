@@ -58,10 +58,10 @@ class Crop(Protocol):
     def cut(
         self, image: Image, mask: Float[np.ndarray, "h w"], background: float
     ) -> Float[np.ndarray, "y x 3"]:
-        """Returns the part of the image; `background` (0 or 1) fills what lies outside of the
-        image.
+        """Returns the part of the image. Crops that add pixels give them the value `background`, 0
+        or 1.
 
-        The mask is not empty.
+        mask: has pixels above a half.
         """
         ...
 
@@ -93,12 +93,12 @@ class SquareBox:
     reaches. It is padded to a square with the background, and resampled (bilinear, without a
     filter).
 
-    The box ends before the last row and column plus the margin, as in
+    The box has one row less at its lower end and one column less at its right end, as in
     https://github.com/lizhe00/AnimatableGaussians/blob/master/eval/score.py.
     """
 
     margin: int = 50
-    """How much wider the box is on each side, pixels."""
+    """The margin on each side of the box, pixels."""
     side: int = 512
     """The side of the resampled square, pixels."""
 
@@ -123,9 +123,9 @@ class SquareBox:
 
 @dataclasses.dataclass(frozen=True)
 class CentredWindow:
-    """A window of an image that was resampled to one size. The middle of the window is that of the
-    bounding box of the pixels where the mask is not 0; the window is moved into the image if it
-    leaves it. A smaller image is taken whole.
+    """A window of an image that was resampled to one size. The window has the same middle as the
+    bounding box of the pixels where the mask is not 0. If it leaves the image, it is moved into it.
+    A side of the image that is smaller than the window's is taken whole.
 
     Source: metrics/compute_metrics.py of
     https://github.com/humansensinglab/Generalizable-Human-Gaussians.
@@ -440,7 +440,8 @@ def score_views(
     networks: Networks | None = None,
 ) -> Iterator[Row]:
     """Yields the scores of each view of a capture, see `_score_image`. predicted: images on the
-    protocol's background.
+    protocol's background. alpha: their coverage. Predictions count as right where the capture is
+    unknown.
 
     Raises: ValueError if the sizes differ, if a value is not finite, or if the protocol needs masks
     that the capture lacks.
@@ -495,7 +496,8 @@ class Scores:
 
 
 def score(predicted: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
-    """Compare images on white with a capture's photos.
+    """Returns the mean scores of images on white, compared with a capture's photos. A score that
+    one of the views lacks is NaN.
 
     Raises: ValueError if the capture has no masks.
     """

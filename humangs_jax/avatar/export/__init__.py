@@ -19,8 +19,10 @@ HERE = "humangs_jax.avatar.export"
 
 @dataclasses.dataclass(frozen=True)
 class ExportFormat(Format):
-    """A format of exported files. Its code is called as code(path, gaussians), or for formats of
-    meshes as code(paths, avatar, poses or motion, up, name).
+    """A format of exported files. The code of a format of Gaussians is called as code(path,
+    gaussians). The code of a format of meshes is called as code(path, files, avatar, motion, up,
+    name). `path` is the name that the user gave, `files` are the files to write, and `motion` is
+    None for the T-pose. Formats that are only read have no code.
     """
 
     up: Up = "y"
@@ -31,16 +33,16 @@ class ExportFormat(Format):
     """Whether one file holds all frames of a motion."""
     rest_fields: bool = False
     """Whether the format may have all 45 `f_rest_*` fields, which some importers (Unity) require.
-    Then code is called as code(path, gaussians, rest_fields).
+    Then code takes the keyword `rest_fields`.
     """
     versions: tuple[int, ...] = ()
     """The versions that can be written, the usual one first; empty where there is no choice. With
-    versions, code is called as code(path, gaussians, version).
+    versions, code takes the keyword `version`.
     """
     backwards: bool = False
     """Whether the format's axes point to the right, up and back, half a turn about y from ours."""
     beside: tuple[str, ...] = ()
-    """Suffixes of further files, of the same name, that are written with it."""
+    """Suffixes of further files that are written with it, see `files_beside`."""
     reader: str | Callable[[bytes], Any] = ""
     """The reader of Gaussians, called with the bytes of a file and a list that takes lines about
     it; raises `io.reading.InvalidFileError`.

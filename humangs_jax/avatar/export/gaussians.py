@@ -94,7 +94,7 @@ def world_matrix(form: ExportFormat) -> Float[np.ndarray, "3 3"]:
 
 
 def turned(gaussians: Gaussians, up: Up) -> Gaussians:
-    """Turns Gaussians from a world with y up to one with `up` up.
+    """Returns Gaussians turned from a world with y up to one with `up` up.
 
     -y: half a turn about z, (-x, -y, z). z: a quarter of a turn about x, (x, -z, y). Raises:
     ValueError for another axis.
@@ -103,8 +103,8 @@ def turned(gaussians: Gaussians, up: Up) -> Gaussians:
 
 
 def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Gaussians:
-    """Turns Gaussians about the origin. turn: a quaternion (wxyz) of a number of quarters of a
-    turn.
+    """Returns Gaussians turned about the origin. turn: a quaternion (wxyz) of a number of quarters
+    of a turn.
     """
     return _rotated(gaussians, turn)
 
@@ -129,8 +129,8 @@ def _matrix(turn: tuple[float, float, float, float]) -> Float[np.ndarray, "3 3"]
 
 
 def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
-    """Moves Gaussians along y so that the lowest centre of a seen Gaussian lies on y = 0. A
-    Gaussian is seen if its opacity is `SEEN` or more.
+    """Returns Gaussians moved along y so that the lowest centre of a seen Gaussian lies on y = 0. A
+    Gaussian is seen if its opacity is at least `SEEN`, or the largest of all if that is less.
     """
     means, opacities = np.asarray(gaussians.means), np.asarray(gaussians.opacities)
     seen = opacities >= min(SEEN, opacities.max(initial=0.0))
@@ -197,9 +197,9 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
     Args:
         path: The file. How it begins decides the format; where that does not tell (`.splat`), its
             suffix.
-        y_up: Turn them from the world that viewers of the format expect (y down in `.ply`,
-            `.splat`, `.sog` and `.pt`) to one with y up, as `orbit` has it. False: the numbers stay
-            those of the file, and its cameras fit.
+        y_up: Whether the Gaussians are turned from the world that viewers of the format expect (y
+            down in `.ply`, `.splat`, `.sog` and `.pt`) to one with y up, as `orbit` has it. False:
+            the numbers stay as they are in the file, and the cameras of the scene fit.
 
     Returns:
         Gaussians in float32 with unit quaternions (wxyz), linear scales, opacities in [0, 1],
@@ -246,7 +246,7 @@ def save_gaussians(
     y_up: bool = False,
     version: int | None = None,
 ) -> None:
-    """Write Gaussians into a file for other programs; it appears whole or not at all.
+    """Write Gaussians into a file for other programs. If writing fails, the path stays as it was.
 
     Deformations become quaternions and scales. A low-pass is taken out of the scales.
 
@@ -256,8 +256,9 @@ def save_gaussians(
             (KHR_gaussian_splatting).
         gaussians: With or without harmonics, which `.splat` does not hold (`hg.replace(gaussians,
             harmonics=None)`).
-        y_up: They have y up, and are turned to the world that viewers of the format expect: y down
-            in `.ply` and `.splat`, up in `.spz` and `.glb`. False: the numbers stay as they are.
+        y_up: Whether the Gaussians have y up, and are turned to the world that viewers of the
+            format expect: y down in `.ply` and `.splat`, up in `.spz` and `.glb`. False: the
+            numbers stay as they are.
         version: Of a `.spz`: 3, which more programs read, or 4. None: 3.
 
     Raises:
@@ -298,8 +299,8 @@ def _versioned(version: int | None) -> dict[str, int]:
 
 
 def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
-    """Turns Gaussians from a world with y up to the world that viewers of a format expect, or back.
-    Both directions are the same turns, since half turns are their own inverse.
+    """Returns Gaussians turned from a world with y up to the world that viewers of a format expect,
+    or back. Both directions have the same turns, since half turns are their own inverse.
     """
     if form.backwards:
         gaussians = rotated(gaussians, BACKWARDS)
@@ -357,8 +358,8 @@ def _finite(arrays: Mapping[str, np.ndarray], notes: list[str]) -> Mapping[str, 
 
 
 def with_largest(three: Float[np.ndarray, "g 3"], places: np.ndarray) -> Float[np.ndarray, "g 4"]:
-    """Returns unit quaternions made of three components and the place of the fourth, the largest
-    one, which is not negative.
+    """Returns unit quaternions from three components in their order, and the place (0 to 3) of the
+    fourth one, which is the largest and not negative.
     """
     rest = np.sqrt(np.maximum(1 - np.square(three).sum(axis=1), 0))
     quats = np.empty((len(three), 4))
@@ -421,8 +422,8 @@ def export(
     version: int | None = None,
     name: str = "motion",
 ) -> list[Path]:
-    """Write an avatar in T-pose, in one pose, or in the poses of a motion. Each file appears whole
-    or not at all.
+    """Write an avatar in T-pose, in one pose, or in the poses of a motion. Each file appears when
+    it is complete.
 
     Args:
         path: with a suffix of `EXPORTS`.

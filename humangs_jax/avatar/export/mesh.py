@@ -138,7 +138,7 @@ def vertex_weights(avatar: Avatar) -> Float[np.ndarray, "n j"]:
     """Returns the skinning weights of the body's vertices: for each vertex the mean over its
     Gaussians.
 
-    Where refinement has added Gaussians, the nearest ones are taken.
+    Where refinement has added Gaussians, it is the mean over the four nearest ones.
     """
     weights = np.asarray(avatar.skinning_weights, np.float32)
     each = avatar.gaussians_per_vertex
@@ -209,10 +209,10 @@ def write_mesh_glb(
     name: str = "motion",
     up: Up = "y",
 ) -> None:
-    """Write mesh, skin and motion; the file appears whole or not at all.
+    """Write mesh, skin and motion as a `.glb`. If writing fails, the path stays as it was.
 
-    Arguments: motion: as it is to be played (`grounded`); without one the person stands in T-pose,
-    feet on 0. name: the motion's.
+    Arguments: motion: the motion as it is to be played (`grounded`); without one the person stands
+    in T-pose, feet on 0. name: the name of the motion. up: the axis that points up in the file.
     """
     writer = GlbWriter()
     skeleton = len(avatar.parents) + 1  # nodes: the joints, then what they hang on, then the mesh
@@ -467,8 +467,8 @@ def write_material(path: Path, mesh: BodyMesh) -> Path:
 
 
 def write_obj(path: Path, mesh: BodyMesh, material: Path, up: Up) -> None:
-    """Write a mesh. material: what `write_material` wrote beside it. up: the axis that points up in
-    the file.
+    """Write a mesh as an `.obj`. material: path of the `.mtl` in the same folder, as
+    `write_material` returns it. up: the axis that points up in the file.
     """
     turn = up_matrix(up)
 

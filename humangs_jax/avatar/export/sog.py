@@ -84,7 +84,11 @@ def read_sog(data: bytes, notes: list[str]) -> Gaussians:
 
 
 def _root(archive: zipfile.ZipFile) -> str:
-    """Returns the folder in the archive that holds meta.json, "" for none."""
+    """Returns the folder in the archive that holds meta.json, with "/" at its end, or "" if
+    meta.json is in no folder.
+
+    Raises: InvalidFileError if there is not exactly one meta.json.
+    """
     found = [name for name in archive.namelist() if name.rsplit("/", 1)[-1] == META]
     if len(found) != 1:
         raise InvalidFileError(f"no bundle of SOG: expected one {META} inside, found {len(found)}")

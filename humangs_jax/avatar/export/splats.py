@@ -85,7 +85,7 @@ Columns = Mapping[str, np.ndarray]
 def write_ply(
     path: str | os.PathLike[str], gaussians: Gaussians, rest_fields: bool = False
 ) -> None:
-    """Write a 3DGS `.ply`; the file appears whole or not at all.
+    """Write a 3DGS `.ply`. If writing fails, the path stays as it was.
 
     rest_fields: write all 45 `f_rest_*` fields, which some importers (Unity) require. Fields of
     harmonics that the Gaussians do not have are 0.
@@ -343,8 +343,8 @@ ROW_BYTES = 32
 
 
 def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a `.splat`; the file appears whole or not at all. Colors, opacities and quaternions are
-    rounded to bytes.
+    """Write a `.splat`. If writing fails, the path stays as it was. Colors, opacities and
+    quaternions are rounded to bytes.
 
     Raises: ValueError for Gaussians with harmonics.
     """
@@ -475,7 +475,7 @@ ATTRIBUTES = (*NEEDED, *COEFFICIENTS)
 
 
 def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
-    """Write a `.glb` with KHR_gaussian_splatting; the file appears whole or not at all.
+    """Write a `.glb` with KHR_gaussian_splatting. If writing fails, the path stays as it was.
 
     Viewers that do not know the extension draw colored points: glTF's COLOR_0 is linear, unlike the
     extension's coefficients.

@@ -100,12 +100,12 @@ class _Header(NamedTuple):
 
 
 def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Version = 3) -> None:
-    """Write a `.spz`; the file appears whole or not at all.
+    """Write a `.spz`. If writing fails, the path stays as it was.
 
     Scales lose up to 3 %, colors, harmonics and opacities to 8 bits, components of quaternions to
     10. Harmonics are from -1 to 1.
 
-    Raises: ValueError for Gaussians farther than 8,000 km from the origin.
+    Raises: ValueError for Gaussians of which a coordinate exceeds 8,388,607 m.
     """
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
     # places have 24 bits: as many behind the point as the farthest Gaussian leaves

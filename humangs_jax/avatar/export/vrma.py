@@ -52,7 +52,8 @@ def _bone_names() -> dict[str, str]:
 def write_vrma(
     path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
 ) -> None:
-    """Write a motion on the joints of an avatar; the file appears whole or not at all.
+    """Write a motion on the joints of an avatar as a `.vrma`. If writing fails, the path stays as
+    it was. name: the name of the animation. files and up are not used.
 
     Raises: ValueError without a motion, or for a body of other joints.
     """
