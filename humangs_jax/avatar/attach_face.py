@@ -1,5 +1,5 @@
-"""Makes a face for an avatar on a body with expressions: how its Gaussians move, and Gaussians for
-what photos do not show.
+"""Makes a face for an avatar on a body with expressions. It finds how the avatar's Gaussians move,
+and adds Gaussians for what photos do not show.
 """
 
 import functools
@@ -54,8 +54,9 @@ LID_LIFT = 0.003
 thick.
 """
 EYE = (0.0165, 0.0095, 0.005, 0.03)
-"""Metres: half the width and height of the opening between the lids, and the depths before the
-centre of the eye between which Gaussians show the eye."""
+"""Metres: half the width and half the height of the opening between the lids, then the least and
+the largest distance in front of the eye's centre at which Gaussians show the eye.
+"""
 SOFT = 0.3
 """The share of the opening over which a Gaussian belongs to the eye in part."""
 AROUND_EYE = (0.02, 0.045)

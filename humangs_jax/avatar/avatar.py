@@ -75,7 +75,9 @@ class Light:
     """The light of the photos, which other poses are drawn in."""
 
     coefficients: Float[Array, "8"]
-    """Weights of `light_terms`, (8,); their sum is the log of the brightness."""
+    """Weights of `light_terms`, (8,). The weighted sum of the terms is the log of the
+    brightness.
+    """
     normals: Float[Array, "g 3"]
     """Unit normals of the body's surface in the T-pose at each Gaussian, (g, 3)."""
     shading: Float[Array, " g"]

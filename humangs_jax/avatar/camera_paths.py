@@ -2,7 +2,8 @@
 is seen.
 
 The person stands on the floor, at the middle of a world with y up and in metres, as in the motions
-of `motion_views` and in the files of `export`. Formats whose world has another axis up are turned.
+of `motion_views` and in the files of `export`. `file_cameras` turns the world of a format that has
+another axis up if it is asked to.
 """
 
 import logging
@@ -31,8 +32,8 @@ def file_cameras(path: Path, shot: FrameSettings, upright: bool = False) -> dict
     """Returns the cameras of a calibration by unique names, in the order of its file. Lens
     distortion is left out, and a line is logged about it.
 
-    Images are as large as the file says. Where it does not say, or the shot has a width or a
-    height, they are those of the shot.
+    Images have the size that the file says. If it says none, they have that of the shot. A width or
+    a height of the shot replaces that of the file.
 
     Arguments: upright: whether the world is turned so that the axis that is up in the format
     becomes y. If not, it stays as it is in the file.

@@ -70,8 +70,8 @@ def draw(
     how: SplatConfig | None = None,
     exposure_gains: Float[np.ndarray, "v 3"] | None = None,
 ) -> Iterator[Rendering]:
-    """Yields one rendering for each pose and its camera. how: the configuration; None: that which
-    the avatar's weights were trained with. exposure_gains: gains of the cameras, see
+    """Yields one rendering for each pose and its camera. how: the configuration. None: the preset
+    `avatar.rendering`, for which the avatar was trained. exposure_gains: gains of the cameras, see
     `data.exposure`.
     """
     if how is None:
@@ -433,8 +433,8 @@ def motion_frames(
     turn: float = 0.0,
     progress: bool = True,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
-    """Yields the frames of a moving avatar. Each is drawn when it is asked for; see `motion_views`
-    and `images`.
+    """Yields the frames of a moving avatar, which the camera follows. Each is drawn when it is
+    asked for. See `motion_views` and `images`.
     """
     if shot is None:
         shot = FrameSettings()

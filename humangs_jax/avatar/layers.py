@@ -117,8 +117,8 @@ def write_views(
     """Draw an avatar in each pose (batch v) from each camera into a folder: view_000.png ..., and
     views.exr if asked.
 
-    exposure_gains: of the cameras, see `data.exposure`. names: of the images, instead of view_000
-    and so on.
+    exposure_gains: the gains of the cameras, (v, 3), see `data.exposure`. names: the names of the
+    images, in place of view_000 and so on.
 
     The files appear together when all are drawn. Images view_*.png and a views.exr of an earlier
     call are removed. Returns the number of views.

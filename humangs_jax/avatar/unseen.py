@@ -72,8 +72,8 @@ CROWN = 0.93
 FACE = 0.5
 """Share of the head's depth in front of which the face begins. The face keeps its colors."""
 NAPE = (0.35, 0.55)
-"""Shares of the head's depth and height. Vertices behind the first and above the second are hair,
-like those of the crown.
+"""Shares of the head's depth and height. Vertices of the head behind the first and above the second
+count as hair, as the crown does.
 """
 GLANCE = (0.03, 0.25)
 """`UNSEEN` and `SEEN` for hair as a source, because photos of a face show the crown at a glancing

@@ -51,8 +51,8 @@ def report_left_out(names: Sequence[str], reasons: dict[int, str]) -> None:
 
 
 def views_without_person(capture: Capture) -> dict[int, str]:
-    """Returns the views that do not show the person, with the reason: the mask is empty, or it
-    hardly meets the part of the posed body in the frame.
+    """Returns the numbers of the views that do not show the person, each with the reason: the mask
+    is empty, or it hardly meets the part of the posed body in the frame.
 
     A body that is not finite is another fault, which is reported where the body is posed.
     """
@@ -80,7 +80,7 @@ def views_without_person(capture: Capture) -> dict[int, str]:
 
 
 def empty_views(masks: Float[np.ndarray, "v h w"] | None) -> list[int]:
-    """Returns the views whose mask shows nobody."""
+    """Returns the numbers of the views whose mask shows nobody. Without masks there are none."""
     if masks is None:
         return []
     return [i for i, mask in enumerate(masks) if not (np.asarray(mask) > MASK_THRESHOLD).any()]

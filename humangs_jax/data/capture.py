@@ -86,7 +86,7 @@ class Capture:
     displacement: Float[np.ndarray, "n 3"] | None = None
     """Metres by which the vertices of the shaped body move in the T-pose, (n, 3), as another tool
     registered them (SMPL+D); joints stay. It belongs to `betas`: code that changes `betas` leaves
-    it out. None: `reconstruct` finds one by the masks.
+    it out. None: `reconstruct` may find one by the masks.
     """
     calibrated: bool = True
     """Whether the cameras were calibrated; if not, they were found from the person, and are

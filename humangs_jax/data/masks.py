@@ -3,9 +3,8 @@ photos.
 
 Segmentation leaves silhouettes that are some pixels off. A pixel too much shows the background at
 the person's rim, a pixel too little cuts the person, in all photos alike, so no later stage can
-find it. Here the photo is searched along the normals of the
-silhouette: at which distance from it do the colors change most, on average over the silhouette, and
-near each of its points?
+find it. Here the photo is searched along the normals of the silhouette for the distance at which
+the colors change most, on average over the silhouette and near each of its points.
 
 A stripe along the rim that looks like the background (rim light before a bright wall, piping) has a
 stronger edge on its other side. So a mask is moved only where sectors of the silhouette agree, and
@@ -227,8 +226,8 @@ def _sector_votes(
     sectors = np.argsort(np.argsort(angles)) * count // len(angles)
 
     def colors(depth):
-        """Returns the colors `depth` pixels inside of the points, and which of them count: those
-        that are not beyond the middle of a limb or outside of the image.
+        """Returns the colors `depth` pixels inside of the points, and which of them count. Colors
+        beyond the middle of a limb or outside of the image do not count.
         """
         at = points + depth * normal
 
@@ -350,8 +349,8 @@ the mean colors of pixels at least this far inside and this far outside.
 SPREAD = 1.5
 """Standard deviation of the Gaussian that weights these means, pixels."""
 LEAST_WEIGHT = 1e-3
-"""Least weight of the pixels further inside. Below it there are none, as in fingers, which are
-thinner; their rim stays as it is.
+"""The least weight of the pixels further inside. Where the weight is less, as in fingers, which are
+too thin, the rim stays as it is.
 """
 CONTRAST = 0.02
 """A pixel is taken for a mixture where the two means differ by more than this."""

@@ -127,9 +127,9 @@ class MaskedView:
     def seen(
         self, points: Float[np.ndarray, "*n 3"], index: np.ndarray | slice = slice(None)
     ) -> tuple:
-        """Projects points of the rest pose. Returns their pixels (*n, 2), the pixels per metre at
-        each point (*n), and which points the photo shows (*n). index: the vertices whose transforms
-        move the points.
+        """Returns where points of the rest pose are in the window, (*n, 2), pixels, the pixels per
+        metre at each point (*n), and which points the photo shows (*n). index: the vertices whose
+        transforms move the points.
         """
         posed = np.einsum("nab,n...b->n...a", self.linear[index], points)
         posed += self.offset[index].reshape(len(posed), *[1] * (points.ndim - 2), 3)
@@ -228,7 +228,8 @@ def _window(
     linear: Float[np.ndarray, "n 3 3"],
     offset: Points,
 ) -> MaskedView:
-    """Cuts a view to the person and brings it to one size.
+    """Returns a view cut to the person, whose longest side has `LONGEST` pixels. project: from the
+    world to homogeneous pixels of the photo. linear, offset: see `MaskedView`.
 
     Outside of the photo the mask repeats the values at the photo's border.
     """
@@ -355,7 +356,9 @@ def _silhouette_distance(
 def silhouette(
     pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "h w"]:
-    """Draws triangles as 1 on 0. They are drawn `DRAWN` pixels larger than they are."""
+    """Returns an image of triangles, 1 on 0. They are drawn `DRAWN` pixels larger than they are.
+    shape: the height and the width of the image.
+    """
     image = Image.new("L", (shape[1], shape[0]))
     pen = ImageDraw.Draw(image)
     for corners in (pixels[faces] - 0.5).reshape(-1, 6).tolist():
@@ -431,7 +434,7 @@ def _outside(
 def at(
     image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "*b 2"]
 ) -> Float[np.ndarray, "*b"]:
-    """Interpolates an image at pixels (x, y), bilinear.
+    """Returns the values of an image at pixels (x, y), (*b), interpolated bilinearly.
 
     The centre of the first pixel is (0.5, 0.5). Beyond the image its edge is repeated.
     """

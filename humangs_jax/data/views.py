@@ -99,10 +99,10 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     """Returns the body whose vertices carry the Gaussians. As the weights need it, it is decimated,
     and then its long edges are split. It has a map of its surface if the network works on one.
 
-    Its `relative_vertex_spacing` is relative to the mesh that the weights were trained with: 1
-    unless `runtime.max_edge_length` asks for more vertices or `runtime.body_vertices` for fewer.
-    The last four results are kept, because making one takes as long as a small network does on a
-    CPU. A body that `has_mesh_of` accepts is returned as it is.
+    Its `relative_vertex_spacing` is relative to the mesh that the weights were trained with. It is
+    None, which stands for 1, unless `runtime.max_edge_length` asks for more vertices or
+    `runtime.body_vertices` for fewer. The last four results are kept, because making one takes as
+    long as a small network does on a CPU. A body that `has_mesh_of` accepts is returned as it is.
 
     Raises: ValueError if `runtime` has both.
     """

@@ -5,8 +5,8 @@ continued.
     folder/person_NAME_KEY.json    the scores of one person; KEY: a checksum of all that they
                                    depend on
 
-The key of a person depends on contents, not names: photos, masks, cameras, poses and body, and the
-weights, avatar or images that are compared. Scores of other contents are never reused.
+The key of a person depends on names and on contents: photos, masks, cameras, poses and body, and
+the weights, avatar or images that are compared. Scores of other contents are never reused.
 """
 
 import inspect

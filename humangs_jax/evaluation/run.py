@@ -215,7 +215,7 @@ class Evaluation:
 
     @functools.cached_property
     def people(self) -> dict[str, Row]:
-        """Mean scores by person."""
+        """The mean scores of each person, by name."""
         return person_means(self.rows)
 
     @functools.cached_property

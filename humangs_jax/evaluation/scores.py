@@ -417,8 +417,8 @@ def score_names(protocol: EvaluationProtocol) -> tuple[str, ...]:
 def missing_reasons(
     protocol: EvaluationProtocol, networks: Networks, masks: bool, alpha: bool
 ) -> dict[str, str]:
-    """Returns the reasons why scores are missing, by the name of the score. masks: whether the
-    truth has masks. alpha: whether predictions have alpha.
+    """Returns the reasons why scores of all images are missing, by the name of the score. masks:
+    whether the truth has masks. alpha: whether predictions have alpha.
     """
     reasons = {}
     for name in score_names(protocol):

@@ -429,8 +429,9 @@ def export(
         path: with a suffix of `EXPORTS`.
         avatar: one person.
         motion: None for the T-pose. A `.glb` of the mesh holds all of it as animation.
-        numbers: of the motion's frames: "x.ply" becomes "x_0007.ply". All stand on one floor: who
-            jumps leaves it. None: the motion has one frame, whose feet are on 0.
+        numbers: a number for each frame of the motion, for its file: "x.ply" becomes "x_0007.ply".
+            All frames stand on one floor, which a person who jumps leaves. None: the motion has one
+            frame, whose feet are on 0. A format that holds a whole motion does not use them.
         mesh: as a mesh where the suffix has formats of Gaussians, too.
         up: the axis that points up; None for the format's own.
         rest_fields: see `write_ply`.

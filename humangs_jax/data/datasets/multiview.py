@@ -104,7 +104,7 @@ _ANGLES = {
 
 
 def read_parameters(file: Path, body: FileBody) -> BodyParameters:
-    """Read the shape and all poses of smpl_params.npz.
+    """Returns the shape and all poses of a smpl_params.npz.
 
     If shape or expression differ between frames, those of the first frame are taken, since a person
     has one shape. Raises: CaptureError naming file and key.

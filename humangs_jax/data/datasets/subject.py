@@ -475,8 +475,9 @@ def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tu
     """Returns the people of a data set that has photos, in any layout of `data.formats.DATASETS`.
     Each person is opened when it is first asked for.
 
-    Arguments: size: the side of the stored squares, pixels. None: the size of the images of a scene
-    list, else `STORED_SIZE`. Raises: CaptureError if the folder has none of the layouts.
+    Arguments: size: the side of the stored squares, pixels. None: for a scene list see
+    `open_scene_list`, else `STORED_SIZE`. Raises: CaptureError if the folder has none of the
+    layouts, or the layout of scans, which have no photos.
     """
     path = Path(path)
     for name, data_set in DATASETS.items():

@@ -188,10 +188,10 @@ class CaptureFolder:
 
 class PeopleCache:
     """The people of a source on disk. Each is checked when it is first asked for. Images are
-    decoded when they are needed, and kept as bytes up to a limit.
+    decoded when they are needed, and kept as bytes until they take `limit_bytes`.
 
-    Several threads may ask at once. broken: what is wrong with people, by name, in the order in
-    which it was found.
+    Several threads may ask at once. broken: what was first found wrong with people, by name, in the
+    order in which it was found.
     """
 
     def __init__(self, people: Sequence[StoredPerson], limit_bytes: int = 4 << 30):
@@ -256,8 +256,8 @@ class PeopleCache:
         return person.posed(summary._replace(images=images, masks=masks, **of_views))
 
     def note(self, index: int, problem: str) -> None:
-        """Record person `index` as broken, and log the first problem. Other views of the person are
-        still used.
+        """Record what is wrong with person `index` in `broken`. The first problem of a person is
+        kept and logged. Other views of the person are still used.
         """
         name = self.name(index)
         with self._lock:
@@ -344,7 +344,9 @@ class CaptureSource:
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """The people left out so far: what is wrong with each, by name."""
+        """The people of whom something could not be used so far: what was first found wrong with
+        each, by name. If only a photo of a person is wrong, other views are still used.
+        """
         return {str(name): problem for name, problem in self.cache.broken.items()}
 
     def __len__(self) -> int:

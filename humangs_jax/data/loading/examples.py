@@ -64,7 +64,7 @@ class StoredSubject(NamedTuple):
     frames: Int[np.ndarray, " v"]
     """The pose that each view shows, (v,)."""
     azimuths: Float[np.ndarray, " v"]
-    """The directions of the cameras, (v,), radians, which views are chosen by."""
+    """The azimuths of the cameras around their middle, (v,), radians. Views are chosen by them."""
     rotations: Float[np.ndarray, "m j 3"]
     """Axis-angle rotations of the m poses, (m, j, 3), radians."""
     translations: Float[np.ndarray, "m 3"]
@@ -121,7 +121,9 @@ class Source(Protocol):
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """The people left out so far: what is wrong with each, by name."""
+        """The people of whom something could not be used so far: what was first found wrong with
+        each, by name.
+        """
         ...
 
     def __len__(self) -> int:
@@ -359,7 +361,9 @@ class Mixture:
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """The people left out so far, of all sources: what is wrong with each, by name."""
+        """The people of whom something could not be used so far, of all sources: what was first
+        found wrong with each, by name.
+        """
         return {name: problem for source in self.sources for name, problem in source.broken.items()}
 
     def __len__(self) -> int:

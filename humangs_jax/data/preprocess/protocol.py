@@ -197,7 +197,7 @@ class ScanRenderer:
     vertices: Float[Array, "n 3"]
     """The aligned vertices, (n, 3), padded."""
     normals: Float[Array, "n 3"]
-    """Their normals, (n, 3), padded."""
+    """The unit normals of the vertices, (n, 3), padded."""
     faces: Int[Array, "f 3"]
     """Vertex indices, (f, 3), padded."""
     uvs: Float[Array, "n 2"]

@@ -440,7 +440,9 @@ def _make_video(
     settings: PreprocessConfig,
     progress: bool,
 ) -> None:
-    """Make the scene of a video, from every `every`-th frame and all cameras."""
+    """Make the scene of a video from all cameras, and from the frames whose number is a multiple of
+    `settings.every`.
+    """
     # the frames to take
     subject = DATASETS[settings.kind](source, body)
     chosen = np.flatnonzero(subject.frames % settings.every == 0)
