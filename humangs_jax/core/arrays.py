@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from humangs_jax.core.array_types import Int
+
 SMALL = 1 << 16
 """Largest number of entries of an array that is brought from an accelerator and back in less time
 than a program takes to compile.
@@ -42,14 +44,31 @@ def taken(array: Any, index: Any) -> Any:
     """Returns `array[index]`, for arrays of numpy and of JAX.
 
     An array of JAX is indexed by numpy if it is small or if numpy can read it at once, see
-    `on_host`. The result is then an array of JAX again.
+    `on_host`. The result is then an array of JAX again. Raises: IndexError for an integer out of
+    range, unless the index is traced: JAX would clamp it.
     """
-    small = _plain(array) and array.size <= SMALL
-    if isinstance(index, Tracer) or isinstance(array, np.ndarray) or not (small or on_host(array)):
+    if isinstance(index, Tracer) or isinstance(array, np.ndarray):
         return array[index]
-    if isinstance(index, jax.Array):
-        index = np.asarray(index)
-    return from_host(np.asarray(array)[index])
+    small = _plain(array) and array.size <= SMALL
+    if small or on_host(array):
+        if isinstance(index, jax.Array):
+            index = np.asarray(index)
+        return from_host(np.asarray(array)[index])
+    wrong = out_of_range(index, len(array))
+    if len(wrong):
+        raise IndexError(f"index {wrong[0]} is out of bounds for axis 0 with size {len(array)}")
+    return array[index]
+
+
+def out_of_range(index: Any, size: int) -> Int[np.ndarray, " n"]:
+    """Returns the integers of an index that do not fit an axis of this size, (n,). Slices, masks,
+    and arrays whose numbers this process cannot read have none.
+    """
+    readable = isinstance(index, int | np.integer | np.ndarray) or _plain(index)
+    if not readable or np.asarray(index).dtype == bool:
+        return np.zeros(0, int)
+    numbers = np.asarray(index)
+    return numbers[(numbers < -size) | (numbers >= size)]
 
 
 def joined(arrays: Sequence[Any]) -> Any:

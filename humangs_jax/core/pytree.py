@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from humangs_jax.core.arrays import taken
+from humangs_jax.core.arrays import out_of_range, taken
 
 T = TypeVar("T")
 B = TypeVar("B", bound="Batchable")
@@ -202,17 +202,17 @@ class Batchable:
         """Returns one example of a batch (for an integer), or a batch of some examples (for a
         slice, a mask or an array of integers), along the first axis.
 
-        Raises: TypeError if this is no batch; IndexError for an integer out of range. A traced
-        index out of range is clamped by JAX. In an array of integers, numbers out of range raise an
-        IndexError where numpy indexes the leaves (`core.arrays.taken`), and are clamped elsewhere.
+        Raises: TypeError if this is no batch; IndexError for an integer out of range, also in an
+        array. A traced index out of range is clamped by JAX.
         """
         size = len(self)
         if not isinstance(index, slice | Tracer) and getattr(index, "ndim", 0) == 0:
             index = operator.index(index)
-            if not -size <= index < size:
-                raise IndexError(
-                    f"{type(self).__name__}: index {index} is out of range for a batch of {size}"
-                )
+        wrong = out_of_range(index, size)
+        if len(wrong):
+            raise IndexError(
+                f"{type(self).__name__}: index {wrong[0]} is out of range for a batch of {size}"
+            )
         return jax.tree.map(lambda leaf: taken(leaf, index), self)
 
     def __iter__(self: B) -> Iterator[B]:

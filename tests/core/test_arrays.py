@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from compiled_programs import compiled_programs
 
+from humangs_jax.core import arrays
 from humangs_jax.core.arrays import from_host, joined, on_host, taken
 from humangs_jax.geometry.camera import Camera, stack_cameras
 
@@ -46,6 +47,20 @@ def test_examples_are_taken_in_programs_too():
     assert np.array_equal(jax.jit(lambda x: taken(x, 1))(batch), np.asarray(batch)[1])
 
 
+@pytest.mark.parametrize("index", [3, -4, np.int64(3), np.array([0, 3]), jnp.asarray([-4, 0])])
+@pytest.mark.parametrize("where", ["host", "accelerator", "program"])
+def test_an_index_out_of_range_is_refused_wherever_the_array_is(index, where, monkeypatch):
+    batch = jax.device_put(numbers(3, 5))
+    if where == "accelerator":
+        monkeypatch.setattr(arrays, "SMALL", 0)
+        monkeypatch.setattr(arrays, "on_host", lambda array: False)
+    with pytest.raises(IndexError, match=r"index (3|-4) is out of bounds for axis 0 with size 3"):
+        if where == "program":
+            jax.eval_shape(lambda x: taken(x, index), batch)
+        else:
+            taken(batch, index)
+
+
 def test_keys_are_no_numbers_and_stay_with_jax():
     keys = jax.random.split(jax.random.key(0), 3)
     assert not on_host(keys)
@@ -53,10 +68,10 @@ def test_keys_are_no_numbers_and_stay_with_jax():
 
 
 def test_stacking_compiles_nothing():
-    arrays = [jax.device_put(numbers(2, 23)) for _ in range(3)]
+    parts = [jax.device_put(numbers(2, 23)) for _ in range(3)]
     with compiled_programs() as programs:
-        found = joined(arrays)
-    assert programs == [] and np.array_equal(found, np.stack(arrays))
+        found = joined(parts)
+    assert programs == [] and np.array_equal(found, np.stack(parts))
 
 
 def test_cameras_are_made_indexed_resized_and_stacked_without_a_program():

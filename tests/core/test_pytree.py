@@ -97,6 +97,14 @@ def test_an_index_out_of_range_is_refused_where_jax_would_clamp_it():
             cameras[index]
     with pytest.raises(IndexError):
         jax.jit(lambda c: c[3].K)(cameras)
+    # JAX indexes traced leaves
+    for index in (np.asarray([0, 3]), jnp.asarray([[1, -4]])):
+        for take in (lambda c, i=index: c[i], lambda c, i=index: jax.eval_shape(lambda x: x[i], c)):
+            with pytest.raises(IndexError, match=r"Camera: index (3|-4) is out of range"):
+                take(cameras)
+    for index in (np.asarray([2, -3]), np.zeros(0, int), np.asarray([True, False, True])):
+        traced = jax.eval_shape(lambda c, i=index: c[i], cameras)
+        assert traced.K.shape == cameras[index].K.shape
 
 
 def test_one_example_is_not_a_batch_but_it_is_there():
