@@ -294,7 +294,7 @@ class ArrayKeys:
     in space ("joint").
     """
     six: bool = False
-    """Whether rotations are six numbers each, with the frames as the last axis."""
+    """Whether rotations are six numbers each, (j, 6, m) or (m, j, 6) for m frames."""
     stays: bool = False
     """Whether people of files without positions stay in place; if not, such files are refused."""
     kind: str = "poses"

@@ -56,8 +56,8 @@ Background = Literal["photo", "white"]
 LEAST_UNKNOWN = 0.5
 """Least value of a pixel that is unknown, in an image that marks the unknown pixels."""
 OFF_CENTER = 0.05
-"""Share of a side. If the principal point is nearer to the middle of the turned photo by more than
-this, K is that of the turned photo.
+"""Share of a side. If the principal point is nearer to the middle of the turned photo than to that
+of the stored one by more than this, K is that of the turned photo.
 """
 LARGEST_LABEL = 20 / 255
 """A mask with no value above this holds labels (0 and 1, or parts of a person) in place of

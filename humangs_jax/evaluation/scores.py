@@ -488,7 +488,7 @@ class Scores:
     psnr: float
     """PSNR of the whole image, dB."""
     ssim: float
-    """SSIM as scikit-image computes it."""
+    """SSIM with a Gaussian window, as scikit-image computes it."""
     psnr_fg: float
     """PSNR of the foreground, dB."""
     foreground: float

@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 AHEAD = 2
-"""Batches that are prepared while one is worked on."""
+"""The number of batches that are prepared while one is worked on."""
 
 
 @dataclasses.dataclass
