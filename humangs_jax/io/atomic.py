@@ -365,10 +365,11 @@ def add_files(
     that are not replaced are deleted after the last move. invalid: files that must never lie beside
     the new ones. They are deleted before the first move. last: the file that is moved last. If it
     was not there before, it shows that all others are in place. first: the file that is moved
-    first. It shows that the others are ours. ours: says whether an existing file may be replaced,
-    or deleted as one of `without`; None: all may be. It is not asked about `invalid`.
-    Raises: ValueError for a file that would be replaced and is not ours, see `check_ours`; OSError,
-    which names `folder` or the file, if a file cannot be written; anything that `write` raises.
+    first. It shows that the others are ours. ours: says whether an existing file may be replaced
+    or deleted; None: all may be. Files of `without` that are not ours stay.
+    Raises: ValueError for a file that would be replaced, or is invalid, and is not ours, see
+    `check_ours`; OSError, which names `folder` or the file, if a file cannot be written; anything
+    that `write` raises.
     """
     folder = Path(folder)
     # in it where it exists: then on the same disk, even if others hold what is beside it
@@ -392,8 +393,9 @@ def add_files(
                     new.sort(key=lambda file: file == Path(last))
                 if first is not None:
                     new.sort(key=lambda file: file != Path(first))
+                invalid = [Path(file) for file in invalid]
                 if ours is not None:
-                    check_ours((folder / file for file in new), ours)
+                    check_ours((folder / file for file in (*invalid, *new)), ours)
                     without = [file for file in without if ours(folder / file)]
                 # what must not lie beside them goes first, what is out of date last
                 moves: dict[Path, Path | None] = {folder / file: None for file in invalid}

@@ -296,6 +296,17 @@ def test_if_one_of_the_added_files_cannot_be_moved_all_are_as_before(tmp_path, m
     assert {path.read_text() for path in tmp_path.iterdir()} == {"old"}
 
 
+def test_an_invalid_file_of_a_user_is_not_deleted(tmp_path):
+    (tmp_path / "invalid").write_text("dear")
+    with pytest.raises(ValueError, match="invalid: exists, and was not written by humangs"):
+        atomic.add_files(
+            tmp_path, writes_into("new"), invalid=("invalid",), ours=lambda file: False
+        )
+    assert names(tmp_path) == ["invalid"] and (tmp_path / "invalid").read_text() == "dear"
+    atomic.add_files(tmp_path, writes_into("new"), invalid=("invalid",), ours=lambda file: True)
+    assert names(tmp_path) == ["a.txt"]
+
+
 @pytest.mark.parametrize("replaced", [False, True])
 def test_a_folder_has_one_writer_at_a_time(tmp_path, replaced):
     place = tmp_path / "place"
