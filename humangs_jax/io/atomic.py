@@ -25,8 +25,9 @@ from humangs_jax.core.processes import undisturbed
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
-"""Seconds without a change after which a temporary file counts as abandoned. On a shared disk,
-another machine may be writing it for so long.
+"""Seconds without a change after which a temporary file or folder counts as abandoned, where it is
+not known whether its process still runs. On a shared disk, another machine may be writing it for so
+long.
 """
 MOVE_AWAY = "move it away, or choose another folder"
 """Advice in errors about a file that has the name of an output and that humangs did not write."""
@@ -552,23 +553,29 @@ def _sweep(parent: Path) -> None:
 
 
 def _abandoned(path: Path, machine: str, pid: int) -> bool:
-    """Says whether a temporary file counts as abandoned, because its process on this machine has
-    ended, or because it is older than `ABANDONED_SECONDS`. False if the file does not exist.
+    """Says whether a temporary file or folder counts as abandoned. False if it does not exist.
+
+    That of another process on this machine is abandoned once the process has ended. All others are
+    abandoned if nothing in them has changed for `ABANDONED_SECONDS`: those of other machines, and
+    those with the id of this process, which an earlier process of a restarted container may have
+    had. On systems other than POSIX, this holds for all.
     """
+    if machine == MACHINE and pid != os.getpid() and os.name == "posix":
+        return path.exists() and not _runs(pid)
     try:
-        age = time.time() - path.stat().st_mtime
+        # writing a file does not change the time of the folders that it lies in
+        last_change = max(each.lstat().st_mtime for each in (path, *path.rglob("*")))
     except FileNotFoundError:
         return False
-    return age > ABANDONED_SECONDS or (machine == MACHINE and not _runs(pid))
+    return time.time() - last_change > ABANDONED_SECONDS
 
 
 def _runs(pid: int) -> bool:
-    """Says whether a process with this id runs on this machine. Always True on systems other than
-    POSIX.
+    """Says whether a process with this id runs on this machine, which must be a POSIX system: on
+    others this would end the process.
     """
     try:
-        if os.name == "posix":  # elsewhere it would end the process
-            os.kill(pid, 0)
+        os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except OSError:  # of another user

@@ -352,7 +352,8 @@ def test_what_killed_processes_left_is_swept(tmp_path, dead_process):
     old = folder_with(
         leftover(target, "new", dead_process, machine="00000001"), "of another machine, long ago"
     )
-    os.utime(old, (0, 0))
+    for path in (old / "a.txt", old):
+        os.utime(path, (0, 0))
     (tmp_path / ".hidden").write_text("not ours")
     atomic.add_files(tmp_path / "other", writes_into("new"))
     folder_with(
@@ -369,6 +370,23 @@ def test_what_killed_processes_left_is_swept(tmp_path, dead_process):
     assert len(names(tmp_path)) == 4
     assert ".hidden" in names(tmp_path) and leftover(target, "new", os.getpid()).is_dir()
     assert leftover(target, "new", dead_process, machine="00000000").is_dir()
+
+
+def test_what_may_still_be_written_is_not_swept(tmp_path):
+    """A process that runs on this machine writes as long as it likes. In a folder of another
+    machine, a file may change while the folder keeps its time.
+    """
+    target = tmp_path / "folder"
+    mine = folder_with(leftover(target, "new", os.getppid()), "of a process that runs")
+    theirs = folder_with(leftover(target, "new", 1, machine="00000000") / "deep", "of a long write")
+    for path in (mine / "a.txt", mine, theirs, theirs.parent):
+        os.utime(path, (0, 0))
+    atomic.write_text(tmp_path / "a.txt", "")
+    assert (mine / "a.txt").is_file() and (theirs / "a.txt").is_file()
+    os.utime(theirs / "a.txt", (0, 0))
+    atomic._sweep.cache_clear()  # a new process sweeps
+    atomic.write_text(tmp_path / "a.txt", "")
+    assert (mine / "a.txt").is_file() and not theirs.parent.exists()
 
 
 def test_a_folder_that_a_killed_process_moved_aside_is_put_back(tmp_path, dead_process):
