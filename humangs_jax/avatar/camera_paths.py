@@ -1,5 +1,4 @@
-"""Reads cameras of a file as they stand in its world, or makes a path of them along which an avatar
-is seen.
+"""Reads the cameras of a file, and makes paths of cameras along which an avatar is seen.
 
 The person stands on the floor, at the middle of a world with y up and in metres, as in the motions
 of `motion_views` and in the files of `export`. `file_cameras` turns the world of a format that has

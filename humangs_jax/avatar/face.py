@@ -48,9 +48,11 @@ class Face(Batchable):
     1].
     """
     beside: Int[Array, "m k"]
-    """The rows of the vertices beside each vertex that moves, (m, k); m for a vertex that stays."""
+    """The rows of the vertices beside each vertex that moves, (m, k). A vertex that stays, or a
+    missing neighbour, has the row m.
+    """
     stretching: Float[Array, "m k 3"]
-    """The w of each of these neighbours, (m, k, 3), 1 / metres."""
+    """The w of each of these neighbours, (m, k, 3), 1 / metres; 0 for a missing neighbour."""
     hidden_normals: Float[Array, "q 3"]
     """Unit normals of the hidden Gaussians, (q, 3), for the light."""
     hidden_directions: Float[Array, "q 3 e"]
@@ -60,7 +62,9 @@ class Face(Batchable):
     The sum is clipped to [0, 1]. Gaussians of the mouth do not use it.
     """
     in_mouth: Float[Array, " q"]
-    """1 for Gaussians of the mouth, which are seen between the lips alone, 0 for lids; (q,)."""
+    """1 for Gaussians of the mouth, which are seen through the open lips or in front of them, and 0
+    for lids, (q,).
+    """
     lips: Float[Array, "4 3"]
     """The inner edges of the upper and the lower lip in the middle, the left and the right corner,
     (4, 3), metres in the T-pose.

@@ -54,9 +54,7 @@ DEPTH = 0.5
 like its sides.
 """
 PART = 0.6
-"""The distance, in metres, that a change of the square roots of the skinning weights by 1 counts
-as.
-"""
+"""A change of the square roots of the skinning weights by 1 counts as this distance, metres."""
 MIRRORED = 0.05
 """Metres. The square of this is added to the squared distance of a source on the other side of the
 body.

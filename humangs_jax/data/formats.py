@@ -473,8 +473,8 @@ class DataSetFormat(Format):
     """
 
     find: str | Callable[[Path], tuple[Path, ...]] = ""
-    """Finds the subjects in a folder: their sorted paths, or the folder itself; empty if the folder
-    has another layout.
+    """Returns the sorted paths of the subjects in a folder, or the folder itself if it is a subject
+    or a list of people. The result is empty if the folder has another layout.
     """
     lists: bool = False
     """Whether one file lists many people. Then code is called as code(path, body, size), and

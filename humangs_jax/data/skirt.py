@@ -58,7 +58,7 @@ BESIDE = 0.02
 SHOWN = 0.8
 """A row is part of a skirt if this share of its points is inside the masks."""
 VOTES = 4
-"""The least number of points of a row; rows with fewer say nothing."""
+"""A row counts if all photos together have at least this many of its points beside the legs."""
 LEAST_ROWS = 4
 """The least number of rows with a point inside the masks that is `CLEAR` of both legs. It tells
 skirts from wide trousers, which look worse with a skirt.

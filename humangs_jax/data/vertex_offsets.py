@@ -42,8 +42,8 @@ NEAR = 2.5
 edge.
 """
 PROBE = 0.012
-"""Metres by which such a vertex is moved along its normal to see whether it leaves the
-silhouette.
+"""Metres by which a vertex near the silhouette's edge is moved along its normal to see whether it
+leaves the silhouette.
 """
 LEAVES = 0.6
 """A vertex is on the silhouette if the move by PROBE takes it at least this share of PROBE

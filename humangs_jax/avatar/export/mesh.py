@@ -53,7 +53,9 @@ NEIGHBOURS = 32
 CHUNK = 16384
 """Points that are colored at a time, in some 100 MB."""
 SMALLEST_SCALE = 1e-4
-"""Metres; flat Gaussians are seen as if they were a tenth of a millimetre thick."""
+"""The least standard deviation with which Gaussians are seen, metres. It gives flat Gaussians a
+thickness.
+"""
 LEAST_WEIGHT = 1e-4
 """The least weight of the nearest Gaussian. It gives a color to points that no Gaussian covers."""
 WEIGHTS = 4

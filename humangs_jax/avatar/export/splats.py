@@ -46,7 +46,7 @@ from humangs_jax.rendering.gaussians import COUNTS, Gaussians, factored, skin_ga
 OPACITY_MARGIN = 1e-6
 """Keeps the logit finite for opacities of 0 and 1."""
 SMALLEST_SCALE = 1e-9
-"""Metres; keeps the logarithm finite for flat Gaussians."""
+"""The least scale that is written, metres. It keeps the logarithm finite for flat Gaussians."""
 LONGEST_HEADER = 1 << 16
 ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 TYPES = {

@@ -68,7 +68,7 @@ class SceneFrame(NamedTuple):
     K: Float[np.ndarray, "3 3"]
     """The camera matrix, (3, 3), pixels."""
     arrays: str
-    """The path of the arrays of the view."""
+    """The path of the arrays of the body that the view shows."""
     mask: str | None = None
     """The path of the mask."""
 

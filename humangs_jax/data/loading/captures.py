@@ -39,7 +39,7 @@ logger = logging.getLogger("humangs_jax.data.loading")
 
 def find_captures(root: str | Path) -> tuple[Path, ...]:
     """Returns the capture folders directly inside a folder, sorted by name; the folder itself if it
-    is a capture.
+    is a capture. Folders whose names begin with a dot are left out.
 
     Raises: ValueError if there is none.
     """
@@ -147,8 +147,8 @@ class StoredPerson(Protocol):
         ...
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
-        """Returns the subject, some views of the summary, with at least the poses that these views
-        show.
+        """Returns a subject with at least the poses that its views show. subject: some views of the
+        summary, perhaps without poses.
 
         Raises: as `summary`.
         """

@@ -224,7 +224,7 @@ def _subjects(source: Path, settings: PreprocessConfig) -> tuple[dict[str, Path]
 
 
 def _made_with(source: Path, body: FileBody, settings: PreprocessConfig) -> dict[str, Any]:
-    """Returns the settings that all scenes depend on, as they stand in the manifest.
+    """Returns the settings that all scenes depend on, as the manifest has them.
 
     The data set is known by the name of its folder alone, since it may lie elsewhere on another
     machine.
@@ -344,7 +344,7 @@ def _write_lists(
 
 
 class View(NamedTuple):
-    """A view to be written. Lengths are those of the scene."""
+    """A view to be written. Lengths are in units of the scene."""
 
     name: str
     """The name of its files."""
