@@ -542,16 +542,20 @@ class EachPerson:
 
     def describe(self, seed: int, index: int, input_count: int) -> str:
         """See `Source`."""
-        return _described(int(self.bank.seeds[index % self.bank.people]), index)
+        person = int(self.bank.seeds[index % self.bank.people])
+        return _described(person, self._appearance(seed, index))
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
         """See `Source`. The index decides the person, seed and index decide the appearance."""
         person = index % self.bank.people
-        appearance = int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(APPEARANCES))
-        key = subject_key(int(self.bank.seeds[person]), appearance)
+        key = subject_key(int(self.bank.seeds[person]), self._appearance(seed, index))
         config = dataclasses.replace(self.config, input_views=input_count)
         example = jitted_example(self.bank, key, config=config, person=person)
         return jax.tree.map(np.asarray if self.on_host else jnp.asarray, example)
+
+    def _appearance(self, seed: int, index: int) -> int:
+        """Returns the number of the appearance that an example shows."""
+        return int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(APPEARANCES))
 
 
 def jitted_example(
