@@ -192,6 +192,21 @@ def test_people_of_easymocap_are_chosen_by_their_id(tmp_path):
     check(read(tmp_path, person=1), values, OPENPOSE_67)
 
 
+@pytest.mark.parametrize(
+    ("ids", "order"), [([1, 100], [1, 0]), ([2, -1, -1], [1, 2, 0]), ([None, 0], [1, 0])]
+)
+def test_nobody_is_lost_whose_id_of_easymocap_is_no_count(ids, order, tmp_path):
+    values = known(67, 1)[0]
+    content = annots(values, "front.jpg", ids[0])
+    for shift, number in enumerate(ids[1:], 1):
+        other = annots(np.add(values, [shift, 0, 0]), "", number)
+        content["annots"] += other["annots"]
+    write(tmp_path / "front.json", content)
+    for person, shift in enumerate(order):
+        found = read(tmp_path, ("front",), person=person)
+        np.testing.assert_allclose(found.points[0], values[:, :2] + [shift + 0.5, 0.5])
+
+
 @pytest.mark.parametrize("tool", ["openpose", "mmpose"])
 def test_nobody_is_found_in_a_view(tool, tmp_path):
     values = known(67 if tool == "openpose" else 17)

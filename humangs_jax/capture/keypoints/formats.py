@@ -17,6 +17,7 @@ is the same person in all images, or null if the person is not in the image. A p
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -373,12 +374,12 @@ def recognizes_easymocap(source: KeypointFile) -> bool:
 
 def read_easymocap(source: KeypointFile, format: SourceFormat) -> Detections:
     """Returns the people of one image. Person i has the personID i, if this is a whole number from
-    0 to 63 that no person before it has. A person with another ID gets the number of people before
-    it.
+    0 to 63 that no person before it has. People with other IDs get the lowest numbers that are
+    left.
 
     Raises: CaptureError if the file is not valid.
     """
-    content, file, people = source.json, source.path, {}
+    content, file, people, others = source.json, source.path, {}, []
     for i, entry in enumerate(content["annots"]):
         field = f"annots[{i}]"
         members(entry, file, field, keypoints=list)
@@ -391,7 +392,12 @@ def read_easymocap(source: KeypointFile, format: SourceFormat) -> Detections:
         number = entry.get("personID", i)
         # people are in the order of their IDs; beyond this many an ID is no count
         counted = type(number) is int and 0 <= number < 64 and number not in people
-        people[number if counted else len(people)] = person
+        if counted:
+            people[number] = person
+        else:
+            others.append(person)
+    free = (number for number in itertools.count() if number not in people)
+    people |= dict(zip(free, others, strict=False))
     first = next(iter(people.values()), np.zeros((0, 3)))
     found = tuple(people.get(i, np.zeros_like(first)) for i in range(max(people, default=-1) + 1))
     name = content.get("filename")
