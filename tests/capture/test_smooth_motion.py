@@ -11,6 +11,7 @@ from fit_people import TOY_MODEL as MODEL
 
 from humangs_jax.body.landmarks import pose_landmarks
 from humangs_jax.body.model import BodyPose
+from humangs_jax.capture.fitting import landmark_fit
 from humangs_jax.capture.fitting.fit_capture import _motion_warnings
 from humangs_jax.capture.fitting.landmark_fit import LandmarkFit, keypoint_problem, smooth_motion
 from humangs_jax.capture.fitting.residuals.keypoints import make_observations
@@ -185,3 +186,13 @@ def test_the_result_of_smoothing_is_reported():
     jumped = joints.copy()
     jumped[2, :, 0] += 0.9
     assert [text[:14] for text in found(0.01, jumped)] == ["frame 2: 0.90 "]
+
+
+def test_frames_that_all_show_little_keep_their_poses(walk):
+    """No frame is extrapolated from another."""
+    seen, start, _ = walk
+    state = states_of(*start)
+    blind = without(seen, range(FRAMES))
+    kept = landmark_fit._bridged(keypoint_problem(MODEL), blind, state)
+    for name in ("global_orient", "transl", "body_pose"):
+        np.testing.assert_allclose(getattr(kept, name), getattr(state, name), atol=1e-5)

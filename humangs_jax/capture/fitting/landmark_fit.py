@@ -532,7 +532,7 @@ def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) ->
 def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> FitState:
     """Returns the state with new poses in frames that show fewer than `FEW` landmarks. A new pose
     is interpolated between the nearest other frames before and after. If one of these is missing,
-    it is the pose of the other.
+    it is the pose of the other. If both are, the frame keeps its pose.
     """
     m = len(seen.noise)
     shown = jnp.sum(jnp.any(seen.confidences * problem.known > 0, axis=1), axis=1) >= FEW
@@ -541,7 +541,8 @@ def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> F
     after = jax.lax.cummin(jnp.where(shown, frames, m), reverse=True)
     # frames before the first that shows something, or behind the last, take that one's pose
     low, high = jnp.where(before < 0, after, before), jnp.where(after >= m, before, after)
-    low, high = (jnp.clip(x, 0, m - 1) for x in (low, high))
+    # if no frame shows enough, each keeps its pose
+    low, high = (jnp.where(jnp.any(shown), x, frames) for x in (low, high))
     share = (frames - low) / jnp.maximum(high - low, 1)
     poses, betas = _poses(problem, state), betas_of(problem.origin, state)
     rotations, translations = poses.rotations, poses.translation
