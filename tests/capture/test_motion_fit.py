@@ -9,7 +9,7 @@ from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, shape_body
 from humangs_jax.capture.fitting.motion_fit import FLIP, betas_of_joints, fit_motion
-from humangs_jax.capture.keypoints.keypoints import MEDIAPIPE_33, Keypoints
+from humangs_jax.capture.keypoints.keypoints import COCO_17, MEDIAPIPE_33, Keypoints
 from humangs_jax.geometry.mesh import smallest_turns
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.motion import load_motion
@@ -86,5 +86,8 @@ def test_a_video_that_shows_nobody_is_refused():
     blind = Keypoints(points, points[..., 0], MEDIAPIPE_33, world=np.zeros((4, 33, 3)))
     with pytest.raises(ValueError, match="seen in no frame"):
         fit_motion(BODY, blind, K, 30.0)
+    few = Keypoints(points[:, :17], points[:, :17, 0], COCO_17, world=np.zeros((4, 17, 3)))
+    with pytest.raises(ValueError, match="coco17 lack left_heel, left_foot_index"):
+        fit_motion(BODY, few, K, 30.0)
     with pytest.raises(ValueError, match="in space"):
         fit_motion(BODY, Keypoints(points, points[..., 0], MEDIAPIPE_33), K, 30.0)

@@ -94,6 +94,8 @@ stage of a motion.
 """
 _FEET = ("left_heel", "left_foot_index", "right_heel", "right_foot_index")
 """Landmarks of the feet, which stand still while the foot stands."""
+_HIPS = ("left_hip", "right_hip")
+"""Landmarks of the hips, which say where the person begins."""
 _LEAST_SEEN = 6
 """Least number of visible keypoints of a frame. The start of a frame with fewer is interpolated."""
 _LEAST_VISIBLE = 0.3
@@ -165,7 +167,7 @@ def fit_motion(
     Args:
         body: body model of the person.
         keypoints: keypoints of all frames, with the detector's 3D landmarks (`Keypoints.world`).
-            The set needs hips and the landmarks of `_FEET`.
+            The set needs the landmarks of `_HIPS` and `_FEET`.
         K: intrinsics of the camera, (3, 3), pixels.
         fps: frames per second.
         betas: shape of the person, (s,). None: the shape is fitted.
@@ -173,10 +175,17 @@ def fit_motion(
             effect if `betas` is given.
         watch: called with the stages and the number of windows. It returns the stages, and may show
             a bar meanwhile.
-    Raises: ValueError if no frame shows the person, or if the keypoints have no 3D landmarks.
+    Raises: ValueError if no frame shows the person, if the keypoints have no 3D landmarks, or if
+    their set lacks hips or feet.
     """
     body = without_expression(body)
     kind = keypoints.set
+    missing = [name for name in (*_HIPS, *_FEET) if name not in kind.names]
+    if missing:
+        raise ValueError(
+            f"keypoints of {kind.name} lack {', '.join(missing)}: expected a set that has them,"
+            " such as mediapipe33"
+        )
     model = landmark_model(body, kind.names, kind.places, kind.certainty)
     seen = _observations(keypoints, K)
     m = len(seen.noise)
@@ -250,7 +259,7 @@ def _start(
     # sizes of the trunks say how large the detector's person is
     trunk = weights > 0.5
     scale = _radius(resting[trunk]) / np.maximum(_radius(world[:, trunk]), 1e-3)
-    hips = [model.names.index(f"{side}_hip") for side in ("left", "right")]
+    hips = [model.names.index(name) for name in _HIPS]
     offsets = (world - world[:, hips].mean(1, keepdims=True)) * scale[:, None, None]
     views = (np.asarray(x)[:, 0] for x in (seen.points, seen.confidences, seen.K))
     places = np.stack([_place(*each) for each in zip(*views, offsets, strict=True)])
