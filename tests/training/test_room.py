@@ -72,7 +72,7 @@ def test_the_need_is_that_of_the_most_demanding_target(body, captures):
     def posed(example):
         outputs, _ = reconstruct_example(state.variables, body, example.inputs, CONFIG)
         avatar = completed_avatar(outputs, body, example.inputs, CONFIG.model)
-        poses = BodyPose(example.targets.rotations, example.targets.translations)
+        poses = jax.vmap(BodyPose)(example.targets.rotations, example.targets.translations)
         return jax.vmap(lambda pose: skin(avatar, pose))(poses)
 
     needs = []
