@@ -288,6 +288,8 @@ def training_step(small: bool, trace: Path | None) -> Iterator[Measurement]:
             config, model=dataclasses.replace(model, runtime=config.model.runtime)
         )
         networks = load_loss_networks(lpips_net="alex", installed=True)
+        if networks.lpips is None:  # the extra `lpips` is not installed
+            config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, lpips=0.0))
         bank = build_bank(SPLITS["train"][:1], body, "train", displaced=carrier)
         state, average = (init_state(config, variables) for _ in range(2))
         examples = jax.jit(train_by_clock.examples_of(config, how))
