@@ -24,6 +24,7 @@ CASES = {
         f"{PEOPLE} --sizes 64 --seconds 0.5 --sheet FOLDER/a.jpg --details-sheet FOLDER/b.jpg"
         " --plot FOLDER/a.png"
     ),
+    "relocation": "--subjects 1 --held-out 1 --pose-views 1 --size 64 --steps 2",
     "scene_fits": "--gaussians 200 --photos 3 --size 32 24 --steps 6 --only",
     "splatting_finite_differences": "--size 32",
     "splatting": "--sizes 64 --repeats 1",
