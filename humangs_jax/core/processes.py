@@ -217,8 +217,8 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
 
     Programs call it once, before the first computation; the library never does. JAX is not imported
     here: it finds the folder in its environment variable, as do the programs that this one starts.
-    A cache that JAX already has (`JAX_COMPILATION_CACHE_DIR`) stays. With `HUMANGS_COMPILE_CACHE=0`
-    nothing is done.
+    A cache that JAX already has (`JAX_COMPILATION_CACHE_DIR`) stays in use, also with
+    `HUMANGS_COMPILE_CACHE=0`, with which nothing is done.
 
     Args:
         folder: the folder that holds the caches. None: what the environment variable
@@ -226,22 +226,22 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
             (`XDG_CACHE_HOME`, or what the platform has in its place).
 
     Returns:
-        The folder in use, which lies in `folder`, or the one that JAX already had. None with
-        `HUMANGS_COMPILE_CACHE=0`, or if the folder cannot be written to.
+        The folder in use, which lies in `folder`, or the one that JAX already had. None if JAX had
+        none and `HUMANGS_COMPILE_CACHE` is 0, or if the folder cannot be written to.
 
     Examples:
         >>> hg.enable_compile_cache()
     """
     # a cache that JAX has already stays
-    wish = os.environ.get(VARIABLE, "")
-    if wish == "0":
-        return None
     if "jax" in sys.modules:
         given = sys.modules["jax"].config.jax_compilation_cache_dir
     else:
         given = os.environ.get(OF_JAX)
     if given:
         return Path(given)
+    wish = os.environ.get(VARIABLE, "")
+    if wish == "0":
+        return None
     # a folder for each version of JAX and processor, if it can be written to
     try:
         root = Path(folder or wish or user_cache() / "humangs_jax").expanduser()

@@ -93,7 +93,9 @@ def test_the_environment_turns_it_off_or_moves_it(tmp_path, monkeypatch):
     assert enable_compile_cache(tmp_path / "here").parent == tmp_path / "here"
 
 
-def test_a_cache_that_jax_has_already_stays(tmp_path):
+@pytest.mark.parametrize("wish", ["", "0"])
+def test_a_cache_that_jax_has_already_stays(wish, tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, wish)
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     assert enable_compile_cache() == tmp_path and jax.config.jax_compilation_cache_dir == str(
         tmp_path
