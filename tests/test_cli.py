@@ -223,6 +223,7 @@ def test_what_a_file_says_does_not_act_on_the_terminal(verbose, monkeypatch, sam
 def test_quiet_and_verbose(sample, capsys):
     assert cli.execute(["--quiet", "sample"]) == 0
     assert capsys.readouterr() == ("the report\n", "humangs: warning: odd\n")
+    assert "--quiet      results, warnings and errors only" in cli.EVERYWHERE
     assert cli.execute(["sample", "--verbose"]) == 0
     assert re.search(r"counting: \d+\.\d s\nwriting: ", capsys.readouterr().err)
     assert cli.execute(["sample", "--verbose", "--fails", "data"]) == cli.BAD_DATA

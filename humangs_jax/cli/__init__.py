@@ -79,7 +79,7 @@ GROUPS = {
 COMMANDS = {name: place for group in GROUPS.values() for name, place in group.items()}
 EVERYWHERE = """Options of every command:
   --help       its options, with examples
-  --quiet      results and errors only
+  --quiet      results, warnings and errors only
   --verbose    also what libraries log
   --version    the version
 Completion for bash, zsh or tcsh: humangs --tyro-print-completion SHELL"""

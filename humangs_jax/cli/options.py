@@ -352,7 +352,8 @@ def _require_writable(path: Path, option: str) -> None:
 
 
 def tell_deleted(folder: Path, unless: Path | None = None) -> None:
-    """Shows what --overwrite will delete in a folder that is going to be replaced.
+    """Shows what --overwrite will delete in a folder that is going to be replaced, even with
+    --quiet.
 
     Shows nothing if the folder is empty, or if it is the folder `unless`.
     """

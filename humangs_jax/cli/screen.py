@@ -179,7 +179,7 @@ def wrote(path: str | Path, what: str) -> None:
 
 
 def warn(text: object) -> None:
-    """Shows a warning about something that looks wrong. The command goes on."""
+    """Shows a warning about something that looks wrong, even with --quiet. The command goes on."""
     say(f"humangs: warning: {text}", error=True, lines=False)
 
 
