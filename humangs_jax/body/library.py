@@ -424,7 +424,7 @@ def _shape_directions(
 
 
 def _parents(file: ArrayFile) -> tuple[int, ...]:
-    parents = file.numbers("kintree_table", (2, JOINTS))[0].astype(np.int64)
+    parents = file.integers("kintree_table", (2, JOINTS))[0]
     found = (-1, *(int(p) for p in parents[1:]))  # the root's is stored as -1 or as 2^32 - 1
     if found != PARENTS:
         raise FileError(file.path, "kintree_table", f"expected SMPL-X's joint tree, got {found}")

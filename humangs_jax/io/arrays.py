@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.progress import printable
 from humangs_jax.io.atomic import replace_file
 from humangs_jax.io.reading import (
@@ -294,11 +294,23 @@ class ArrayFile:
         """
         return float(self.numbers(key, (1,) * self.array(key).ndim).reshape(-1)[0])
 
+    def integers(self, key: str, shape: tuple[int | None, ...]) -> Int[np.ndarray, "..."]:
+        """Returns the value of a key as int64, at least one number. The file may have them as any
+        real type. shape: as in the function `numbers`. Raises: `error`.
+        """
+        array = self.numbers(key, shape)
+        whole = array == np.rint(array)
+        if not whole.all():
+            where = np.argwhere(~whole)[0].tolist()
+            found = f"got {array[tuple(where)]} at index {where}"
+            raise self.error(self.path, key, f"expected whole numbers, {found}")
+        return array.astype(np.int64)
+
     def indices(self, key: str, bound: int) -> np.ndarray:
         """Returns the value of a key as triangles, (f, 3), int64, with vertices in [0, bound).
         Raises: `error`.
         """
-        array = self.numbers(key, (None, 3)).astype(np.int64)
+        array = self.integers(key, (None, 3))
         if array.min() < 0 or array.max() >= bound:
             raise self.error(self.path, key, f"expected indices in [0, {bound})")
         return array

@@ -382,7 +382,7 @@ def _cameras(
             file.notes.append("no camera.npy beside it: people move as the camera sees them")
             return None
         camera = ArrayFile(beside, read_values(beside), error=MotionError)
-        own = file.numbers(file.first(("frame", "frames")), (count,)).astype(int)
+        own = file.integers(file.first(("frame", "frames")), (count,))
         kind = "world" if "world_cam_R" in camera else "pred"
         turns = camera.numbers(f"{kind}_cam_R", (None, 3, 3))
         places = camera.numbers(f"{kind}_cam_T", (None, 3))

@@ -239,6 +239,14 @@ def with_bad_number(key):
         (broken(shapedirs=np.ones((9, 3, 12))), "shapedirs: expected 20 or 400 columns"),
         (broken(f=np.full((4, 3), 9, np.uint32)), r"f: expected indices in \[0, 9\)"),
         (
+            broken(f=np.full((4, 3), 0.5)),
+            r"f: expected whole numbers, got 0\.5 at index \[0, 0\]",
+        ),
+        (
+            broken(kintree_table=made_up_file()["kintree_table"] + 0.25),
+            r"kintree_table: expected whole numbers, got ",
+        ),
+        (
             broken(kintree_table=np.zeros((2, 55), np.uint32)),
             "kintree_table: expected SMPL-X's joint tree",
         ),

@@ -187,6 +187,15 @@ def test_several_people_are_listed_with_their_frames_and_chosen_by_number(kind, 
         load_motion(path, person=3)
 
 
+def test_half_frames_of_cameras_are_refused(tmp_path):
+    tram()(tmp_path)
+    file = tmp_path / "hps" / "hps_track_0.npy"
+    values = np.load(file, allow_pickle=True).item()
+    np.save(file, values | {"frame": values["frame"] + 0.5}, allow_pickle=True)
+    with pytest.raises(MotionError, match=r"0\.npy: frame: expected whole numbers, got 0\.5 at"):
+        load_motion(file, fps=30)
+
+
 def test_frames_in_which_nobody_was_seen_are_filled(tmp_path, caplog):
     at = [0, 1, 4, 5]
     seen = np.asarray([10, 11, 14, 15])
