@@ -6,7 +6,6 @@ Phones put more behind a JPEG (a video, a map of gains, depth) and inside of its
 """
 
 import re
-import struct
 import zlib
 from typing import Any
 
@@ -121,14 +120,14 @@ def check_png_chunks(data: bytes) -> None:
     """Checks that a PNG file is whole, by the checksums of its chunks. It must have pixels, an end,
     and a palette if its pixels need one. Pillow decodes some files without these.
 
-    Raises: InvalidFileError, or another error for damaged chunks.
+    Raises: InvalidFileError.
     """
     at, names = 8, set()
     while at < len(data) and b"IEND" not in names:
-        length, name = struct.unpack(">I4s", data[at : at + 8])
+        length, name = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
         body, check = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
         if len(check) < 4 or zlib.crc32(name + body) != int.from_bytes(check, "big"):
-            raise ValueError(f"chunk {name!r} is damaged or cut off")
+            raise InvalidFileError(f"not a readable image: chunk {name!r} is damaged or cut off")
         names.add(name)
         at += 12 + length
     missing = {b"IDAT", b"IEND"} - names

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from humangs_jax.io.image_headers import iso_kind, jpeg_scans, webp_size
+from humangs_jax.io.image_headers import check_png_chunks, iso_kind, jpeg_scans, webp_size
 from humangs_jax.io.images import focal_length, image_size, orientation, read_image
-from humangs_jax.io.reading import FileError, Limits, set_limits
+from humangs_jax.io.reading import FileError, InvalidFileError, Limits, set_limits
 
 PHOTO = Image.fromarray(np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)).resize(
     (320, 240)
@@ -129,6 +129,14 @@ def test_a_damaged_photo_of_the_web_is_one_line(kind, tmp_path):
         with pytest.raises(FileError, match=r"a\.webp: ") as caught:
             read_image(tmp_path / "a.webp")
         assert "\n" not in str(caught.value)
+
+
+def test_a_png_that_is_cut_anywhere_is_refused_with_the_same_error():
+    whole = encoded("PNG", PHOTO.resize((4, 3)))
+    check_png_chunks(whole)
+    for cut in range(len(whole)):
+        with pytest.raises(InvalidFileError, match=r"not a readable image: .*cut off"):
+            check_png_chunks(whole[:cut])
 
 
 def test_further_brands_tell_what_a_photo_is_whose_first_does_not():
