@@ -16,6 +16,7 @@ import dataclasses
 import json
 import logging
 import math
+import numbers
 import os
 import re
 import reprlib
@@ -177,14 +178,18 @@ class _Shown(reprlib.Repr):
         return f"an integer of {x.bit_length():,} bits"
 
     def repr_instance(self, x: object, level: int) -> str:
-        """Shows texts, None, booleans and floats as `repr` does, also those of subclasses, and any
-        other object by the name of its type.
+        """Shows texts as `repr` does, also those of subclasses, None and numbers, also numpy's, as
+        `str` does, and any other object by the name of its type.
         """
         if isinstance(x, str):
             return self.repr_str(str(x), level)
-        if x is None or isinstance(x, bool | float):
-            return repr(x)[: self.maxother]
+        if x is None or isinstance(x, numbers.Number):  # numpy's `repr` also names the type
+            return str(x)[: self.maxother]
         return f"a {type(x).__name__}"
+
+    def repr_bool(self, x: object, level: int) -> str:
+        """Shows booleans, also numpy's, whose type has the same name."""
+        return str(x)
 
 
 def shown(value: object) -> str:

@@ -215,6 +215,24 @@ def test_values_of_files_are_shown_in_few_words_whatever_they_hold():
     )
 
 
+@pytest.mark.parametrize(
+    "value, text",
+    [
+        (np.float64(1.5), "1.5"),
+        (np.float32(0.1), "0.1"),
+        (np.float16("nan"), "nan"),
+        (np.int32(-3), "-3"),
+        (np.uint8(7), "7"),
+        (np.bool(True), "True"),
+        ([np.float64(1.5), {"a": np.int64(2)}], "[1.5, {'a': 2}]"),
+        (1.5, "1.5"),
+        (False, "False"),
+    ],
+)
+def test_numbers_of_numpy_are_shown_as_numbers(value, text):
+    assert shown(value) == text
+
+
 def test_a_folder_is_searched_once_however_many_links_lead_to_it(tmp_path, caplog):
     for name in ("a", "b"):
         (tmp_path / "in" / name).mkdir(parents=True)
