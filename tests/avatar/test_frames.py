@@ -40,10 +40,16 @@ def blobs(count=80):
 @pytest.mark.slow
 def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
     plans, gaussians = [], blobs()
-    real = frames.plan_buffers
-    monkeypatch.setattr(
-        frames, "plan_buffers", lambda *arguments: plans.append(1) or real(*arguments)
-    )
+
+    def counted(plan):
+        def call(*arguments):
+            plans.append(plan)
+            return plan(*arguments)
+
+        return call
+
+    for name in ("plan_near", "plan_buffers"):  # of the first frame, and of those without room
+        monkeypatch.setattr(frames, name, counted(getattr(frames, name)))
     focal = [5.0, 5.2, 150.0, 6.0]  # the third one comes close
     cameras = [
         Camera(jnp.asarray([[f, 0, 36], [0, f, 36], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64)
