@@ -75,7 +75,10 @@ def views_without_person(capture: Capture) -> dict[int, str]:
             if seen.mean() > LEAST_SHARE:
                 on_mask = on_mask[seen]
         if not len(on_mask) or on_mask.mean() < LEAST_SHARE:
-            found[i] = "mask and posed body hardly meet (`humangs check` draws both)"
+            border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
+            inverted = np.mean(border > MASK_THRESHOLD) > 0.5
+            guess = ": is the mask inverted?" if inverted else ""
+            found[i] = f"mask and posed body hardly meet{guess} (`humangs check` draws both)"
     return dict(sorted(found.items()))
 
 

@@ -49,8 +49,8 @@ def elsewhere(mask):
 SPOILED = {
     "empty": (lambda mask: 0 * mask, "the mask is empty"),
     "faint": (lambda mask: 0.4 * mask, "the mask is empty"),
-    "inverted": (lambda mask: 1 - mask, "hardly meet"),
-    "a spot elsewhere": (elsewhere, "hardly meet"),
+    "inverted": (lambda mask: 1 - mask, "hardly meet: is the mask inverted?"),
+    "a spot elsewhere": (elsewhere, "hardly meet ("),
 }
 
 
