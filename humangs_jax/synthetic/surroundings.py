@@ -249,8 +249,10 @@ def pick(u: Float[Array, "*b"], count: Int[Array, ""] | int) -> Int[Array, "*b"]
 
 CELL = 0.025
 """Edge of a voxel of the occupancy grid, metres."""
-GRID = (112, 104, 80)
-"""Numbers of voxels along x, y and z. Most poses fit in. What lies outside casts no shadow."""
+GRID = (112, 112, 80)
+"""Numbers of voxels along x, y and z. The tallest people with raised arms fit in. What lies outside
+casts no shadow.
+"""
 DARKEST = 0.4
 """Least share of the key light that arrives at a point in shadow."""
 SHOULDER = 0.72

@@ -367,6 +367,13 @@ def test_openness_is_how_empty_a_blurred_grid_is(bank, scene):
         assert lit[high].mean() > lit[low_down].mean() + 0.15
 
 
+def test_the_grid_of_shadows_holds_the_tallest_person_with_raised_arms():
+    arms = 1.23  # arms that point up reach this multiple of the stature; 1.22 was measured
+    empty = 6 + 3  # voxels below the person, and above: two are blurred into
+    room = (surroundings.GRID[1] - empty) * surroundings.CELL
+    assert room > arms * subject.HEIGHT_RANGE[1]
+
+
 def test_a_bank_is_a_source_of_its_split(bank, example):
     source = on_the_fly_source(bank, CONFIG, input_counts=(2,))
     assert source.split == "demo" and source.input_counts == (2,)
