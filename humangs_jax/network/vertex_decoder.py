@@ -257,12 +257,12 @@ def activate(
 ) -> VertexGaussians:
     """Returns the Gaussians that the heads' outputs stand for. Quaternions are normalised, scales
     go through a softplus, colors and opacities through a sigmoid. Offsets are bounded if
-    `config.offset_scale` is not None, and are turned to the axes of the canonical body, as are
-    rotations.
+    `VertexDecoder.offset_scale` is not None. Offsets and rotations are turned to the axes of the
+    canonical body.
 
     With shells, each Gaussian has weights of the shells that sum to 1. Its offset is added to the
-    weighted mean of the distances along the normal. With `config.residual_color`, its color is
-    relative to the weighted mean of the shells' photo colors, or without shells to the vertex's
+    weighted mean of the distances along the normal. With `VertexDecoder.residual_color`, its color
+    is relative to the weighted mean of the shells' photo colors, or without shells to the vertex's
     photo color.
 
     Raises: ValueError if the configuration needs photo colors and there are none.

@@ -389,10 +389,11 @@ def test_a_bank_is_a_source_of_its_split(bank, example):
 
 
 def test_each_person_of_a_bank_is_shown_once_in_order(bank, example, monkeypatch):
-    asked = []
+    asked, keys = [], []
 
     def make(bank, key, config, person):
         asked.append((person, config))
+        keys.append(key)
         return example
 
     monkeypatch.setattr(on_the_fly, "jitted_example", make)
@@ -401,7 +402,11 @@ def test_each_person_of_a_bank_is_shown_once_in_order(bank, example, monkeypatch
     for index in range(2):
         source.example(0, index, 3)
     assert [person for person, _ in asked] == [0, 1] and asked[0][1].input_views == 3
-    assert source.describe(0, 1, 3) == f"synthetic person {SEEDS[1]} in appearance 1"
+    # the appearance that is named is the one that is drawn
+    who, _, appearance = source.describe(0, 1, 3).rpartition(" ")
+    assert who == f"synthetic person {SEEDS[1]} in appearance"
+    drawn = on_the_fly.subject_key(SEEDS[1], int(appearance))
+    np.testing.assert_array_equal(jax.random.key_data(drawn), jax.random.key_data(keys[1]))
 
 
 @pytest.mark.parametrize("people", [1, 7, 1000, 20_000])

@@ -441,7 +441,7 @@ def _make_video(
     progress: bool,
 ) -> None:
     """Make the scene of a video from all cameras, and from the frames whose number is a multiple of
-    `settings.every`.
+    the setting `every`.
     """
     # the frames to take
     subject = DATASETS[settings.kind](source, body)
