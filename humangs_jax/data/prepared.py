@@ -15,6 +15,7 @@ from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.pytree import short_repr
 from humangs_jax.data.body_and_masks import report_left_out, views_without_person
 from humangs_jax.data.capture import Capture
@@ -146,13 +147,15 @@ def prepare_capture(
 
     Raises:
         CaptureError: one line that names the views, if none shows the person.
-        ValueError: for `views` below 1.
+        ValueError: for `views` below 1, or a word other than "auto".
 
     Examples:
         >>> variables, config = hg.load_weights()
         >>> photos = hg.prepare_capture(hg.load_capture("demo_capture"), config)
         >>> avatar = hg.refine(hg.reconstruct(variables, config, photos), photos)
     """
+    if isinstance(views, str) and views != "auto":
+        raise ArgumentError("views", f'{views!r}: expected a number from 1, "auto" or None')
     # which views show the person
     prepared, is_new = capture, False
     if isinstance(prepared, Capture):

@@ -129,6 +129,10 @@ def find_people(
     Raises: ValueError naming what is wrong; TypeError for cases that are no `Case`; CaptureError
     when a capture is loaded.
     """
+    if indices is not None and not isinstance(source, Capture | str | Path):
+        raise ValueError(
+            "indices: expected none, since cases and sources say what is input and what is compared"
+        )
     if isinstance(source, Case):
         return People((source.name,), lambda index: source)
     # captures: one, or a folder of them

@@ -85,8 +85,8 @@ def _file_key(file: Path) -> str:
 
 
 def case_key(case: Case) -> str:
-    """Returns a checksum of the name of a case and of its captures: photos, masks, unknown pixels,
-    cameras, frames, poses, body, betas, displacement and names.
+    """Returns a checksum of the name of a case and of its captures, with all fields that a
+    reconstruction or a score depends on: all but `body_file`.
     """
     inputs = "none"
     if case.inputs is not None:
@@ -101,12 +101,15 @@ def _capture_key(capture: Capture) -> str:
         "frames": capture.frames,
         "betas": capture.betas,
     }
-    moved = {"displacement": capture.displacement, "unknown": capture.unknown}
+    optional = {name: getattr(capture, name) for name in ("displacement", "unknown", "gains")}
     known = {
-        name: np.asarray(array) for name, array in {**arrays, **moved}.items() if array is not None
+        name: np.asarray(array)
+        for name, array in {**arrays, **optional}.items()
+        if array is not None
     }
     placed = _tree_key((capture.cameras, capture.poses))
-    return checksum(known, placed, _tree_key(capture.body), repr(capture.names))
+    others = repr((capture.names, capture.calibrated))
+    return checksum(known, placed, _tree_key(capture.body), others)
 
 
 def indices_key(indices: Mapping[str, Any] | None) -> str | None:

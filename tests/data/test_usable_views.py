@@ -330,3 +330,8 @@ def test_without_masks_nothing_is_changed(demo):
     np.testing.assert_array_equal(exposure_gains(bare), 1)
     nobody = dataclasses.replace(demo, masks=np.zeros_like(demo.masks))
     np.testing.assert_array_equal(exposure_gains(nobody), 1)
+
+
+def test_a_number_of_views_that_is_another_word_is_refused(demo):
+    with pytest.raises(ValueError, match="'autos': expected a number from 1"):
+        prepare_capture(demo, views="autos")

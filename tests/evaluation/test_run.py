@@ -16,13 +16,13 @@ from small import small_body
 import humangs_jax as hg
 from humangs_jax import cli
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.capture import save_capture
+from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading import Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.evaluation import run as evaluation
 from humangs_jax.evaluation.cases import Case, Predicted, _short_names, find_people, spread_views
-from humangs_jax.evaluation.kept import method_key
+from humangs_jax.evaluation.kept import case_key, method_key
 from humangs_jax.io.images import write_png
 
 NAMES = ("front", "left", "back", "right")
@@ -510,3 +510,18 @@ def test_the_command_goes_on_after_an_interruption(people, folders, tmp_path, mo
     os.utime(max(folders.rglob("*.png"), key=lambda file: len(file.parts)), (0, 0))  # deep in there
     interrupting.clear()
     assert run() == 0 and len(scored) == 3 and "going on" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("field", ["gains", "calibrated"])
+def test_the_key_of_a_case_depends_on_how_its_capture_was_taken(field):
+    capture = load_capture("demo_capture").resized(32)
+    other = {"gains": np.full((capture.view_count, 3), 0.9, np.float32), "calibrated": False}
+    changed = dataclasses.replace(capture, **{field: other[field]})
+    assert case_key(Case("a", capture)) != case_key(Case("a", changed))
+
+
+def test_indices_are_refused_where_cases_say_what_is_compared():
+    case = Case("a", load_capture("demo_capture").resized(32))
+    for source in (case, [case]):
+        with pytest.raises(ValueError, match="indices: expected none, since cases"):
+            find_people(source, indices={"a": {"context": [0], "target": [1]}})
