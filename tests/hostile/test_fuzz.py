@@ -158,7 +158,8 @@ def taken_apart(data):
     with contextlib.suppress(ValueError):
         json.loads(data)
         return of_json
-    with contextlib.suppress(ValueError):  # joblib has arrays between the instructions
+    # joblib has arrays between the instructions; a text may have escapes that Python warns of
+    with contextlib.suppress(ValueError, DeprecationWarning):
         list(pickletools.genops(data))
         return of_pickle
     return of_text if data.isascii() else of_bytes
