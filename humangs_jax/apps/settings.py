@@ -159,7 +159,7 @@ def reconstruct_with(
     settings: Settings | str,
     variables: Variables,
     config: HumanGSConfig,
-    capture: Capture,
+    capture: Capture | PreparedCapture,
     progress: bool = False,
 ) -> Avatar:
     """Makes an avatar of the person of a capture: calls `reconstruct`, then `refine` if the
@@ -169,7 +169,7 @@ def reconstruct_with(
         settings: the settings, or the name of one of `PRESETS`.
         variables: of the network. `load_weights` returns them with `config`.
         config: of the network. The settings replace its runtime.
-        capture: the photos. `Settings.photos` chooses those that are used.
+        capture: the photos, of which `Settings.photos` chooses those that are used, or its result.
         progress: whether to show the progress of refinement.
 
     Returns:
