@@ -108,7 +108,7 @@ def views_of(people: Path, photos: int, body: Path | None, varying: bool) -> Vie
         photos: number of inputs
         body: body model of a data set
         varying: whether each input shows another pose and side, and targets show poses that no
-            input shows, as far as there are so many poses
+            input shows, where there are enough poses
     """
     # the frames and cameras of each person
     names, found = find_people(people, None, {}, body).names, {}

@@ -85,7 +85,7 @@ def run_demo(
         frame_size: side of the animation's frames, pixels.
         refine: how the avatar is refined by its photos; None: not at all.
         settings: settings that decide which photos are used, how the network runs, and how frames
-        are drawn. Their refinement is ignored. None: `Settings()`.
+            are drawn. Their refinement is ignored. None: `Settings()`.
     """
     report: dict[str, Any] = {}
     settings = settings or Settings()

@@ -480,7 +480,8 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
 
     Arguments: person: the number that was asked for; None: none was. sheet: where the numbers can
     be looked up. It is written if the choice fails.
-    Raises: ValueError if no photo has a person, if none has this number, if several may be meant,
+    Raises: ValueError if no photo has a person, if none has this number, if photos show several
+    large people and none was asked for,
     or if it is unclear who is who.
     """
     try:
@@ -621,7 +622,8 @@ def write_found(
     Arguments:
         masks: whether to write masks.
         to_capture: whether the folder is the capture that has the photos. Then capture.json is
-        changed to name the masks, and unknown/ gets the places where others may hide the person.
+            changed to name the masks, and unknown/ gets the places where others may hide the
+            person.
         overwrite: whether files that were not written by this function may be replaced, too.
     Raises: ValueError if the names of two photos differ in the suffix only, or if a file of others
     is in the way, see `check_found_place`.

@@ -145,17 +145,17 @@ def avatar_from_photos(
         photos: folder of photos, which may also have cameras, masks and keypoints, or a video.
         out: the capture folder to write.
         cameras: file or folder of the calibration, if it is not in `photos`. "ignore": the
-        calibration in `photos` is ignored, and the cameras are found from the person.
+            calibration in `photos` is ignored, and the cameras are found from the person.
         masks: folder of the masks, if it is not in `photos`.
         others: folder of masks of what is in front of the person, if it is not in `photos`.
         keypoints: file or folder of keypoints, if it is not in `photos`.
         person: number of the person, if several people are in the photos. It is the number in the
-        file of keypoints, or on people.png if there is no such file.
+            file of keypoints, or on people.png if there is no such file.
         height: height of the person, metres. It gives the scale if there is no calibration. None:
-        that of an average person.
+            that of an average person.
         scale: metres per unit of the calibration. None: 1.
         up: axis of the calibration's world that points up, such as "+z". None: that of the
-        calibration's format.
+            calibration's format.
         without_masks: whether masks are not used, because there is only white behind the person.
         fit_masks: whether the boundaries of masks are moved to the edges in the photos.
         refinement: how the avatar is refined. None: not at all.
@@ -166,7 +166,7 @@ def avatar_from_photos(
 
     Raises:
         ValueError: if something is missing or wrong. The message is one line that names the file or
-        the argument.
+            the argument.
         OSError: if another process writes `out`.
         KeyboardInterrupt: if refinement was interrupted.
 
@@ -264,7 +264,7 @@ class FromPhotos:
             yield from self._go_on(material, ahead)
 
     def _check_lengths(self, material: PhotoFolder) -> None:
-        """Checks that scale and direction are not given twice.
+        """Checks that size and up axis have one source: a calibration or an option.
 
         Raises: ArgumentError for a height with a calibration, or for a scale or an axis without
         one.

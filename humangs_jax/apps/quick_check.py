@@ -149,8 +149,8 @@ def faults(capture: Capture) -> Faults:
 
 
 class _View(NamedTuple):
-    """What is compared of one view, as numpy arrays. JAX would compile each of the small
-    operations.
+    """What is compared of one view. The arrays are NumPy's, because JAX would compile each small
+    operation.
     """
 
     name: str

@@ -169,7 +169,8 @@ def reconstruct_with(
         settings: the settings, or the name of one of `PRESETS`.
         variables: of the network. `load_weights` returns them with `config`.
         config: of the network. The settings replace its runtime.
-        capture: the photos, of which `Settings.photos` chooses those that are used, or its result.
+        capture: a capture, or a prepared one as `Settings.photos` returns it. The settings choose
+            which of its photos are used.
         progress: whether to show the progress of refinement.
 
     Returns:
@@ -285,7 +286,7 @@ def tune(
         config: of the network.
         capture: the person to reconstruct.
         reconstruct_ms: longest time in which the avatar may be made, with refinement, milliseconds.
-        None: no limit.
+            None: no limit.
         frame_ms: longest time that a frame may take, milliseconds. None: no limit.
         memory_mb: most memory that this may add to the process, MiB. None: no limit.
         size: side of the frames, pixels.
@@ -297,7 +298,7 @@ def tune(
 
     Raises:
         ValueError: if no preset is within the budget; the message has the costs of the fastest.
-        Also if memory is limited where it cannot be measured.
+            Also if memory is limited where it cannot be measured.
 
     Examples:
         >>> tuned = hg.tune(*hg.load_weights(), capture, frame_ms=33)

@@ -355,7 +355,7 @@ def held_out_psnr(
         variables, config: of the network.
         refinement: how the avatar is refined; None: not at all.
         number: which photo is held out. 0 is the photo with the nearest neighbour, 1 the next in
-        this order.
+            this order.
         watch: called with the avatar of the other photos, before refinement, and these photos.
     """
     photos = _photos_to_hold_out(capture)

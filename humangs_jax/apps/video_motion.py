@@ -115,11 +115,11 @@ def motion_from_video(
     Args:
         video: the file.
         person: number of the person, from 0. People are counted from the largest to the smallest,
-        in the first frame that shows so many. None: the largest.
+            in the first frame that shows more people than this number. None: the largest.
         height: height of the person, metres. It gives the motion its scale. None: that of an
-        average person.
+            average person.
         avatar: an avatar to which the motion is fitted. Its body takes the place of a body with the
-        person's shape, and its size gives the scale.
+            person's shape, and its size gives the scale.
         focal_mm: focal length of the camera, millimetres on 35-mm film. None: that of a telephone.
 
     Returns:
@@ -350,8 +350,8 @@ class _Follower:
 def _row(
     photo: Float[np.ndarray, "h w 3"], found: Landmarks | None, parts: Any
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays that are kept of a frame. They are 0 if nobody was found, and `face` is
-    NaN if the face is not seen.
+    """Returns the arrays that are kept of a frame. If nobody was found, all but `face` are 0.
+    `face` is NaN without a person, or if the face is not seen or too small.
     """
     if found is None:
         shapes = {"points": (2,), "confidences": (), "world": (3,)}

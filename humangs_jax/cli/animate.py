@@ -101,7 +101,7 @@ class Animate:
     loop: int = 1
     """How often to play the motion. Each repetition starts where the last one ended."""
     preset: Preset | None = None
-    """Preset of splatting, from fast to accurate, if --splat is not given (docs: tradeoff)."""
+    """Preset of splatting, from fast to accurate (docs: tradeoff). --splat overrides it."""
     config: Path | None = None
     """Like --preset, with the settings in a file of `humangs tune`."""
 
@@ -228,7 +228,7 @@ class Render:
     exr_type: Literal["float", "half"] = "float"
     """Number type of views.exr. With half, depths and positions still have 32 bits."""
     preset: Preset | None = None
-    """Preset of splatting, from fast to accurate, if --splat is not given (docs: tradeoff)."""
+    """Preset of splatting, from fast to accurate (docs: tradeoff). --splat overrides it."""
     config: Path | None = None
     """Like --preset, with the settings in a file of `humangs tune`."""
 

@@ -55,8 +55,8 @@ class Demo:
     Default: 15s, or as --preset says.
     """
     preset: Preset | None = None
-    """Preset, from fast to accurate (docs: tradeoff), for photos, network and splatting, and for
-    refinement if --refine is not given.
+    """Preset, from fast to accurate (docs: tradeoff), for photos, network, refinement and
+    splatting. --refine overrides the refinement.
     """
 
     def run(self) -> None:

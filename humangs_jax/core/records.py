@@ -32,8 +32,8 @@ class Part(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """A mark of an annotation that names the batch axes of a record, which is a field of another
-    record.
+    """Marks a field that is itself a record, and names the batch axes that all arrays of that
+    record have in front: `cameras: Annotated[Camera, Batch("v")]`.
     """
 
     axes: str

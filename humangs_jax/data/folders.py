@@ -188,8 +188,8 @@ def photo_of_mask(name: str) -> str | None:
 
 
 def _masks_beside(pictures: Iterable[Path]) -> dict[Path, Path]:
-    """Returns the photo of each mask. A picture is a mask if its name is that of the mask of
-    another picture in the same folder.
+    """Returns the photo of each mask. A picture is a mask if its name is made from the name of
+    another picture in the same folder (see `photo_of_mask`).
     """
     pictures = list(pictures)
     named: dict[tuple[Path, str], Path] = {}

@@ -46,13 +46,15 @@ class PreparedCapture:
     in `capture`.
     """
     up: str
-    """The axis that points up in the world of `given`: "y", "z", "-z" and the like."""
+    """The axis that points up in the world of `given`: "y", "z", "-z" and the like; "y" if that is
+    not certain.
+    """
     chosen: bool = False
     """Whether only some of the views that show the person are used, see `select`."""
     body: BodyModel | None = None
     """The body that carries the Gaussians, with a skirt where the photos show one.
 
-    None: prepared without a network, as `refine` needs it.
+    None if the capture was prepared without a network. That is enough for `refine`.
     """
     displacement: Float[np.ndarray, "n 3"] | None = None
     """The displacements of the vertices of the shaped `body` in the T-pose, (n, 3), metres. None:

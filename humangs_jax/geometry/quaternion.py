@@ -65,9 +65,11 @@ def candidates_from_matrix(
     """Returns the four quaternions that a rotation matrix can be read as, (..., 4, 4), and how well
     conditioned each is, (..., 4).
 
-    The second result is q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)). Candidate c is row c divided by
-    2 max(q_abs, 0.1). For a rotation, candidates with q_abs of at least 0.1 are equal but for their
-    signs, and others are shorter. For another matrix they differ.
+    Let M be the symmetric matrix (4, 4) that is 4 q q^T for a rotation. Its diagonal is
+    1 ± m00 ± m11 ± m22, with no or two minus signs. The second result is
+    q_abs = sqrt(max(0, diagonal)). Candidate c is row c of M divided by 2 max(q_abs, 0.1). For a
+    rotation, candidates with q_abs of at least 0.1 are equal but for their signs, and others are
+    shorter. For another matrix they differ.
     """
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     squared = jnp.stack(

@@ -114,8 +114,8 @@ def _number(row: Sequence[str], index: int, name: str, line: int) -> float:
 
 
 def _times(codes: Sequence[str], asked: float | None) -> tuple[float, np.ndarray | None, str]:
-    """Returns frames per second, the numbers of the frames, (m,), or None if they are consecutive,
-    and a note, or "".
+    """Returns three values: frames per second; the numbers of the frames, (m,), or None if the
+    timecodes do not give them; and a note, "" if there is none.
 
     codes: the timecode of each frame. asked: the rate that the user gave, or None.
     """

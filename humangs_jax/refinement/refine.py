@@ -68,8 +68,8 @@ class Refinement:
     head_steps: int = 0
     """Steps of the optimizer on the head alone; 0 if they were not kept."""
     moved: bool = False
-    """Whether photos were moved by pixels, because the person or the pose is not the same in all
-    photos. Then `loss` and `psnr` compare with the moved photos.
+    """Whether the photos were warped to match one another: the person has moved between them, or
+    a pose or a camera is off. If so, `loss` and `psnr` compare with the warped photos.
     """
 
     def summary(self) -> str:

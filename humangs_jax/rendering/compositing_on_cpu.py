@@ -157,7 +157,7 @@ class _BackwardChain(NamedTuple):
     seen: Float[Array, "block p"]
     """Sum of w g . f so far."""
     sums: Float[Array, "g width"]
-    """The sums to return, of all splats so far."""
+    """The result: a row for each splat, summed over the chunks and blocks so far."""
 
 
 @functools.lru_cache

@@ -97,8 +97,8 @@ def mcmc_relocate(
         key: of `jax.random`.
         parameters: of all slots, by `unconstrain`.
         used: (g,) which slots are Gaussians.
-        count: number of slots that are used afterwards, if there are so many. None, or fewer than
-            now: as many as now.
+        count: number of slots that are used afterwards, at most all of them. None, or a smaller
+            number than now: the number does not change.
 
     Returns:
         Parameters, which slots are used, and which slots have changed.

@@ -74,8 +74,9 @@ def random_numbers(key: Key, views: SubjectViews) -> Numbers:
 
 
 def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -> Example:
-    """Returns the example with errors. All inputs of a share of the examples have errors, and so do
-    the betas of their targets. Other examples have errors of exposure and tint only.
+    """Returns the example with random errors. With the probability `Augmentation.share` they are in
+    photos, masks, cameras, poses and betas, and the targets get the same betas. Otherwise they are
+    in the exposure and tint of the input photos only.
 
     Pure and jittable.
     """

@@ -28,7 +28,7 @@ CONFIG = tiny()
 
 @pytest.fixture
 def measured(monkeypatch, body):
-    """Returns a function (rows, pairs, config) -> configuration for targets that need so many.
+    """Returns a function (rows, pairs, config) -> configuration for targets with these needs.
 
     The usual room is 4000, and any measurement is worth its time.
     """

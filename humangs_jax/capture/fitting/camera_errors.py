@@ -62,7 +62,9 @@ class _Decision:
     is reported.
     """
     alike: float = 0.9
-    """Share of the gain from which on another camera explains as much."""
+    """If another camera, turned in place of the reported one, lowers the cost by more than this
+    share of what the reported one does, it is named as a possible cause, too.
+    """
     most_cameras: int = 64
     """Largest number of cameras. With more, errors are not looked for."""
 

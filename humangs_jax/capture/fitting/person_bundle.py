@@ -249,7 +249,9 @@ def pixel_errors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "c k 2"]:
 
 
 def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
-    """Returns the residuals of a rig. scale: robust scale of pixels, standard deviations."""
+    """Returns the residuals of a rig. scale: the scale of the robust loss (Geman-McClure) of pixel
+    errors, in standard deviations of the detections. Much larger errors count as about `scale`.
+    """
     root, turned = np.sqrt(evidence.weights)[..., None], _turned(rig)
     errors = pixel_errors(evidence, rig) / evidence.noise[:, None, None]
     errors = errors * scale / np.sqrt(scale**2 + np.sum(errors**2, axis=-1, keepdims=True))
@@ -271,8 +273,8 @@ def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
 
 
 def derivatives(evidence: Evidence, rig: Rig, scale: float) -> Derivatives:
-    """Returns the derivatives of `residuals`. The mean of a view is a separate unknown here, which
-    does not change the minimum.
+    """Returns the derivatives of `residuals`, with one change: the mean of a view's landmarks,
+    which `residuals` computes, is a separate unknown. The minimum is the same.
     """
     root, turned = np.sqrt(evidence.weights)[..., None, None], _turned(rig)
     c, k = evidence.weights.shape

@@ -193,7 +193,7 @@ class Explanation:
     """The answer of `explain`: cameras of one moment, or none."""
 
     trial: Trial | None
-    """Cameras of `views`. None: each photo stands for itself."""
+    """Cameras of `views`. None: no cameras explain several photos of one moment."""
     views: tuple[int, ...]
     """Indices of the photos that the trial explains. These are all, or all but one."""
     warnings: tuple[str, ...] = ()
@@ -202,7 +202,7 @@ class Explanation:
 
 def explain(seen: PersonViews) -> Explanation:
     """Returns the cameras that explain all photos, or all but one, by one person in one pose. If
-    there are no such cameras, each photo stands for itself.
+    there are no such cameras, the explanation has no trial, and each photo counts as a moment.
     """
     every = tuple(range(len(seen.photos)))
 
@@ -232,7 +232,7 @@ def explain(seen: PersonViews) -> Explanation:
             f"{which} are from one side (directions differ by {angle:.1f} degrees, expected"
             f" {ONE_MOMENT.least_angle:.0f} or more)"
         )
-        return Explanation(None, every, (f"{side}: each photo stands for itself",))
+        return Explanation(None, every, (f"{side}: each photo counts as a moment",))
 
     out = [seen.photos[view] for view in every if view not in views]
     left = "left out: it shows another moment than the others, or was not understood"

@@ -369,8 +369,7 @@ class SilhouetteFit:
     """Pixels where the masks say nothing, (v, h, w). None: there are no such pixels."""
     hidden: list[Bool[np.ndarray, "h w"] | None]
     """For each view, the pixels where its mask says nothing and a rim around them, (h, w). In the
-    rim the edge of the mask is the edge of what stands in front. None for a view without such
-    pixels.
+    rim the mask ends at an object in front of the person. None for a view without such pixels.
     """
     faces: Int[np.ndarray, "f 3"]
     """Faces of the body, (f, 3)."""

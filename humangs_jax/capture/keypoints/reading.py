@@ -143,7 +143,7 @@ def read_keypoints(
         names: names of the capture's views. Images of the file are matched by name, or by the
             number in the name if the file has only numbers. Images that match no view are ignored.
         width, height: size of the capture's photos, pixels. The keypoints have to be in photos of
-        this size, or in photos of several sizes that were padded to it when they were imported.
+            this size, or in photos of several sizes that were padded to it when they were imported.
         person: number of the person to take where several people are seen, from 0 in the order of
             the file. None: the only person.
 
