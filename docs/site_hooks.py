@@ -3,27 +3,39 @@ the site.
 """
 
 import os
+import posixpath
 import re
 import subprocess
 import sys
 import textwrap
+from typing import Any
 
 COMMANDS = "<!-- commands -->"
 """Where docs/cli.md gets the help of every command."""
-OUTSIDE = re.compile(r"\[([^\]]*)\]\((?:\.\./)+(?!images/|api/)([^)\s]+)\)")
-"""A link that leaves docs/: right on a checkout, and nothing on the site."""
+UPWARDS = re.compile(r"\[([^\]]*)\]\(((?:\.\./)+[^)\s]+)\)")
+"""A link that leaves the folder of its page."""
 
 
-def on_page_markdown(markdown: str, **_: object) -> str:
-    """Called by mkdocs for the text of every page."""
+def on_page_markdown(markdown: str, page: Any, **_: object) -> str:
+    """Called by mkdocs for the text of every page. Links that leave docs/ are right on a checkout,
+    and lead nowhere on the site: they become names of files.
+    """
     if COMMANDS in markdown:
         markdown = markdown.replace(COMMANDS, commands())
-    return OUTSIDE.sub(_named, markdown)
+    folder = posixpath.dirname(page.file.src_uri)
+
+    def shown(link: re.Match[str]) -> str:
+        target = posixpath.normpath(posixpath.join(folder, link[2]))
+        if not target.startswith("../"):
+            return link[0]
+        return _named(link[1], target.removeprefix("../"))
+
+    return UPWARDS.sub(shown, markdown)
 
 
-def _named(link: re.Match[str]) -> str:
-    """The text of a link with its file, once."""
-    return f"`{link[2]}`" if link[2].endswith(link[1].strip("`")) else f"{link[1]} (`{link[2]}`)"
+def _named(text: str, file: str) -> str:
+    """Returns the text of a link with its file, once."""
+    return f"`{file}`" if file.endswith(text.strip("`")) else f"{text} (`{file}`)"
 
 
 def commands() -> str:
