@@ -1,12 +1,12 @@
-"""Poses the Gaussians of an avatar by blend skinning alone: the network is not run again. Also
-makes the low-pass of images a part of the scales, so that an avatar looks the same in images of
-every size.
+"""Poses the Gaussians of an avatar by blend skinning, without running the network again. Also makes
+the low-pass of images a part of the scales, so that an avatar looks the same in images of every
+size.
 
-A renderer adds `EPS2D` pixels^2 to the variances of each Gaussian, whatever the size of the image.
-Gaussians that fit images of one size are therefore too wide in smaller images, and too narrow in
-larger ones. Here all but `MIP_EPS2D` of it goes into the scales, for the size of the images that
-they fit (after Mip-Splatting, https://arxiv.org/abs/2311.16493), and `Gaussians.pixel_footprint`
-tells renderers so.
+A renderer adds `EPS2D` pixels^2 to the projected variances of each Gaussian, whatever the size of
+the image. Gaussians that fit images of one size are therefore too wide in smaller images, and too
+narrow in larger ones. Here `EPS2D - MIP_EPS2D` pixels^2 are added to the squared scales, with the
+pixels of the images that the Gaussians fit (after Mip-Splatting, https://arxiv.org/abs/2311.16493).
+`Gaussians.pixel_footprint` holds the size of these pixels, and renderers then add only `MIP_EPS2D`.
 """
 
 import jax
@@ -45,16 +45,17 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
 
     Args:
         avatar: one person.
-        pose: rotations (j, 3), axis-angle; translation (3,), metres; of an avatar with a face also
-            an expression.
+        pose: rotations (j, 3), axis-angle; translation (3,), metres. If the avatar has a face, the
+            pose may have an expression.
 
     Returns:
         Posed Gaussians, metres. Colors stay, or are re-shaded for the pose if the avatar has a
-        light. With an expression those of teeth, tongue and lids come behind the others.
+        light. If the pose has an expression, the Gaussians of teeth, tongue and lids come after the
+        others.
 
     Raises:
-        ValueError: for an expression of an avatar without a face, or one of another number of
-            coefficients.
+        ValueError: if the pose has an expression, and the avatar has no face or a face with another
+            number of coefficients.
 
     Examples:
         >>> image = lambda pose: hg.render(hg.skin(avatar, pose), camera, config).rgb
@@ -73,12 +74,13 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
 
 
 def _with_expression(avatar: Avatar, pose: BodyPose) -> tuple[Avatar, BodyPose]:
-    """Returns the avatar in T-pose with the face that the pose's expression makes, and the pose
-    without its expression but with the joints that the expression turns.
+    """Returns the avatar in T-pose with the pose's expression on its face, and the pose without its
+    expression. The rotations of the returned pose contain the turns of joints that the expression
+    makes.
 
-    Hidden Gaussians become ordinary Gaussians behind the others, and follow the head. Gaussians of
-    an eye follow its joint. Raises: ValueError for an avatar without a face, or a pose of other
-    expressions.
+    Hidden Gaussians become ordinary Gaussians after the others, and follow the head. Gaussians of
+    an eye follow the joint of the eye. Raises: ValueError if the avatar has no face, or if the
+    expression has another number of coefficients than the face.
     """
     face, expression = avatar.face, pose.expression
     if face is None or expression is None:
@@ -107,7 +109,7 @@ def _with_expression(avatar: Avatar, pose: BodyPose) -> tuple[Avatar, BodyPose]:
 
 def with_hidden_among(avatar: Avatar, hidden: Gaussians) -> Avatar:
     """Returns the avatar without its face. The hidden Gaussians of the face become ordinary
-    Gaussians behind the others, and follow the head.
+    Gaussians after the others, and follow the head.
     """
     face, names = avatar.face, avatar.joint_names
     assert face is not None
@@ -133,21 +135,23 @@ def with_hidden_among(avatar: Avatar, hidden: Gaussians) -> Avatar:
 
 @checked_arguments
 def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
-    """Returns the avatar in a pose, as Gaussians that means, quats and scales describe completely.
+    """Returns the avatar in a pose, as Gaussians without `deformations`.
 
     The linear deformation is factored into quaternions and scales. These are not differentiable
-    where two scales coincide: optimise through `skin`.
+    where two scales coincide. Use `skin` to optimise.
 
     Args:
         avatar: one person.
-        pose: rotations (j, 3), axis-angle; translation (3,), metres.
+        pose: rotations (j, 3), axis-angle; translation (3,), metres. If the avatar has a face, the
+            pose may have an expression.
 
     Returns:
         Posed Gaussians, metres.
 
     Raises:
-        ValueError: if the pose has another number of joints than the avatar; outside of
-            transformations, also for values that are not finite or out of range, naming the array.
+        ValueError: if the pose has another number of joints than the avatar, or is a batch of
+            poses. Outside of JAX transformations also if values are not finite or out of range; the
+            message names the array.
 
     Examples:
         >>> image = hg.render(hg.animate(avatar, capture.pose(0)), camera).rgb
@@ -181,11 +185,11 @@ def _animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
 
 
 def with_pixel_footprint(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> Avatar:
-    """Returns the avatar whose scales contain the low-pass of images with pixels of this size,
-    metres.
+    """Returns the avatar with the low-pass of images in its scales.
 
-    An avatar that is drawn by other conventions than "exact", or has a low-pass already, is
-    returned as it is.
+    pixel: side of a pixel of these images at the Gaussians, metres, one number or one for each
+    Gaussian. The avatar is returned as it is if its `rendering` is not "exact", or if its scales
+    contain a low-pass already.
     """
     gaussians = avatar.gaussians
     if avatar.rendering != "exact" or gaussians.pixel_footprint is not None:
@@ -204,18 +208,20 @@ def with_pixel_footprint(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> A
 
 
 def without_pixel_footprint(avatar: Avatar) -> Avatar:
-    """Returns the avatar that was given to `with_pixel_footprint`."""
+    """Returns the avatar without the low-pass in its scales. This undoes `with_pixel_footprint`,
+    except that no scale is below 10 micrometres.
+    """
     gaussians = avatar.gaussians
     scales = widened(gaussians.scales, gaussians.pixel_footprint, -1)
     return replace(avatar, gaussians=replace(gaussians, scales=scales, pixel_footprint=None))
 
 
 def with_pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Avatar:
-    """Returns the avatar with the low-pass of the photos that it will be fitted to, unless its own
-    low-pass is that of smaller pixels.
+    """Returns the avatar with the low-pass of the photos that it will be fitted to. A Gaussian
+    keeps its low-pass if this is for smaller pixels.
 
-    The avatar looks as before. The part by which its own low-pass was larger becomes part of the
-    scales, which a fit can reduce.
+    The avatar looks as before. Where its low-pass was larger, the difference is now an ordinary
+    part of the scales, which a fit can reduce.
     """
     return replace(avatar, gaussians=_pixel_footprint_of(avatar, views))
 
@@ -230,10 +236,10 @@ def _pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Gaussians:
 
 @jax.jit
 def pixel_sizes(avatar: Avatar, views: SubjectViews) -> Float[Array, " g"]:
-    """Returns the size of a photo's pixel at each Gaussian, metres, in the photo that shows the
-    Gaussian largest.
+    """Returns the side of a photo's pixel at each Gaussian, metres. Of the photos that contain a
+    Gaussian, the one with the smallest pixels there counts.
 
-    Gaussians outside of all frames get the largest value of the others.
+    Gaussians outside of all photos get the largest value of the others.
     """
 
     def in_photo(photo):

@@ -41,39 +41,47 @@ COLORS = {
 }
 """The RGB colors of parts that no photo shows. Lids have the color of the skin around the eye."""
 CLOSING = 4.0
-"""The opacity of a lid per unit of the coefficient of its blink."""
+"""How fast a lid appears: the shown share of its opacity is this factor times the coefficient of
+its blink, up to 1.
+"""
 OPAQUE = 0.97
 COVER = 0.6
-"""Standard deviation of a hidden Gaussian over the side of its face: neighbors overlap without
-gaps.
+"""Standard deviation of a hidden Gaussian along a side of its quadrangle, divided by the length of
+the side. Neighbours overlap without gaps.
 """
 THICKNESS = 0.25
-"""The thickness of a hidden Gaussian as a share of its smaller side."""
+"""Standard deviation of a hidden Gaussian along its normal, divided by the length of the shorter
+side of its quadrangle.
+"""
 LID_LIFT = 0.003
-"""Metres by which lids lie in front of the body's lids, because Gaussians of the eye are as
-thick.
+"""The Gaussians of lids are moved out along their normals by this distance, metres, because the
+Gaussians of the eye are about as thick.
 """
 EYE = (0.0165, 0.0095, 0.005, 0.03)
-"""Metres: half the width and half the height of the opening between the lids, then the least and
-the largest distance in front of the eye's centre at which Gaussians show the eye.
+"""Four lengths in metres: half of the width and half of the height of the opening between the lids,
+then the least and the largest distance from the eye's centre, forwards, that Gaussians of the eye
+have.
 """
 SOFT = 0.3
-"""The share of the opening over which a Gaussian belongs to the eye in part."""
+"""Gaussians outside of the opening belong to the eye in part, until they are this share of the
+opening's radius beyond its edge.
+"""
 AROUND_EYE = (0.02, 0.045)
 """Distances from the centre of an eye, metres, between which skin gives its color to the lids."""
 BESIDE = 8
-"""The most neighbours of a vertex from which its stretch is found."""
+"""The largest number of neighbours from which the stretch of a vertex is computed."""
 RIDGE = 0.01
-"""Weight of the ridge, relative to the sum of the squared edges. It keeps skin from being stretched
-along its normal, about which edges say little.
+"""Weight of the ridge, relative to the sum of the squared lengths of the edges at a vertex. It
+keeps skin from being stretched along its normal, because the edges hardly extend in this direction.
 """
 NEAR = {"mouth": 0.06, "lid": 0.04}
-"""Metres around teeth or lids. Vertices within them, compared with those of the mean body, say
-where teeth or lids belong.
+"""Radii around the middle of the mouth's parts and around the middle of a lid, metres. Where the
+vertices within a radius lie on the avatar, compared with the mean body, decides where the parts are
+put.
 """
 FEWEST = 12
-"""The least number of vertices for an affine map. If fewer are near, that many nearest ones are
-taken.
+"""The least number of vertices from which an affine map is computed. If fewer are within the
+radius, the `FEWEST` nearest vertices are taken.
 """
 
 
@@ -82,8 +90,8 @@ taken.
 
 
 def shipped_network() -> HumanGSConfig:
-    """Returns the configuration of the shipped weights, without reading their tensors; the default
-    one if no weights are shipped.
+    """Returns the configuration of the shipped weights, without reading their tensors. If no
+    weights are shipped, it is the default configuration.
     """
     with resources.as_file(resources.files("humangs_jax") / SHIPPED) as file:
         metadata = {}
@@ -95,10 +103,11 @@ def shipped_network() -> HumanGSConfig:
 
 
 def body_of(avatar: Avatar) -> BodyModel | None:
-    """Returns the shipped body, remeshed to the vertices that carry Gaussians, if the avatar's face
-    is that of this body; else None.
+    """Returns the shipped body if the avatar has the face of this body, else None. The body is
+    returned as it is or remeshed to carry Gaussians (`gaussian_body`), as the avatar's vertices
+    are.
 
-    The avatar's vertices may be displaced, and followed by those of a skirt.
+    The avatar's vertices may be displaced, and the vertices of a skirt may follow them.
     """
     if avatar.parents != PARENTS:
         return None
@@ -128,7 +137,8 @@ def _has_face(avatar: Avatar, body: BodyModel) -> bool:
 
 def with_face(avatar: Avatar, body: BodyModel | None = None) -> Avatar:
     """Returns the avatar with a face, see `Avatar.with_face`. An avatar that has a face is returned
-    as it is. Raises: ValueError.
+    as it is. Raises: ValueError if the vertices are not those of the body, or if the body has no
+    expressions.
     """
     if avatar.face is not None:
         return avatar
@@ -153,8 +163,8 @@ def faced(avatar: Avatar) -> Avatar:
 
 
 def with_face_for(avatar: Avatar, motion: Motion) -> Avatar:
-    """Returns the avatar with a face if the motion has expressions. If the avatar's body is not
-    known, it stays without, and a warning says so.
+    """Returns the avatar with a face if the motion has expressions, else the avatar as it is. If
+    the avatar's body is not known, no face is added, and a warning is logged.
     """
     if motion.expressions is None or avatar.face is not None:
         return avatar
@@ -195,9 +205,10 @@ def _face(avatar: Avatar, body: BodyModel, of_arkit: bool) -> Face:
 def _stretching(
     avatar: Avatar, vertices: Int[np.ndarray, " m"], row: Int[np.ndarray, " n"]
 ) -> tuple[Int[np.ndarray, "m k"], Float[np.ndarray, "m k 3"]]:
-    """Returns for each vertex that moves the rows of at most `BESIDE` neighbours, and their w, see
-    `avatar.face`. vertices: the vertices that move. row: the row of each vertex among these, m for
-    a vertex that stays.
+    """Returns the neighbours of each vertex that moves, and their vectors w (see `avatar.face`).
+    Neighbours are given as rows among the vertices that move, (m, BESIDE). vertices: indices of the
+    vertices that move. row: the row of each vertex of the avatar among them, m for a vertex that
+    stays.
     """
     edges, _ = mesh_edges(np.asarray(avatar.faces))
     pairs = np.concatenate([edges, edges[:, ::-1]])
@@ -218,8 +229,8 @@ def _stretching(
 
 
 def _vertex_of_gaussians(avatar: Avatar) -> Int[np.ndarray, " g"]:
-    """Returns the vertex that each Gaussian belongs to; the nearest one if refinement has added
-    Gaussians.
+    """Returns the index of the vertex that each Gaussian belongs to. If refinement has added
+    Gaussians, this is the vertex nearest to the Gaussian.
     """
     each, count = avatar.gaussians_per_vertex, len(avatar.rest_vertices)
     if each is not None:
@@ -228,8 +239,8 @@ def _vertex_of_gaussians(avatar: Avatar) -> Int[np.ndarray, " g"]:
 
 
 def _eyes(avatar: Avatar) -> Float[np.ndarray, "g 2"]:
-    """Returns the share of each Gaussian that belongs to the left and to the right eye, in [0, 1].
-    Gaussians between the lids of open eyes belong to an eye.
+    """Returns the shares by which each Gaussian belongs to the left and to the right eye, in [0,
+    1]. Gaussians between the lids of open eyes belong to an eye.
     """
     means = np.asarray(avatar.gaussians.means)
     shares = []
@@ -246,8 +257,9 @@ def _eyes(avatar: Avatar) -> Float[np.ndarray, "g 2"]:
 
 
 def _nothing(expressions: Expressions) -> dict[str, Any]:
-    """Returns the fields of a face without hidden Gaussians, as for SMPL-X, whose own mesh has eyes
-    and the inside of a mouth.
+    """Returns the fields of `Face` about hidden Gaussians, by name, for a face without hidden
+    Gaussians. Bodies such as SMPL-X have such a face, because their mesh has eyes and the inside of
+    a mouth.
     """
     e = len(expressions.names)
     empty = Gaussians(*(from_host(np.zeros((0, *shape))) for shape in ((3,), (4,), (3,), (), (3,))))
@@ -268,8 +280,8 @@ def _shipped_parts() -> FaceParts:
 
 
 def _hidden(avatar: Avatar, body: BodyModel, follows: np.ndarray) -> dict[str, Any]:
-    """Returns the fields of a face about its hidden Gaussians. follows: which Gaussians move with
-    the face.
+    """Returns the fields of `Face` about hidden Gaussians, by name. follows: whether each Gaussian
+    of the avatar moves with the face.
     """
     expressions = body.expressions
     assert expressions is not None
@@ -316,10 +328,11 @@ def _map_around(
     after: Float[np.ndarray, "m 3"],
     reach: float,
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Returns the affine map that takes the vertices `before` near some points to the vertices
-    `after`, all in metres. At least `FEWEST` vertices count as near, even beyond `reach`. With
-    fewer vertices in all, the map is a shift. reach: the distance from the middle of the points
-    within which vertices are near, metres.
+    """Returns a function that maps places, metres, by an affine map. The map is the least-squares
+    fit that takes the vertices `before` near `points` to the vertices `after`. A vertex is near if
+    it is within `reach` of the middle of the points. If fewer than `FEWEST` vertices are, the
+    `FEWEST` nearest ones are taken. With fewer vertices in all, the map is a shift. All lengths are
+    in metres.
     """
     middle = points.reshape(-1, 3).mean(axis=0)
     distance = np.linalg.norm(before - middle, axis=1)
@@ -333,8 +346,9 @@ def _map_around(
 
 
 def _skin_around(avatar: Avatar, eye: str, follows: np.ndarray) -> Float[np.ndarray, "3"]:
-    """Returns the median color of the skin around and below an eye; that of all Gaussians if there
-    is none. eye: the name of its joint. follows: which Gaussians move with the face.
+    """Returns the median color of the skin around and below an eye, or of all Gaussians if there is
+    no skin there. eye: the name of the eye's joint. follows: whether each Gaussian moves with the
+    face.
     """
     offset = (
         np.asarray(avatar.gaussians.means)
@@ -354,8 +368,8 @@ def _gaussians_of(
     colors: Float[np.ndarray, "q 3"],
     in_mouth: np.ndarray,
 ) -> tuple[Gaussians, Float[np.ndarray, "q 3"]]:
-    """Returns a flat Gaussian for each quadrangle, and its normal. corners: the corners at rest,
-    metres. drawn: the corners when the Gaussian is seen.
+    """Returns a flat Gaussian for each quadrangle, and the unit normals of the quadrangles.
+    corners: the corners at rest, metres. drawn: the corners when the Gaussian is seen, metres.
     """
     first = (drawn[:, 1] + drawn[:, 2] - drawn[:, 0] - drawn[:, 3]) / 2
     second = (drawn[:, 2] + drawn[:, 3] - drawn[:, 0] - drawn[:, 1]) / 2

@@ -46,28 +46,31 @@ from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 TERMS = 8
 LIMIT = 0.7
-"""The largest change of the log of a Gaussian's brightness from the photos to another pose: a
-factor of about 2 or 1/2.
+"""From the photos to another pose, the log of a Gaussian's brightness changes by at most this. The
+brightness changes by a factor of at most about 2.
 """
 STEPS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233)
-"""Distances between the vertices that are compared, as numbers of vertices along a curve through
-all of them.
+"""A curve runs through all vertices. Each vertex is compared with the vertices that are these
+numbers of vertices away along the curve.
 """
 CURVE_REACH = 1.5
-"""Metres: half the side of the cube that holds the curve, around the middle of the body."""
+"""Half of the side of the cube that holds the curve, metres. Its centre is the middle of the body.
+"""
 REACH = 0.25
-"""Metres. Vertices that are farther apart are not compared."""
+"""Vertices that are farther apart than this are not compared, metres."""
 DARKEST = 0.02
-"""Brightness below which differences of the log are noise."""
+"""Brightness below which differences of the log are noise. Darker colors are raised to this."""
 ROBUST = 0.03
-"""Differences of the logs above this count by their size, smaller ones by their square."""
+"""Residuals of the log brightness above this count by their size, smaller ones by their square."""
 RIDGE = 0.003
 """Weight of the squared coefficients in the fit. It keeps the light of a body without contrast at
 zero.
 """
 ITERATIONS = 10
 TINY = 1e-24
-"""The least sum of squares: it keeps the gradient of a vanishing normal finite."""
+"""The least squared length by which a normal is divided. It keeps the gradient finite where a
+normal vanishes.
+"""
 
 
 @pytree_dataclass
@@ -81,15 +84,13 @@ class Light:
     normals: Float[Array, "g 3"]
     """Unit normals of the body's surface in the T-pose at each Gaussian, (g, 3)."""
     shading: Float[Array, " g"]
-    """Log of the brightness in the photos, (g,): the colors of the Gaussians are those under this
-    light.
+    """Log of the brightness of each Gaussian in the photos, (g,). The colors of the Gaussians
+    contain this brightness.
     """
 
 
 def light_terms(normals: Float[Array, "g 3"]) -> Float[Array, "g 8"]:
-    """Returns the spherical harmonics of the first and second order of unit normals, up to constant
-    factors.
-    """
+    """Returns the spherical harmonics of degree 1 and 2 of unit normals, up to constant factors."""
     x, y, z = normals[:, 0], normals[:, 1], normals[:, 2]
     return jnp.stack([x, y, z, x * y, y * z, z * x, z**2 - x**2, 3 * y**2 - 1], axis=-1)
 
@@ -131,13 +132,14 @@ def light_coefficients(
     weights: Float[Array, " n"],
     terms: Float[Array, "n 8"],
 ) -> Float[Array, "8"]:
-    """Returns the coefficients of the light that explains the colors of vertices.
+    """Returns the coefficients of the light that best explains how the log of the brightness
+    differs between vertices that are near each other.
 
-    They minimise the absolute deviations of the differences between vertices that are near each
-    other, found by reweighted least squares.
+    Absolute residuals of these differences are minimised by iteratively reweighted least squares;
+    below `ROBUST` they count by their square.
 
-    Arguments: vertices: metres, in the T-pose. colors, weights: those of the vertices; vertices of
-    weight 0 do not count. terms: the `light_terms` of the vertices in the photos.
+    Arguments: vertices: in the T-pose, metres. colors, weights: of the vertices. Vertices of weight
+    0 do not count. terms: the `light_terms` of the vertices in the photos.
     """
     middle = (jnp.min(vertices, axis=0) + jnp.max(vertices, axis=0)) / 2
     order = jnp.argsort(along_curve(vertices - middle, CURVE_REACH))
@@ -190,7 +192,7 @@ _ARRAYS = (
     "faces",
 )
 ALIKE = 1e-3
-"""Skinning weights that differ by less count as those of one vertex."""
+"""Gaussians belong to one vertex if their skinning weights differ by less than this."""
 _LIGHT = ("coefficients", "normals", "shading")
 _OPTIONAL = {"low_pass": "pixel_footprint", "harmonics": "harmonics"}
 """The optional arrays of a file: key -> field of `Gaussians`."""
@@ -217,8 +219,8 @@ class Avatar(Batchable):
     """
 
     gaussians: Gaussians
-    """The Gaussians in the T-pose, metres: vertex-major, the k Gaussians of a vertex together,
-    unless refinement has added some.
+    """The Gaussians in the T-pose, metres. They are ordered by vertex, with the k Gaussians of a
+    vertex next to each other, unless refinement has added some.
     """
     skinning_weights: Float[Array, "g j"]
     """The weights of the joints for each Gaussian, (g, j); rows sum to 1."""
@@ -233,20 +235,26 @@ class Avatar(Batchable):
     joint_names: tuple[str, ...] = static_field()
     """The name of each joint, in their order."""
     skinning: Literal["affine", "rotation"] = static_field(default="affine")
-    """Whether Gaussians take the full linear part of the blended transform, or its rotation."""
+    """Which part of the blended transform acts on a Gaussian. "affine": the full linear part.
+    "rotation": only the rotation.
+    """
     rendering: Literal["exact", "inria"] = static_field(default="exact")
-    """The splatting that the Gaussians were trained for, a name in `SPLAT_PRESETS`."""
+    """How the Gaussians are splatted: the preset that they were trained for, a name in
+    `SPLAT_PRESETS`.
+    """
     light: Light | None = None
     """The light of the photos, where it has been estimated; other poses are drawn in it."""
     face: Face | None = None
-    """What poses with an expression need (`with_face`); None: the face is rigid."""
+    """The face, which poses with an expression need (see `with_face`). None: no pose can have an
+    expression.
+    """
     one_at_a_time: ClassVar[bool] = True
-    """Functions of one avatar refuse a batch of avatars (`core.checks`)."""
+    """Functions that take one avatar refuse a batch of avatars, see `core.checks`."""
 
     @property
     def gaussians_per_vertex(self) -> int | None:
-        """The number of Gaussians of each vertex. None if refinement has added Gaussians, which do
-        not stand with the others of their vertex.
+        """The number of Gaussians of each vertex. None if refinement has added Gaussians, which are
+        not next to the other Gaussians of their vertex.
         """
         weights, vertices = np.asarray(self.skinning_weights), len(self.rest_vertices)
         if len(weights) % vertices:
@@ -269,11 +277,11 @@ class Avatar(Batchable):
         expression are drawn as before.
 
         Args:
-            body: the model that the avatar's vertices are of, with expressions. None: the shipped
-                body.
+            body: the body model that the avatar's vertices belong to. It must have expressions.
+                None: the shipped body.
 
         Raises:
-            ValueError: if the avatar's vertices are not those of the body, or it has no
+            ValueError: if the avatar's vertices are not those of the body, or if the body has no
                 expressions.
 
         Examples:
@@ -287,7 +295,7 @@ class Avatar(Batchable):
         return with_face(self, body)
 
     def select(self, index: Array | np.ndarray) -> "Avatar":
-        """Returns the avatar with the Gaussians at `index` alone."""
+        """Returns the avatar with only the Gaussians at `index`."""
         light = self.light
         if light is not None:
             light = replace(
@@ -307,8 +315,8 @@ class Avatar(Batchable):
 
         Arguments: made_from: a checksum of what the avatar was made from, for `recorded_source`.
 
-        Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and if the
-        Gaussians have deformations, which those of a T-pose do not have; FileError if `load` would
+        Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and for
+        Gaussians with deformations, because an avatar in T-pose has none; FileError if `load` would
         refuse the file, for example for numbers that are not finite; OSError.
         """
         require_concrete("Avatar.save", "writes a file", self)
@@ -360,8 +368,8 @@ class Avatar(Batchable):
 
         Raises: FileNotFoundError if there is no such file; FileError, naming file and key, if it is
         no avatar of this version, a key is missing, shapes do not fit each other, numbers are not
-        finite or out of range, indices do not exist, or the contents are not those of the checksum
-        in the header (which the first files do not have).
+        finite or out of range, indices do not exist, or the arrays do not have the checksum in the
+        header. The first files have no checksum, and are read without this check.
         """
         with reading(path, "avatar file"):
             return _load(cls, path)
@@ -383,8 +391,9 @@ def recorded_source(path: str | os.PathLike[str]) -> str | None:
 def _read(
     path: Any, wanted: Callable[[str], bool] | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read the arrays of an avatar file, without checks, and its header. wanted: tells by its key
-    whether an array is read; None: all are.
+    """Returns the arrays of an avatar file by key, without checks, and its header.
+
+    wanted: function that returns whether the array of a key is read. None: all are read.
     """
     try:
         arrays, _ = read_npz(path, wanted)
@@ -513,7 +522,7 @@ def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray])
 
 
 _RANGES = {"skinning_weights": UNIT, "light_normals": SIGNED_UNIT}
-"""Ranges of the arrays in files, where the records themselves allow more."""
+"""Ranges of arrays in files, by key, where the ranges of the records are wider or missing."""
 
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:

@@ -1,8 +1,8 @@
 """Reads the cameras of a file, and makes paths of cameras along which an avatar is seen.
 
 The person stands on the floor, at the middle of a world with y up and in metres, as in the motions
-of `motion_views` and in the files of `export`. `file_cameras` turns the world of a format that has
-another axis up if it is asked to.
+of `motion_views` and in the files of `export`. If a format has another axis up, `file_cameras` can
+turn its world.
 """
 
 import logging
@@ -28,15 +28,15 @@ logger = logging.getLogger(__name__)
 
 
 def file_cameras(path: Path, shot: FrameSettings, upright: bool = False) -> dict[str, Camera]:
-    """Returns the cameras of a calibration by unique names, in the order of its file. Lens
-    distortion is left out, and a line is logged about it.
+    """Returns the cameras of a calibration file by unique names, in the order of the file. Lens
+    distortion is left out, and a warning is logged about it.
 
-    Images have the size that the file says. If it says none, they have that of the shot. A width or
-    a height of the shot replaces that of the file.
+    The size of a camera's images is the size in the file, or the size of the shot if the file has
+    none. If the shot has a width or a height, it replaces the width or height in the file.
 
     Arguments: upright: whether the world is turned so that the axis that is up in the format
-    becomes y. If not, it stays as it is in the file.
-    Raises: FileError, one line that names the file.
+    becomes y. If not, it stays as it is in the file. Raises: FileError, one line that names the
+    file.
     """
     with reading(path, "calibration"):
         found = read_calibration(path, lambda name: shot.resolution)
@@ -79,8 +79,8 @@ def camera_path(cameras: Camera, frames: int) -> Camera:
     """Returns a camera for each of `frames` frames, from a batch of cameras. A single camera stands
     still; several are evenly spread over the frames.
 
-    Between them centres and intrinsics run along a monotone cubic spline (Fritsch and Carlson
-    1980), which goes through all of them and does not overshoot; rotations turn about one axis at
+    Between two cameras, centres and intrinsics follow a monotone cubic spline (Fritsch and Carlson
+    1980), which goes through all cameras and does not overshoot. Rotations turn about one axis at
     constant speed.
     """
     count = len(cameras)

@@ -1,14 +1,16 @@
 """The face of an avatar: what its Gaussians do when a pose has an expression.
 
-A Gaussian moves by the offset d of the vertex i that it belongs to, before skinning, and is
-stretched as the skin around it is: with p the places of vertices at rest and k those beside i,
+Before skinning, a Gaussian moves by the offset d_i of its vertex i. With affine skinning it is also
+stretched like the skin around the vertex, by the linear map
 
     A_i = I + sum_k (d_k - d_i) w_ik^T,
     w_ik = (sum_k (p_k - p_i)(p_k - p_i)^T + ridge)^-1 (p_k - p_i).
 
+Here k runs over the vertices beside i, and p_i is the place of vertex i at rest, metres.
+
 Gaussians that show an eye turn with the joint of the eye instead, and fade when the lids close.
-Photos hardly show teeth, tongue and closed lids: these are Gaussians with fixed colors,
-which are drawn only while an expression shows them. `avatar.attach_face.with_face` makes a face.
+Photos hardly show teeth, tongue and closed lids. For these a face has further Gaussians, which are
+drawn only while an expression shows them. `avatar.attach_face.with_face` makes a face.
 """
 
 import jax
@@ -24,13 +26,15 @@ from humangs_jax.rendering.gaussians import Gaussians
 BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
 """The expressions that close the left and the right eye."""
 SMALLEST_OPENING = 0.001
-"""Half of the distance of the lips at which the mouth begins to show its inside, metres."""
+"""Half of the distance between the lips at which the inside of the mouth begins to show, metres."""
 RIM = 0.3
-"""The share of the opening's radius over which its inside fades towards the lips: Gaussians are
-some millimetres wide.
+"""The inside of the mouth fades towards the lips over this share of the opening's radius, because
+Gaussians are some millimetres wide.
 """
 BEFORE_LIPS = 0.004
-"""Metres in front of the lips from which on a point, as of a tongue, is fully seen."""
+"""A point of the mouth, such as the tip of the tongue, is fully seen if it is at least this far in
+front of the lips, metres.
+"""
 
 
 @pytree_dataclass
@@ -52,25 +56,28 @@ class Face(Batchable):
     missing neighbour, has the row m.
     """
     stretching: Float[Array, "m k 3"]
-    """The w of each of these neighbours, (m, k, 3), 1 / metres; 0 for a missing neighbour."""
+    """The vectors w_ik of these neighbours (see the module), (m, k, 3), 1 / metres; 0 for a missing
+    neighbour.
+    """
     hidden_normals: Float[Array, "q 3"]
     """Unit normals of the hidden Gaussians, (q, 3), for the light."""
     hidden_directions: Float[Array, "q 3 e"]
     """How the hidden Gaussians move, (q, 3, e), metres per unit of a coefficient."""
     hidden_shown: Float[Array, "q e"]
-    """The share of the opacity of each hidden Gaussian that a unit of a coefficient shows, (q, e).
-    The sum is clipped to [0, 1]. Gaussians of the mouth do not use it.
+    """The share of each hidden Gaussian's opacity that a unit of each coefficient shows, (q, e).
+    The sum over the coefficients is clipped to [0, 1]. Gaussians of the mouth do not use this
+    field.
     """
     in_mouth: Float[Array, " q"]
     """1 for Gaussians of the mouth, which are seen through the open lips or in front of them, and 0
     for lids, (q,).
     """
     lips: Float[Array, "4 3"]
-    """The inner edges of the upper and the lower lip in the middle, the left and the right corner,
-    (4, 3), metres in the T-pose.
+    """Four points of the lips, (4, 3), metres in the T-pose: the inner edge of the upper lip in the
+    middle, the inner edge of the lower lip in the middle, the left corner and the right corner.
     """
     lip_directions: Float[Array, "4 3 e"]
-    """How these points of the lips move, (4, 3, e), metres per unit of a coefficient."""
+    """How the four points of `lips` move, (4, 3, e), metres per unit of a coefficient."""
     hidden: Gaussians
     """Teeth, tongue, the inside of the mouth and closed lids in T-pose, with the opacities that
     they have when shown.
@@ -79,7 +86,7 @@ class Face(Batchable):
     """The expressions, as moves of the avatar's rest vertices."""
 
     def select(self, index: Array | np.ndarray) -> "Face":
-        """Returns the face of an avatar that has the Gaussians at `index` alone."""
+        """Returns the face for an avatar that keeps only the Gaussians at `index`."""
         return replace(self, row=self.row[index], eyes=self.eyes[index])
 
     def without_expression(self) -> Float[Array, " e"]:
@@ -118,8 +125,8 @@ def between_lips(points: Float[Array, "q 3"], lips: Float[Array, "4 3"]) -> Floa
 def moved_gaussians(
     face: Face, gaussians: Gaussians, expression: Float[Array, " e"], stretched: bool
 ) -> Gaussians:
-    """Returns the Gaussians of an avatar in T-pose, moved by an expression. Gaussians of eyes fade
-    as far as their lids close. stretched: whether the Gaussians are deformed, too.
+    """Returns the Gaussians of an avatar in T-pose, moved by an expression. Gaussians of an eye
+    fade as its lids close. stretched: whether the Gaussians also get `deformations`.
     """
     moves = jnp.einsum("mae,e->ma", face.expressions.directions, expression, precision=EXACT)
     moves = jnp.concatenate([moves, jnp.zeros_like(moves[:1])])
@@ -137,9 +144,9 @@ def moved_gaussians(
 
 
 def with_hidden(gaussians: Gaussians, hidden: Gaussians) -> Gaussians:
-    """Returns the Gaussians, and after them the hidden ones. hidden: has no harmonics, low-pass and
-    deformations. If the other Gaussians have these, the hidden ones get harmonics of 0, the median
-    low-pass and the identity.
+    """Returns the Gaussians, followed by the hidden ones. `hidden` has no harmonics, low-pass and
+    deformations. If `gaussians` has them, the hidden Gaussians get harmonics of 0, the median
+    low-pass, and the identity as their deformation.
     """
     fields = {}
     if gaussians.harmonics is not None:

@@ -12,7 +12,9 @@ from typing import Annotated, Literal
 from humangs_jax.core.configuration import ArgumentError, Range, check_range
 
 LARGEST_SIDE = 8192
-"""The largest side of an image, pixels: that of the largest level of H.264 and VP9."""
+"""The largest side of an image, pixels. It is also the largest side in the highest level of H.264
+and of VP9.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +34,9 @@ class FrameSettings:
     elevation: Annotated[float, Range(-89, 89)] = 6.0
     """Degrees of the camera above the horizon."""
     distance: Annotated[float | None, Range(0.01, 1000)] = None
-    """Metres from the person. Default: as near as all that is shown of the person fits."""
+    """Metres from the person. Default: the smallest distance from which all of the person is in the
+    images.
+    """
     fov: Annotated[float, Range(1, 150)] = 30.0
     """Vertical field of view, degrees."""
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = "as_trained"

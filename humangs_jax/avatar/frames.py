@@ -37,24 +37,24 @@ from humangs_jax.rendering.splat_config import (
 from humangs_jax.rendering.splatting import Background, Rendering, render
 
 MARGIN = 1.12
-"""Factor on the room that a person takes in the frame, since the extent is measured at the centres
-of Gaussians.
+"""Factor on the room that a person takes in the frame. The extent is measured at the centres of
+Gaussians, and Gaussians reach beyond.
 """
 FOLLOWING = 0.5
-"""Standard deviation of the Gaussian that smooths the path of the camera, seconds. The camera
-follows a walk, but not the swing of steps and arms, which takes about a second.
+"""Standard deviation of the Gaussian kernel that smooths the path of the camera, seconds. The
+camera follows a walk, but not the swing of steps and arms, which takes about a second.
 """
 WIDEST = 2
-"""The largest standard deviation of this Gaussian, as a multiple of the length of the path. Wider
-ones leave less than 1e-8 of anything but a straight line.
+"""The largest standard deviation of this kernel, as a multiple of the number of frames. Already
+then less than 1e-8 is left of anything but a straight line.
 """
 TRACKED = 1024
-"""A person's extent is measured on this number of Gaussians, evenly spread."""
+"""Number of Gaussians, evenly spread, on which a person's extent is measured."""
 TRACKED_OPACITY = 0.5
 """Least opacity of a Gaussian that the extent is measured on."""
 MOST_TRACKED = 1 << 25
-"""The most points in all frames together, 400 MB. A motion of more than 32,768 frames is measured
-on fewer Gaussians.
+"""The largest number of points on which the extent is measured, in all frames together. They take
+400 MB. A motion of more than 32,768 frames is measured on fewer Gaussians.
 """
 A_POSE = 48.0
 """Degrees by which the arms hang down in the A-pose, as in the page."""
@@ -125,8 +125,8 @@ def splatting_of(shot: FrameSettings, avatar: Avatar) -> SplatConfig:
 def composite_over(
     rendering: Rendering, color: tuple[float, float, float] | None
 ) -> Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w 4"]:
-    """Returns a rendering onto black as an image in [0, 1]. color: the background of the image,
-    whose shape is then (h, w, 3). None: the image has straight alpha, as PNG and WebM have it, and
+    """Returns an image in [0, 1], made of a rendering onto black. color: the background. The image
+    then has the shape (h, w, 3). None: the image has straight alpha, as PNG and WebM have it, and
     the shape (h, w, 4).
     """
     rgb, alpha = np.asarray(rendering.rgb), np.asarray(rendering.alpha)[..., None]
@@ -161,8 +161,8 @@ def a_pose_of(avatar: Avatar) -> BodyPose:
 
 
 def tracked_points(avatar: Avatar, poses: BodyPose) -> Float[np.ndarray, "m p 3"]:
-    """Returns the places of opaque Gaussians of the avatar in each pose of a batch, metres. A frame
-    has to show these points.
+    """Returns the positions of opaque Gaussians of the avatar in each pose of a batch, metres. All
+    of these points have to be in the images.
     """
     opacities = np.asarray(avatar.gaussians.opacities)
     opaque = np.flatnonzero(opacities >= min(TRACKED_OPACITY, opacities.max()))
@@ -178,16 +178,16 @@ def shot_cameras(
     azimuths: Float[np.ndarray, " v"],
     smoothing: float | None,
 ) -> Camera:
-    """Returns a batch of cameras, one for each azimuth, all at one distance from the middle of
-    the points of their frames.
+    """Returns a batch of cameras, one for each azimuth. All look at the middle of the person from
+    the same distance.
 
-    Arguments: points: the points of each frame, metres; those of a single frame are used for all
-    cameras. azimuths: degrees, added to the azimuth of the shot. smoothing: the standard deviation,
-    in frames, with which the camera follows the middle of the person. None: the camera stands
-    still, and the image holds everything that happens.
+    Arguments: points: points of the person in each frame, metres. If there is a single frame, it is
+    used for all cameras. azimuths: degrees, added to the azimuth of the shot. smoothing: the camera
+    follows the middle of the points, smoothed with this standard deviation, frames. None: the
+    camera looks at the middle of the points of all frames.
 
-    Without `shot.distance`, the distance is the smallest for which every point lies in the middle 1
-    / MARGIN of the image.
+    If `shot.distance` is None, the distance is the smallest for which all points of each frame lie
+    in the middle of its image, within 1 / MARGIN of its width and height.
 
     Raises: ValueError for a shot that is out of range.
     """
@@ -220,8 +220,8 @@ def shot_cameras(
 
 
 def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.ndarray, "m 3"]:
-    """Returns a path smoothed by a Gaussian whose standard deviation is `frames` frames. Beyond its
-    ends the path is continued by its point reflection.
+    """Returns a path smoothed by a Gaussian kernel with a standard deviation of `frames` frames.
+    Before, the path is extended at both ends, by its reflection in the end point.
     """
     frames = min(frames, WIDEST * len(path))
     reach = int(np.ceil(3 * frames))
@@ -237,8 +237,9 @@ def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.nda
 def _fitting_distance(
     shot: FrameSettings, points: np.ndarray, targets: np.ndarray, axes: np.ndarray
 ) -> float:
-    """Returns the least distance d with MARGIN |x| <= tangent (d + z) for all points. x is a place
-    across or down the image, z the distance behind the target, metres.
+    """Returns the least distance d with MARGIN |x| <= tangent (d + z) for all points, metres. Here
+    x is the coordinate of a point across or down the image, and z is its depth behind the target,
+    both in metres.
     """
     needed = 0.0
     for i, target in enumerate(targets):
@@ -252,8 +253,8 @@ def _fitting_distance(
 def _paths(
     means: Array, weights: Array, rest_joints: Array, parents: tuple[int, ...], poses: BodyPose
 ) -> Array:
-    """Returns the places of Gaussians in each pose, (m, p, 3), metres. Poses are computed one at a
-    time.
+    """Returns the positions of Gaussians in each pose, (m, p, 3), metres. Poses are computed one at
+    a time.
     """
 
     def one(pose):
@@ -322,10 +323,10 @@ def trim_and_resample(
 
 
 def motion_poses(avatar: Avatar, motion: Motion) -> BodyPose:
-    """Returns a pose for each frame of a motion, which is put on the floor. Poses have the motion's
-    expression if the avatar has a face.
+    """Puts a motion on the floor, and returns a pose for each of its frames. Poses have the
+    motion's expressions if the avatar has a face.
 
-    Raises: ValueError for another number of joints.
+    Raises: ValueError if the motion has another number of joints than the avatar.
     """
     joints = motion.rotations.shape[1]
     if joints != len(avatar.parents):
@@ -338,11 +339,11 @@ def motion_poses(avatar: Avatar, motion: Motion) -> BodyPose:
 def motion_views(
     avatar: Avatar, motion: Motion, shot: FrameSettings, turn: float = 0.0, follow: bool = True
 ) -> tuple[BodyPose, Camera]:
-    """Returns a pose and a camera for each frame of a motion, which is put on the floor.
+    """Puts a motion on the floor, and returns a pose and a camera for each of its frames.
 
-    Arguments: turn: degrees that the camera travels around the person. follow: whether the camera
-    goes along with the person; if not, it stands still, far enough away to keep the person in the
-    image.
+    Arguments: turn: degrees by which the camera goes around the person during the motion. follow:
+    whether the camera goes along with the person; if not, it stands still, far enough away to keep
+    the person in the image.
 
     Raises: ValueError if the motion has another number of joints than the avatar, or the shot is
     out of range.
@@ -356,10 +357,10 @@ def motion_views(
 def turntable_views(
     avatar: Avatar, pose: BodyPose, views: int, shot: FrameSettings
 ) -> tuple[BodyPose, Camera]:
-    """Returns one pose for all views, and cameras on a circle that starts at the azimuth of the
-    shot.
+    """Returns a batch of copies of a pose, one for each view, and cameras on a circle that starts
+    at the azimuth of the shot.
 
-    Raises: ValueError for no view.
+    Raises: ValueError if `views` is less than 1.
     """
     if views < 1:
         raise ValueError(f"views {views}: expected at least 1")
@@ -370,8 +371,8 @@ def turntable_views(
 
 
 def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
-    """Returns the pose and the camera of each view of a capture, turned to a world with y up. An
-    avatar's light is that of such a world.
+    """Returns the pose and the camera of each view of a capture, turned to a world with y up,
+    because the light of an avatar is that of a world with y up.
 
     Raises: ValueError if the capture's body has another number of joints than the avatar.
     """
@@ -445,8 +446,8 @@ def motion_frames(
 def without_unseen(
     avatar: Avatar, poses: BodyPose, cameras: Camera, how: SplatConfig, progress: str | None = None
 ) -> Avatar:
-    """Returns the avatar without the Gaussians that weigh less than `ALPHA_MIN` on every pixel of
-    all these images.
+    """Returns the avatar without the Gaussians whose blending weight is less than `ALPHA_MIN` on
+    every pixel of all these images.
 
     All images are drawn once to find these Gaussians, which pays if they are drawn several times.
     docs/video.md has the error and the time.

@@ -3,20 +3,21 @@ programs.
 
 Layers of a view, besides the colors:
 
-Z: depth along the camera's axis, metres. position: the point of the world on the ray of the pixel
-at that depth, metres.
-normal: of the body's surface, in the world; unit vectors. Each Gaussian has the normal of the
-    vertex that is nearest to it in the T-pose, turned by its own skinning transform; a pixel has
-    the mean by the weights of its color, normalised.
-part: the joint that most of the pixel's color follows, 1 for the first of the header's `parts`, 0
-    where alpha is below 1/2. A Gaussian follows the joint of its largest skinning weight.
+Z: depth along the camera's axis, metres.
+position: the point of the world at this depth on the ray of the pixel, metres.
+normal: unit normals of the body's surface, in the world. Each Gaussian has the normal of the
+    vertex that is nearest to it in the T-pose, turned by its own skinning transform. A pixel has
+    the mean of these normals with the weights of its color, scaled to length 1.
+part: the joint that most of the pixel's color follows. 1 is the first joint of the header's
+    `parts`. 0 is no joint, where alpha is below 1/2. A Gaussian follows the joint of its largest
+    skinning weight.
 
-None of these is multiplied by alpha; they are 0 where alpha is.
+None of these is multiplied by alpha. All are 0 where alpha is 0.
 
-The OpenEXR file is lossless (ZIP); several views are its parts. The header of each has its camera:
-`K` (3x3, pixels) and `cam_from_world` (4x4, OpenCV, metres), float32, exact. R, G, B and A are
-premultiplied, as compositing programs expect. Colors are the values of the photos, as in PNG files:
-encoded for a display by the curve of sRGB, not linear in light.
+The OpenEXR file is compressed without loss (ZIP). Each view is a part of the file. The header of a
+part has the camera: `K` (3x3, pixels) and `cam_from_world` (4x4, OpenCV, metres), float32, exact.
+R, G, B and A are premultiplied, as compositing programs expect. Colors are the values of the
+photos, as in PNG files: they are sRGB-encoded, not linear in light.
 """
 
 import dataclasses
@@ -48,12 +49,12 @@ from humangs_jax.rendering.splatting import Rendering, render
 LAYERS = ("rgba", "z", "position", "normal", "part")
 EXR_NAME = "views.exr"
 COVERED = 0.5
-"""Pixels with less alpha belong to no part."""
+"""Pixels with an alpha below this belong to no part."""
 RGBA = ("R", "G", "B", "A")
 DEPTH = "Z"
 WIDE = (DEPTH, "position.")
-"""The beginnings of the names of channels that stay in 32 bits when others are halved. They are
-lengths in metres, and half precision has steps of 2 mm at 4 m.
+"""Channels whose names begin so keep 32 bits when the others have 16. They are lengths in metres,
+and half floats have steps of 2 mm at 4 m.
 """
 
 
@@ -64,7 +65,7 @@ class ExrView:
     rgba: Float[np.ndarray, "h w 4"]
     """Premultiplied colors and coverage, (h, w, 4)."""
     depth: Float[np.ndarray, "h w"] | None
-    """Distances along the camera's axis, (h, w), metres; None: not written."""
+    """Depths along the camera's axis, (h, w), metres. None: they are not written."""
     K: Float[np.ndarray, "3 3"]
     """The camera matrix, (3, 3), pixels."""
     cam_from_world: Float[np.ndarray, "4 4"]
@@ -82,7 +83,7 @@ class ExrLayers:
     """The contents of an EXR file of views."""
 
     layers: tuple[str, ...] = ("rgba", "z")
-    """The layers to write, of `LAYERS`; colors are always written."""
+    """The layers to write, names in `LAYERS`. Colors are always written."""
     half: bool = False
     """Whether colors, normals and parts have 16 bits. Z and positions stay in 32, since half floats
     are 2 mm apart at 4 m.
@@ -114,8 +115,8 @@ def write_views(
     exposure_gains: Float[np.ndarray, "v 3"] | None = None,
     names: Sequence[str] | None = None,
 ) -> int:
-    """Draw an avatar in each pose (batch v) from each camera into a folder: view_000.png ..., and
-    views.exr if asked.
+    """Draw v images of an avatar into a folder, pose i from camera i: view_000.png and so on. With
+    `exr`, the file views.exr is written, too.
 
     exposure_gains: the gains of the cameras, (v, 3), see `data.exposure`. names: the names of the
     images, in place of view_000 and so on.
@@ -123,8 +124,8 @@ def write_views(
     The files appear together when all are drawn. Images view_*.png and a views.exr of an earlier
     call are removed. Returns the number of views.
 
-    Raises: ValueError if the layers of all views are more than an EXR file may hold (see
-    docs/security.md); OSError.
+    Raises: ValueError if the layers of all views have more bytes than the limit for arrays (see
+    docs/security.md); OSError if the files cannot be written.
     """
     out, count = Path(out), len(poses)
     if names is None:
@@ -172,7 +173,9 @@ def exr_view(
     layers: Iterable[str],
     how: SplatConfig,
 ) -> ExrView:
-    """Returns a view with its layers. rendering: of this avatar, pose and camera, onto black."""
+    """Returns a view with its layers. rendering: the rendering of this avatar, pose and camera onto
+    black.
+    """
     layers, alpha = set(layers), np.asarray(rendering.alpha)
     channels, attributes = {}, {}
     # positions follow from the depth
@@ -241,8 +244,8 @@ def _plain_view(name: str, camera: Camera, rendering: Rendering) -> ExrView:
 
 
 def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
-    """Returns the world points on the rays of the pixels (centres at +0.5), metres. depth:
-    distances along the camera's axis, metres.
+    """Returns the points of the world at given depths on the rays through the centres of the
+    pixels, metres. depth: along the camera's axis, metres.
     """
     require_pinhole("unprojection", camera)
     K = np.asarray(camera.K, np.float64)
@@ -254,15 +257,13 @@ def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.nda
 
 
 def gaussian_parts(avatar: Avatar) -> Int[np.ndarray, " g"]:
-    """Returns the number of the joint that each Gaussian follows most, the joint of its largest
-    skinning weight.
-    """
+    """Returns for each Gaussian the index of the joint with its largest skinning weight."""
     return np.asarray(avatar.skinning_weights).argmax(axis=-1)
 
 
 def gaussian_normals(avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
-    """Returns unit normals of the posed body's surface at each Gaussian: the normal of the nearest
-    vertex, turned by the Gaussian's transform.
+    """Returns a unit normal of the posed body's surface for each Gaussian. It is the normal of the
+    vertex nearest in the T-pose, turned by the Gaussian's transform.
     """
     normals = surface_normals(avatar.rest_vertices, avatar.faces, avatar.gaussians.means)
     return _posed_normals(normals, avatar, pose)
@@ -285,8 +286,8 @@ def _posed_normals(
 def write_exr(path: str | Path, views: Sequence[ExrView], half: bool = False) -> None:
     """Write views of one size as the parts of one file. If writing fails, the path stays as it was.
 
-    half: see `ExrLayers`; numbers beyond 65504 become infinite there. Raises: OSError if the file
-    cannot be written.
+    half: see `ExrLayers`. In 16 bits numbers beyond 65504 become infinite. Raises: OSError if the
+    file cannot be written.
     """
     import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
 

@@ -70,13 +70,13 @@ LEGS = tuple(
     for side in ("left", "right")
 )
 SMALLEST_VOLUME = 0.2
-"""The least determinant of a blended transform that is inverted. Transforms of limbs that are
-turned against each other collapse, and Gaussians there keep their weights.
+"""A blended transform is inverted only if its determinant is larger than this. Transforms between
+limbs that are turned against each other collapse; Gaussians there keep their weights.
 """
 POSED = "the posed vertices, which all arrays of the body move"
 BATCH = 8
-"""Captures that `reconstruct_batch` takes at a time by default. Larger batches take more memory,
-and gain little.
+"""Number of captures that `reconstruct_batch` takes at a time by default. Larger batches take more
+memory, and gain little.
 """
 
 
@@ -90,13 +90,14 @@ def reconstruct(
     mask does not show the person are left out. Numbers of views and of foreground tokens are
     rounded up to few sizes; a program is compiled for each.
 
-    Worlds that are not y-up are turned for the network; the avatar then has no light, whose
+    Worlds that are not y-up are turned for the network. The avatar then has no light, because its
     directions would be those of another world. For a network that looks at the person's pixels
-    alone, the body is displaced first, unless `Runtime.displacement` is False: by the capture's
-    displacement, or without one to the edges of the masks. The latter is done if the body does not
-    fit the masks, or if `Runtime.displacement` is True. Where masks show a skirt, the avatar's body
-    has one (`data.skirt`). What no photo shows is guessed from what they show (`avatar.unseen`).
-    For a network with a driver this is the avatar before any correction of a frame.
+    alone, the body is displaced first, unless `Runtime.displacement` is False. It takes the
+    displacement of the capture. If the capture has none, but masks, the body is moved to the edges
+    of the masks if it does not fit them, or in any case if `Runtime.displacement` is True. If the
+    masks show a skirt, the body of the avatar has one (`data.skirt`). What no photo shows is
+    guessed from what photos show (`avatar.unseen`). If the network has a driver, which corrects
+    Gaussians for each frame, the avatar is without these corrections.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -139,9 +140,9 @@ def reconstruct(
 def calls_of_reconstruct(
     variables: Variables, config: HumanGSConfig, capture: Capture
 ) -> Iterator[Call]:
-    """Yields the jitted calls that `reconstruct` makes for a capture with masks. They fit any body
-    without a skirt that has as many vertices. If the sizes of the programs depend on where the body
-    is, nothing is yielded.
+    """Yields the jitted calls that `reconstruct` makes for a capture with masks. The compiled
+    programs also fit other bodies with as many vertices and without a skirt. Nothing is yielded if
+    the sizes in the programs depend on where the body is.
     """
     body, moved = gaussian_body(capture.body, config), None
     if allows_vertex_offsets(config):
@@ -203,13 +204,13 @@ def reconstruct_batch(
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
         config: of the network.
-        captures: of people, whose shapes may differ; or functions that load one each, when its
-            turn comes.
+        captures: of people, whose shapes may differ; or functions that load one each, when its turn
+            comes.
         batch: captures at a time.
 
     Yields:
-        Each capture with its avatar, in the order of the captures. A ValueError or OSError that a
-        capture, or the function that loads it, has raised takes the place of both.
+        Each capture with its avatar, in the order of the captures. If a capture, or the function
+        that loads it, raises a ValueError or OSError, there is this error instead of both.
 
     Examples:
         >>> made = hg.reconstruct_batch(*hg.load_weights(), captures)
@@ -267,14 +268,14 @@ def stack_captures(
         captures: of people with one body model.
 
     Returns:
-        The body that carries the Gaussians; the photos as the network wants them (leading axis b,
-        padded to one number of views); `config` with room for as many tokens as these photos need,
-        and without light if no world is y-up.
+        Three values: the body that carries the Gaussians; the photos as the network wants them
+        (leading axis b, padded to one number of views); and `config` with room for the tokens of
+        these photos, and without light if no world is y-up.
 
     Raises:
-        ValueError: if there is no capture, one has no view or values that are not finite or out of
-            range, or their bodies differ; also if some worlds, but not all, are not y-up and the
-            avatars are to have the light of their photos: in a batch all have one or none has.
+        ValueError: if there is no capture, if one has no view or values that are not finite or out
+            of range, or if the bodies differ. Also if `config` wants light and only some of the
+            worlds are y-up, because in a batch all avatars have a light or none has.
 
     Examples:
         >>> body, views, config = hg.stack_captures(config, captures)
@@ -401,8 +402,8 @@ def _reconstruct(
 def make_avatar(
     outputs: HumanGSOutputs, body: BodyModel, rest: RestBody, config: HumanGSConfig
 ) -> Avatar:
-    """Returns an avatar: the canonical Gaussians of the outputs on the body of a person. rest: that
-    body in the T-pose.
+    """Returns the avatar that the outputs of the network describe: their canonical Gaussians on the
+    body of a person. rest: the body of the person in the T-pose.
 
     Raises: ValueError if there are no Gaussians.
     """
@@ -433,8 +434,9 @@ def make_avatar(
 def completed_avatar(
     outputs: HumanGSOutputs, body: BodyModel, views: SubjectViews, config: HumanGSConfig
 ) -> Avatar:
-    """Returns `make_avatar` with what the configuration's conventions take from the photos: the
-    skinning weights between the legs, the light, and the low-pass.
+    """Returns the avatar of `make_avatar`, completed as the conventions of the configuration ask
+    for. They may change the skinning weights between the legs, and add the light of the photos and
+    the low-pass.
     """
     conventions = config.conventions
     avatar = make_avatar(outputs, body, subject_rest(body, views.betas, views.displacement), config)
@@ -492,8 +494,9 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
 
 
 def with_blended_leg_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
-    """Returns the avatar with the skinning weights of `blend_leg_weights`. The means are changed
-    such that they stay in their places in `pose`, the pose of the first photo.
+    """Returns the avatar with the skinning weights of `blend_leg_weights`. The means in T-pose are
+    changed so that Gaussians keep their places in `pose`, the pose of the first photo. reach: as
+    `blend_leg_weights` takes it, metres.
 
     The shapes of Gaussians are not corrected. Gradients do not pass through the weights.
     """

@@ -30,17 +30,17 @@ from humangs_jax.rendering.splat_config import (
 from humangs_jax.rendering.splatting import Background, Rendering, render
 
 SHOWN = 0.9
-"""Share of the opaque Gaussians that a circle of cameras shows at least. The others may be
-outliers, far away.
+"""Least share of the opaque Gaussians that the images of a circle of cameras contain. The others
+may be outliers, far away.
 """
 NEARLY_ALL = 0.999
-"""Share of the opaque Gaussians whose distance stands for that of all."""
+"""Share of the opaque Gaussians that stands for all of them, because a few may be outliers."""
 COMPACT = 3.0
-"""If nearly all Gaussians are within this many times the distance of `SHOWN`, as those of a person
-are, there are no outliers, and all are shown.
+"""All opaque Gaussians are shown if the radius of nearly all of them is less than this many times
+the radius of the share `SHOWN`. There are no outliers then, as around a person.
 """
 ROOM = 1.1
-"""Factor on the distance of the cameras at which the Gaussians just fit."""
+"""Factor on the least distance from which the cameras see the Gaussians."""
 PAIRS = 4_000_000
 """The most (splat, tile) pairs that are drawn at once, in some hundred megabytes."""
 
@@ -51,8 +51,9 @@ def circle_cameras(
     """Returns cameras in a circle around the middle of the Gaussians, by name.
 
     form: the format of the file that the Gaussians are from. At azimuth 0 the first camera sees the
-    front of a person that `export` wrote. If the shot has no distance, the images hold all opaque
-    Gaussians but outliers.
+    front of a person that `export` wrote. If the shot has no distance, the images contain all
+    opaque Gaussians except outliers. A Gaussian is opaque if its opacity is at least half of the
+    largest one.
     """
     means = np.asarray(gaussians.means)[
         np.asarray(gaussians.opacities) >= 0.5 * np.max(gaussians.opacities, initial=0)
@@ -129,12 +130,13 @@ def render_in_bands(
     background: Background = None,
     most_pairs: int = PAIRS,
 ) -> Rendering:
-    """Returns the image of `render` in numpy arrays, drawn in as many bands as keep each below
-    `most_pairs` pairs. It works outside of transformations only.
+    """Returns what `render` returns, in numpy arrays. The image is drawn in bands of rows, so that
+    a band has at most `most_pairs` (splat, tile) pairs. This does not work inside of JAX
+    transformations.
 
-    Bands of one row of tiles may still need more pairs, and get them. Configurations whose image
-    depends on its height (a `jacobian_margin`, or what is asked for of each Gaussian) are drawn
-    whole. Raises: as `render`.
+    A band is at least one row of tiles high, and may then have more pairs. The image is drawn as a
+    whole if it depends on its height (`jacobian_margin`), or if values of each Gaussian are wanted
+    (`visibility`, `means2d`, `radii`). Raises: as `render`.
     """
     whole = (
         config.jacobian_margin is not None or config.visibility or config.means2d or config.radii

@@ -35,51 +35,56 @@ from humangs_jax.network.reader import project_and_test
 from humangs_jax.rendering.gaussians import Gaussians
 
 UNSEEN = 0.15
-"""Cosine between a vertex's normal and the line of sight, in the photo that shows the vertex best.
-Below it nothing is known of the vertex.
+"""Cosine between a vertex's normal and the direction to the camera, in the photo with the largest
+cosine. Below this, nothing is known of the vertex.
 """
 SEEN = 0.45
-"""The same cosine from which on nothing is guessed. Between `UNSEEN` and `SEEN` guesses are mixed
-in.
+"""If the cosine is this or more, nothing is guessed for the vertex. Between `UNSEEN` and `SEEN`
+guesses are mixed in.
 """
 SPREAD = 0.015
-"""Metres in the space of the features, over which sources are averaged."""
+"""Standard deviation of the weights of sources in the space of the features, metres."""
 LEAST_HIDDEN = 1 / 3
-"""Share of the vertices that no photo shows, below which nothing is guessed. If photos show a
+"""Something is guessed only if photos hide more than this share of the vertices. If photos show a
 person from all around, only folds and the insides of hands are left, which the network knows
 better.
 """
 DEPTH = 0.5
-"""Factor on distances from front to back, because the back of a trunk is more like its front than
-like its sides.
+"""Factor on distances from front to back in the features, because the back of a trunk is more like
+its front than like its sides.
 """
 PART = 0.6
-"""A change of the square roots of the skinning weights by 1 counts as this distance, metres."""
+"""Distance in the features that stands for a change of the square root of a skinning weight by 1,
+metres.
+"""
 MIRRORED = 0.05
-"""Metres. The square of this is added to the squared distance of a source on the other side of the
-body.
+"""The square of this distance, metres, is added to the squared distance of a source's mirror image.
 """
 FARTHEST = 0.5
-"""The largest distance of a source in the space of the features, metres."""
+"""A vertex gets a guess only if a source is within this distance in the space of the features,
+metres.
+"""
 APART = 10.0
-"""The distance of the head, and of the hands, from the rest in the space of the features,
+"""Distance of the head, and of the hands, from the rest of the body in the space of the features,
 metres.
 """
 CROWN = 0.93
 """Share of the head's height above which the crown begins."""
 FACE = 0.5
-"""Share of the head's depth in front of which the face begins. The face keeps its colors."""
+"""The face is the part of the head in front of this share of the head's depth, except the crown. It
+keeps its colors.
+"""
 NAPE = (0.35, 0.55)
-"""Shares of the head's depth and height. Vertices of the head behind the first and above the second
-count as hair, as the crown does.
+"""Shares of the head's depth, from behind, and of its height. Vertices of the head behind the first
+share and above the second count as hair, as the crown does.
 """
 GLANCE = (0.03, 0.25)
-"""`UNSEEN` and `SEEN` for hair as a source, because photos of a face show the crown at a glancing
-angle.
+"""These replace `UNSEEN` and `SEEN` where hair is a source, because photos of a face show the crown
+at a glancing angle.
 """
 HEAD_JOINTS = ("head", "jaw", "eye")
 BLOCK = 256
-"""Vertices whose sources are weighed at a time, which bounds the memory."""
+"""Number of vertices whose guesses are computed at a time. It bounds the memory."""
 TINY = 1e-6
 """The least distance and weight, so that quotients and logarithms are finite."""
 
@@ -87,12 +92,12 @@ TINY = 1e-6
 def with_guesses(
     outputs: HumanGSOutputs, inputs: HumanGSInputs, body: BodyModel, config: HumanGSConfig
 ) -> HumanGSOutputs:
-    """Returns the outputs with guesses for what no photo shows. Nothing is guessed if photos show
-    all but `LEAST_HIDDEN` of the vertices.
+    """Returns the outputs with guesses for what no photo shows. Nothing is guessed if photos hide
+    at most the share `LEAST_HIDDEN` of the vertices.
 
-    Outputs are also returned as they are for networks that read whole photos, not the person alone,
-    and for networks whose Gaussians are not on vertices. Gradients do not pass through the choice
-    of sources.
+    Outputs are returned unchanged for networks that read whole photos and not only the person, and
+    for networks whose Gaussians are not on vertices. Gradients do not pass through the choice of
+    sources.
     """
     on_vertices = not outputs.is_empty and outputs.skinning_weights is None
     rest, normals = inputs.canonical_vertices, inputs.canonical_normals
@@ -105,8 +110,9 @@ def with_guesses(
 
 
 def _shown_by_view(inputs: HumanGSInputs, config: HumanGSConfig) -> Float[Array, "v n"]:
-    """Returns how well each photo shows each vertex: the cosine between its normal and the line of
-    sight. It is 0 where the vertex is hidden, beyond the frame or beyond the mask, and in padding.
+    """Returns how well each photo shows each vertex: the cosine between the vertex's normal and the
+    direction to the camera. It is 0 if the vertex is hidden or beyond the frame or the mask, and in
+    views that are padding.
     """
     assert inputs.posed_normals is not None  # `prepare_inputs` computes them
     unit_length = subject_unit(inputs.canonical_vertices)
@@ -232,11 +238,11 @@ def attended(
     sure: Float[Array, " n"],
     regions: Regions,
 ) -> Float[Array, "n c"]:
-    """Returns the values, each mixed with its guess. need: the share of the guess for each vertex;
-    0 where nothing changes.
+    """Returns the values, each mixed with its guess.
 
-    sure: how much a vertex counts as a source; 0 for no source. Vertices far from all sources keep
-    their values. The time grows with the number of vertices in need.
+    need: the share of the guess for each vertex, in [0, 1]. 0: the value stays. sure: how much a
+    vertex counts as a source, in [0, 1]. 0: it is no source. Vertices that have no source within
+    `FARTHEST` keep their values. The time grows with the number of vertices with a need.
     """
     count = len(need)
     order = jnp.argsort(-need)  # so that blocks without need are skipped
@@ -271,12 +277,12 @@ def attended(
 # ------------------------------------------------------------------------------------------------
 
 CLEARLY = 0.5
-"""Cosine between normal and line of sight from which on a photo shows clearly what a surface looks
-like.
+"""A photo shows clearly what a surface looks like if the cosine between the surface's normal and
+the direction to the camera is larger than this.
 """
 LEAST_SHOWN = 0.5
-"""Share of the area of a side that photos must show clearly, or of a part of the body that must be
-in photos. Below it the side or part is a guess.
+"""Share of the area of a side that photos must show clearly, and share of the area of a part of the
+body that must lie in photos. Below it the side or the part is a guess.
 """
 SIDES = {
     "front": (0.0, 0.0, 1.0),
@@ -288,7 +294,9 @@ SIDES = {
 a side.
 """
 PARTS = {"head": HEAD_JOINTS, "lower legs": ("knee",), "feet": ("ankle", "foot")}
-"""Words of the names of the joints that move each part."""
+"""Words in joint names, by part. A vertex belongs to a part if the name of its main joint has one
+of the words.
+"""
 
 
 def guess_line(capture: Capture) -> str | None:

@@ -30,13 +30,15 @@ CONSTANT_RATE_FACTOR = 17
 VP9_QUALITY = 18
 """libvpx's constant quality, 0 to 63. 18 is about as good as 18 of x264."""
 LARGEST_GIF = 1 << 30
-"""The most bytes of all frames of a GIF in 24 bits. All are kept in memory, because one palette is
-chosen for all.
+"""The largest size of the frames of a GIF, bytes, with three bytes for each pixel. All frames are
+kept in memory, because one palette is chosen for all.
 """
 LARGEST_GIF_FPS = 50
-"""Viewers slow down frames that are shorter than 2/100 s."""
+"""The largest frame rate of a GIF, frames per second, because viewers slow down frames that are
+shorter than 2/100 s.
+"""
 PALETTE_FRAMES = 16
-"""The palette of a GIF is chosen from this number of frames, evenly spaced."""
+"""Number of evenly spaced frames from which the palette of a GIF is chosen."""
 
 
 def check_video(
@@ -301,8 +303,8 @@ def _indexed(frame: np.ndarray, palette: Any, background: np.ndarray) -> Any:
 
 
 def _commonest(pixels: np.ndarray) -> tuple[int, int, int]:
-    """Returns the most frequent color (3,) of pixels (h, w, 3): that of the background, where it
-    has one color.
+    """Returns the most frequent color (3,) of pixels (h, w, 3). It is the color of the background
+    if the background has a single color.
     """
     packed = pixels.reshape(-1, 3).astype(np.int32) @ (1 << 16, 1 << 8, 1)
     values, counts = np.unique(packed, return_counts=True)
@@ -347,7 +349,7 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple
 
 
 LARGEST_ERROR = 0.25
-"""Mean absolute difference of the channels that is shown in the last of `ERROR_COLORS`."""
+"""Mean absolute difference of the channels for which the last of `ERROR_COLORS` stands."""
 GAP = 4
 """White pixels between tiles."""
 TEXT_SHARE = 1 / 14

@@ -204,8 +204,8 @@ def _fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | 
 
 
 def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any, Any]]:
-    """Returns the further arrays of avatar and motion that have to be finite, by name, each with
-    the range `FINITE`.
+    """Returns the arrays of avatar and motion, besides the Gaussians, that have to be finite. They
+    are given by name, each with the range `FINITE`.
     """
     values = {
         name: (getattr(avatar, name), FINITE)
@@ -316,9 +316,9 @@ def page_html(
 ) -> str:
     """Returns the page as text.
 
-    motion: None for the walk that comes with the package, if the avatar has as many joints. The
-    page has at most 60 frames per second, and the person stands on the floor. title, motion_name:
-    names that the page shows.
+    motion: None for the walk that comes with the package; there is no motion if the walk has
+    another number of joints than the avatar. The page has at most 60 frames per second, and the
+    person stands on the floor. title, motion_name: names that the page shows.
 
     Raises: ValueError (one line) for an avatar or a motion that cannot be drawn, see `pack`.
     """

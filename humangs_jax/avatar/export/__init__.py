@@ -1,8 +1,8 @@
 """Tables of the formats in which avatars are exported for other programs (docs/export.md), and of
 the formats of videos.
 
-`gaussians` has the functions that read and write, `splats` and `spz` the formats of Gaussians, and
-`mesh` the formats of the body.
+`gaussians` has the functions that read and write. The formats of Gaussians are in `splats`, `spz`
+and `sog`, the formats of the body in `mesh`, and the format of motions in `vrma`.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ class ExportFormat(Format):
     """
 
     up: Up = "y"
-    """The axis that the readers of this format take for up."""
+    """The axis that points up for the programs that read this format."""
     mesh: bool = False
     """Whether the format holds the body as a textured mesh, not Gaussians."""
     animated: bool = False
@@ -42,14 +42,17 @@ class ExportFormat(Format):
     backwards: bool = False
     """Whether the format's axes point to the right, up and back, half a turn about y from ours."""
     beside: tuple[str, ...] = ()
-    """Suffixes of further files that are written with it, see `files_beside`."""
+    """Suffixes of the further files that are written next to a file of this format, see
+    `files_beside`.
+    """
     reader: str | Callable[[bytes], Any] = ""
-    """The reader of Gaussians, called with the bytes of a file and a list that takes lines about
-    it; raises `io.reading.InvalidFileError`.
+    """The function that reads Gaussians, or its place as "module:function". It takes the bytes of a
+    file and a list, to which it appends lines about the file. It raises
+    `io.reading.InvalidFileError`. Empty: the format is not read.
     """
     magic: tuple[bytes, ...] = ()
-    """The bytes with which files of the format may begin; empty where the beginning does not
-    tell.
+    """The bytes with which files of the format may begin. Empty: the format is recognised by its
+    suffix.
     """
 
 
@@ -143,12 +146,12 @@ OTHERS = {
         " folder"
     ),
 }
-"""Texts about files of Gaussians that are not read, by suffix."""
+"""What the error says about files that are not read, by suffix."""
 
 
 @dataclasses.dataclass(frozen=True)
 class VideoFormat(Format):
-    """A format of videos. code: called as code(path, frames, fps, shape of a frame)."""
+    """A format of videos. Its code is called as code(path, frames, fps, shape of a frame)."""
 
     transparent: bool = False
     """Whether frames may have alpha."""
@@ -174,18 +177,19 @@ VIDEOS = Formats(
 
 
 def files_beside(path: Path, form: ExportFormat) -> list[Path]:
-    """Returns the further files of an output.
+    """Returns the paths of the files that are written next to an output, such as the `.mtl` and the
+    `.png` of an `.obj`.
 
-    White space in the output's name becomes "_" in theirs, because many readers of `.obj` end names
-    there.
+    White space in the output's name becomes "_" in these names, because for many readers of `.obj`
+    a name ends at white space.
     """
     stem = "_".join(path.stem.split())
     return [path.with_name(stem + suffix) for suffix in form.beside]
 
 
 def chosen_format(suffix: str, mesh: bool = False) -> ExportFormat | None:
-    """Returns the format of files with this suffix, None if there is none. mesh: whether it has to
-    be a format of meshes; if not, formats of Gaussians come first.
+    """Returns the format in which files with this suffix are written, or None if there is none.
+    mesh: whether only formats of meshes count; if not, formats of Gaussians come first.
     """
     found = [
         each for each in EXPORTS.values() if suffix.lower() in each.suffixes and each.mesh >= mesh

@@ -1,11 +1,11 @@
 """The parts of reading and writing Gaussians and avatars that all file formats share. `EXPORTS` has
 a row for each format.
 
-Ours are metres with y up, the person faces +z, quaternions wxyz, linear scales, opacities and
-colors in [0, 1]. glTF's world is the same. Viewers of `.ply` and `.splat` take y for down:
-SuperSplat and PlayCanvas turn what they read by half a turn about z. The axes of `.spz` point to
-the right, up and back, half a turn about y from ours. Converters assume the same. `export` turns
-avatars into these worlds; `load_gaussians` and `save_gaussians` do so with `y_up`.
+Our Gaussians are in metres with y up, the person faces +z, quaternions are wxyz, scales are linear,
+and opacities and colors are in [0, 1]. glTF's world is the same. Viewers of `.ply` and `.splat`
+take y for down: SuperSplat and PlayCanvas turn what they read by half a turn about z. The axes of
+`.spz` point to the right, up and back, half a turn about y from ours. Converters assume the same.
+`export` turns avatars into these worlds; `load_gaussians` and `save_gaussians` do so with `y_up`.
 """
 
 import functools
@@ -103,8 +103,8 @@ def turned(gaussians: Gaussians, up: Up) -> Gaussians:
 
 
 def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Gaussians:
-    """Returns Gaussians turned about the origin. turn: a quaternion (wxyz) of a number of quarters
-    of a turn.
+    """Returns Gaussians turned about the origin. turn: the rotation as a quaternion (wxyz), which
+    must consist of quarter turns.
     """
     return _rotated(gaussians, turn)
 
@@ -121,8 +121,8 @@ def _rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> G
 
 
 def _matrix(turn: tuple[float, float, float, float]) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation of a quaternion (wxyz) of quarters of a turn as a matrix of 0, 1 and
-    -1.
+    """Returns the rotation matrix of a quaternion (wxyz) that consists of quarter turns. Its
+    elements are exactly 0, 1 or -1.
     """
     w, x, y, z = turn
     return Rotation.from_quat([x, y, z, w]).as_matrix().astype(np.float32).round()
@@ -140,15 +140,15 @@ def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
 
 
 def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
-    """Returns means, unit quaternions (wxyz), scales, opacities, colors and harmonics (k = 0 for
-    none) as float64 arrays, without deformations and low-pass.
+    """Returns means, unit quaternions (wxyz), scales, opacities, colors and harmonics as float64
+    arrays, without deformations and low-pass. Harmonics have k = 0 if there are none.
 
-    Viewers add `EPS2D` pixels^2, as 3DGS does, where our renderer adds less to scales that contain
-    a low-pass (`Gaussians.pixel_footprint`). It is taken out, so that both draw the same in images
-    of the size that the Gaussians were fitted to.
+    Viewers add `EPS2D` pixels^2 to projected variances, as 3DGS does. Our renderer adds less if the
+    scales contain a low-pass (`Gaussians.pixel_footprint`). The low-pass is therefore taken out of
+    the scales, so that viewers draw the same images, at the size that the Gaussians were fitted to.
 
-    Raises: ValueError for numbers that files cannot hold: not finite, or of more than
-    `checks.LARGEST`.
+    Raises: ValueError for numbers that files cannot hold, because they are not finite or larger
+    than `checks.LARGEST`.
     """
     names = ("means", "quats", "scales", "colors", "harmonics")
     check_values("export", record_values(gaussians, "gaussians"))
@@ -195,8 +195,8 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
     PlayCanvas), `.splat`, `.spz`, `.glb`, `.sog` (PlayCanvas) and `.pt` (checkpoints of gsplat).
 
     Args:
-        path: The file. How it begins decides the format; where that does not tell (`.splat`), its
-            suffix.
+        path: The file. Its first bytes decide the format. Its suffix does for the formats without
+            typical first bytes (`.splat`, `.sog`, `.pt`).
         y_up: Whether the Gaussians are turned from the world that viewers of the format expect (y
             down in `.ply`, `.splat`, `.sog` and `.pt`) to one with y up, as `orbit` has it. False:
             the numbers stay as they are in the file, and the cameras of the scene fit.
@@ -204,13 +204,13 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
     Returns:
         Gaussians in float32 with unit quaternions (wxyz), linear scales, opacities in [0, 1],
         colors 1/2 + Y00 f_dc, and harmonics (g, 3, 3), (g, 8, 3) or (g, 15, 3) if the file has
-        them.
+        them. Gaussians with numbers that are not finite are left out. A warning says so, and lists
+        what else in the file is not used.
 
     Raises:
         FileNotFoundError: There is no such file.
-        FileError: It cannot be read, is larger than the limits allow, or has other numbers than it
-            should: file and property. Gaussians with numbers that are not finite are left out, with
-            a warning; so is what a file says and is not used.
+        FileError: The file cannot be read, is larger than the limits allow, or has invalid numbers.
+            The message names file and property.
 
     Examples:
         >>> scene = hg.load_gaussians("garden.ply", y_up=True)
@@ -280,7 +280,7 @@ def save_gaussians(
 def _check_version(path: object, form: ExportFormat, version: int | None) -> None:
     """Check that a version of a format can be written.
 
-    Raises: ValueError.
+    Raises: ValueError if not.
     """
     if version is None or version in form.versions:
         return
@@ -333,8 +333,10 @@ def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], notes: list[str]) -
 
 
 def _finite(arrays: Mapping[str, np.ndarray], notes: list[str]) -> Mapping[str, np.ndarray]:
-    """Returns the rows of the arrays that are finite in all of them, also when rounded to float32.
-    A line with the count of the others is appended to `notes`.
+    """Returns the arrays without the Gaussians (rows) that have a number that is not finite, also
+    after rounding to float32. A line with the count of these Gaussians is appended to `notes`.
+    Arrays of different lengths or without floats are returned as they are. Raises: InvalidFileError
+    if no Gaussian is left.
     """
     count = len(next(iter(arrays.values())))
     keep = np.ones(count, bool)
@@ -358,8 +360,9 @@ def _finite(arrays: Mapping[str, np.ndarray], notes: list[str]) -> Mapping[str, 
 
 
 def with_largest(three: Float[np.ndarray, "g 3"], places: np.ndarray) -> Float[np.ndarray, "g 4"]:
-    """Returns unit quaternions from three components in their order, and the place (0 to 3) of the
-    fourth one, which is the largest and not negative.
+    """Returns unit quaternions, each from three of its components, in their order. The fourth
+    component follows from the length of 1, and is not negative. places: the place (0 to 3) of the
+    fourth component in each quaternion.
     """
     rest = np.sqrt(np.maximum(1 - np.square(three).sum(axis=1), 0))
     quats = np.empty((len(three), 4))
@@ -369,14 +372,14 @@ def with_largest(three: Float[np.ndarray, "g 3"], places: np.ndarray) -> Float[n
 
 
 def colors_of(coefficients: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
-    """Returns the colors of coefficients of the constant spherical harmonic; the inverse of
-    `sh_of`.
+    """Returns colors from the coefficients of the constant spherical harmonic. This is the inverse
+    of `sh_of`.
     """
     return 0.5 + SH_C0 * coefficients
 
 
 def unit_quats(quats: Float[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
-    """Returns the quaternions scaled to length 1; the identity for those of length 0."""
+    """Returns the quaternions scaled to length 1. Quaternions of length 0 become the identity."""
     norms = np.linalg.norm(quats, axis=-1, keepdims=True)
     return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0])
 
@@ -393,7 +396,7 @@ def frame_range(text: str, count: int) -> range:
     """Returns the frames that "a:b:step" selects of `count` frames, as Python slices do. Each part
     may be missing.
 
-    Raises: ValueError.
+    Raises: ValueError if the text is of another form or selects no frame.
     """
     parts = text.split(":")
     if not 2 <= len(parts) <= 3 or not all(
@@ -429,21 +432,22 @@ def export(
         path: with a suffix of `EXPORTS`.
         avatar: one person.
         motion: None for the T-pose. A `.glb` of the mesh holds all of it as animation.
-        numbers: a number for each frame of the motion, for its file: "x.ply" becomes "x_0007.ply".
-            All frames stand on one floor, which a person who jumps leaves. None: the motion has one
-            frame, whose feet are on 0. A format that holds a whole motion does not use them.
-        mesh: as a mesh where the suffix has formats of Gaussians, too.
+        numbers: for each frame of the motion the number in the name of its file: "x.ply" becomes
+            "x_0007.ply". All frames have one floor, so that a person who jumps is above it. None:
+            the motion has one frame, whose feet are on 0. A format that holds a whole motion does
+            not use the numbers.
+        mesh: whether a mesh is written if the suffix also has a format of Gaussians (`.glb`).
         up: the axis that points up; None for the format's own.
         rest_fields: see `write_ply`.
         version: see `save_gaussians`.
-        name: of the animation.
+        name: the name of the animation in the file.
 
     Returns:
         The files, without those that a format puts beside them (`.mtl` and `.png` of an `.obj`).
 
     Raises:
-        ValueError: for another suffix, a format without what is asked for, or if `numbers` are not
-            one for each frame.
+        ValueError: for another suffix, for a format that cannot hold what is asked for, or if
+            `numbers` has not one number for each frame.
 
     Examples:
         >>> hg.export("person.glb", avatar, hg.load_motion("dance.bvh"), mesh=True)

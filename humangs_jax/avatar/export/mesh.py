@@ -1,9 +1,9 @@
 """The body of an avatar as a textured mesh: for programs that know no Gaussians.
 
-The texture is what the Gaussians show to someone who looks at each point of the skin along its
-normal: those near the line of sight are blended front to back, as a renderer blends them. So
-clothes end up on the skin, as a bodysuit: the mesh is that of the body. The atlas is our own
-(`rendering.mesh.atlas`), for any body.
+The texture has the colors that the Gaussians show to someone who looks at each point of the skin
+along its normal. Gaussians near the line of sight are blended front to back, as a renderer blends
+them. Clothes therefore end up on the skin, like a bodysuit, because the mesh is the body's. The
+atlas is our own (`rendering.mesh.atlas`), for any body.
 
     .glb    https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#skins: mesh, skin and motion,
             as Blender, Unity, Unreal and three.js open it. The texture holds the photos' light, so
@@ -51,7 +51,7 @@ TEXTURE_SIZE = 1024
 NEIGHBOURS = 32
 """The number of Gaussians that color a point: those with the nearest means."""
 CHUNK = 16384
-"""Points that are colored at a time, in some 100 MB."""
+"""Number of points that are colored at a time. This takes some 100 MB."""
 SMALLEST_SCALE = 1e-4
 """The least standard deviation with which Gaussians are seen, metres. It gives flat Gaussians a
 thickness.
@@ -59,7 +59,7 @@ thickness.
 LEAST_WEIGHT = 1e-4
 """The least weight of the nearest Gaussian. It gives a color to points that no Gaussian covers."""
 WEIGHTS = 4
-"""The number of joints of a vertex that all programs read."""
+"""The number of joints for each vertex. All programs can read this many."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,8 +213,8 @@ def write_mesh_glb(
 ) -> None:
     """Write mesh, skin and motion as a `.glb`. If writing fails, the path stays as it was.
 
-    Arguments: motion: the motion as it is to be played (`grounded`); without one the person stands
-    in T-pose, feet on 0. name: the name of the motion. up: the axis that points up in the file.
+    Arguments: motion: the motion as it is to be played (`grounded`). None: the person stands in
+    T-pose, feet on 0. name: the name of the motion. up: the axis that points up in the file.
     """
     writer = GlbWriter()
     skeleton = len(avatar.parents) + 1  # nodes: the joints, then what they hang on, then the mesh
@@ -258,8 +258,8 @@ def write_mesh_glb(
 def strongest(
     weights: Float[np.ndarray, "n j"],
 ) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 4"]]:
-    """Returns the four joints of most weight of each row, strongest first, and their weights scaled
-    to sum 1. Where a weight is 0, its joint is 0.
+    """Returns the four joints with the largest weights of each row, strongest first, and their
+    weights, scaled to sum to 1. Where a weight is 0, its joint is 0.
     """
     weights = np.pad(weights, ((0, 0), (0, max(0, WEIGHTS - weights.shape[1]))))
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :WEIGHTS]
@@ -269,8 +269,8 @@ def strongest(
 
 
 def _standing(mesh: BodyMesh, up: Up) -> BodyMesh:
-    """Returns the mesh as its skin shows it in T-pose, turned to `up` and standing on 0. Readers
-    that ignore skins show the same.
+    """Returns the mesh in T-pose, turned to `up` and moved so that its lowest point is on 0. The
+    file's skin leaves it there, so that readers that ignore skins show the same.
     """
     turn = up_matrix(up)
     vertices = (mesh.vertices - _floor(mesh)) @ turn.T
@@ -344,8 +344,8 @@ def _primitive(writer: GlbWriter, mesh: BodyMesh) -> dict[str, Any]:
 
 
 def _skin(writer: GlbWriter, avatar: Avatar, mesh: BodyMesh, up: Up) -> dict[str, Any]:
-    """Returns the glTF skin, whose matrices take the mesh as it is written, with `up` up, to the
-    rest frame of each joint.
+    """Returns the glTF skin. Its matrices take the mesh as it is written, with `up` up, to the rest
+    frame of each joint.
     """
     matrices = np.tile(np.eye(4), (len(avatar.parents), 1, 1))
     matrices[:, :3, :3] = up_matrix(up)  # column by column, as glTF has them: the turn back
@@ -361,8 +361,8 @@ def _skin(writer: GlbWriter, avatar: Avatar, mesh: BodyMesh, up: Up) -> dict[str
 def _animation(
     writer: GlbWriter, avatar: Avatar, motion: Motion, name: str, mesh_node: int
 ) -> dict[str, Any]:
-    """Returns the glTF animation of a motion: the rotations of every joint that turns, the places
-    of the root, and the expressions of an avatar with a face.
+    """Returns the glTF animation of a motion. It has the rotations of every joint that turns, the
+    translation of the root, and the expressions if the avatar has a face.
     """
     times = writer.array("SCALAR", np.arange(len(motion.translations)) / motion.fps, bounds=True)
     rotations = np.asarray(motion.rotations)
@@ -385,8 +385,9 @@ def _animation(
 def tracks_of(
     writer: GlbWriter, times: int, tracks: Sequence[tuple[int, str, str, np.ndarray]], name: str
 ) -> dict[str, Any]:
-    """Returns a glTF animation. tracks: (node, path, kind of array, values) of each track. times:
-    the accessor of the times of all tracks.
+    """Returns a glTF animation. tracks: for each track the node, the animated property (glTF's
+    `path`), the type of the values, such as "VEC4", and the values. times: index of the accessor
+    with the times of all tracks.
     """
     samplers = [
         {"input": times, "output": writer.array(kind, values), "interpolation": "LINEAR"}
@@ -400,8 +401,8 @@ def tracks_of(
 
 
 def continuous(quats: Float[np.ndarray, "m j 4"]) -> Float[np.ndarray, "m j 4"]:
-    """Returns unit quaternions with signs such that each is on the side of the one before, since
-    some players interpolate the numbers.
+    """Returns the quaternions of m frames with length 1 and with signs such that neighbouring
+    frames have a dot product of at least 0. Some players interpolate the components.
     """
     quats = quats / np.linalg.norm(quats, axis=-1, keepdims=True)
     jumps = (quats[1:] * quats[:-1]).sum(axis=-1, keepdims=True) < 0
@@ -439,8 +440,8 @@ def check_beside(path: Path) -> None:
 def write_poses(
     path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
 ) -> None:
-    """Write an `.obj` for each pose of a motion, or one of the T-pose with its feet on 0. All share
-    the material and the texture beside `path`.
+    """Write an `.obj` for each pose of a motion, or a single one in T-pose with its feet on 0. All
+    of them use the material and the texture beside `path`. files: the paths of the `.obj` files.
     """
     check_beside(path)
     mesh = body_mesh(avatar)
@@ -455,9 +456,9 @@ def write_poses(
 
 
 def write_material(path: Path, mesh: BodyMesh) -> Path:
-    """Write the `.mtl` and the `.png` that the `.obj` of this path names. Several poses share them.
+    """Write the `.mtl` and the `.png` for the `.obj` at this path. Several poses share them.
 
-    Returns the `.mtl`'s path.
+    Returns the path of the `.mtl`.
     """
     material, texture = files_beside(path, EXPORTS["obj"])
     write_png(texture, mesh.texture.astype(np.float32) / 255, mark=DRAWN)

@@ -1,11 +1,12 @@
 """`.sog` of PlayCanvas, read only: a zip of meta.json and of pictures (WebP without loss, or PNG),
-a pixel for each Gaussian.
+with a pixel for each Gaussian.
 
-Version 2 (https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog) has
-positions in 16 bits, of two pictures, between bounds of sign(x) log(1 + |x|); log scales and colors
-as bytes that stand for numbers of a codebook; opacities in a byte; quaternions as the three
-components beside the largest, whose place is the alpha less 252; and harmonics as one of up to
-65,536 rows of a picture, by the two bytes of their label. Y points down, as in `.ply`.
+Version 2 is https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog. Positions
+have 16 bits, one byte in each of two pictures. They stand for sign(x) log(1 + |x|) between two
+bounds. Log scales and colors are bytes that stand for the numbers of a codebook, and opacities are
+bytes. A quaternion has its three smaller components; alpha minus 252 is the place of the largest.
+Harmonics are in a picture with up to 65,536 sets of them; the two bytes of a Gaussian's label
+choose its set. Y points down, as in `.ply`.
 """
 
 import io
@@ -30,9 +31,9 @@ USUAL = "default"
 LEVELS = 256
 """The most numbers in a codebook."""
 FIRST_PLACE = 252
-"""Alpha of a quaternion whose largest component is w; the next three are of x, y and z."""
+"""Alpha of a quaternion whose largest component is w. The next three values are for x, y and z."""
 COLUMNS = 64
-"""Rows of harmonics that stand side by side in their picture."""
+"""Number of sets of harmonics in a row of their picture."""
 
 
 def read_sog(data: bytes, notes: list[str]) -> Gaussians:
@@ -137,8 +138,8 @@ def _numbers(values: Any, name: str, least: int, most: int) -> Float[np.ndarray,
 
 
 def _codebook(meta: dict[str, Any], part: str) -> Float[np.ndarray, "256"]:
-    """Returns the numbers that bytes stand for. Numbers beyond the end of a short codebook are NaN;
-    `loaded` leaves such Gaussians out.
+    """Returns the numbers that the bytes of a part stand for. A short codebook is filled up with
+    NaN, so that `loaded` leaves out Gaussians with bytes beyond its end.
     """
     found = _numbers(_part(meta, part).get("codebook"), f"{part}.codebook", 1, LEVELS)
     return np.pad(found, (0, LEVELS - len(found)), constant_values=np.nan)
@@ -173,7 +174,9 @@ def _positions(
 def _harmonics(
     archive: zipfile.ZipFile, root: str, meta: dict[str, Any], count: int
 ) -> dict[str, Float[np.ndarray, "g k 3"]]:
-    """Returns the harmonics under the name "shN"; an empty dictionary if there are none."""
+    """Returns the harmonics (g, k, 3) under the name "shN". The dictionary is empty if there are
+    none.
+    """
     if meta.get("shN") is None:
         return {}
     bands = _whole(_part(meta, "shN").get("bands"), "shN.bands")

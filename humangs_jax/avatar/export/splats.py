@@ -1,16 +1,17 @@
 """Formats of Gaussians: `.ply`, `.splat`, `.glb` and checkpoints of gsplat; `spz` and `sog` have
 the others.
 
-`.ply` is that of 3DGS, or the compressed one of PlayCanvas, which is read only.
+A `.ply` has the properties of 3DGS, or the compressed ones of PlayCanvas, which are read only.
 
 3DGS (https://github.com/graphdeco-inria/gaussian-splatting): x y z, nx ny nz (zeros), f_dc_* = (rgb
 - 1/2) / Y00, f_rest_* of degrees 1 to 3 (all of red, then of green, then of blue), logit opacity,
 log scales, quaternion wxyz.
 
-Compressed (https://github.com/playcanvas/splat-transform): for each 256 Gaussians a chunk with the
-bounds of positions, log scales and perhaps colors; for each Gaussian four words: position and scale
-between them in 11, 10 and 11 bits, the quaternion without its largest component in 2 bits and three
-times 10, color and opacity in 8 bits each; f_rest_* from -4 to 4 in a byte.
+Compressed (https://github.com/playcanvas/splat-transform): for each 256 Gaussians a chunk has the
+bounds of positions, log scales and perhaps colors. Each Gaussian has four words of 32 bits.
+Position and scale are shares between the bounds, in 11, 10 and 11 bits. The quaternion has the
+place of its largest component in 2 bits, and the other three components in 10 bits each. Color and
+opacity have 8 bits each. f_rest_* are bytes, from -4 to 4.
 """
 
 import io
@@ -44,7 +45,7 @@ from humangs_jax.io.tensors import tensors_in
 from humangs_jax.rendering.gaussians import COUNTS, Gaussians, factored, skin_gaussians
 
 OPACITY_MARGIN = 1e-6
-"""Keeps the logit finite for opacities of 0 and 1."""
+"""Opacities are clipped to be this far from 0 and 1, so that their logit is finite."""
 SMALLEST_SCALE = 1e-9
 """The least scale that is written, metres. It keeps the logarithm finite for flat Gaussians."""
 LONGEST_HEADER = 1 << 16
@@ -62,8 +63,8 @@ TYPES = {
 TYPES |= {f"{np.dtype(kind).name}": kind for kind in TYPES.values()}
 CHUNK = 256
 REST = 8 * np.concatenate([[0], np.arange(1.5, 255), [256]]) / 256 - 4
-"""The numbers that the bytes of compressed harmonics stand for: the middle of each step, but the
-ends of the range for the first and the last byte.
+"""The number that each byte of compressed harmonics stands for, (256,). It is the middle of the
+byte's step; for the first and the last byte it is the end of the range.
 """
 DEGREE_4 = 72
 """The number of `f_rest_*` properties of harmonics of degree 1 to 4, which are not read."""
@@ -75,9 +76,11 @@ KNOWN = re.compile(
     r"[xyz]|n[xyz]|red|green|blue|alpha|opacity|filter_3D"
     r"|(f_dc|f_rest|scale|rot|packed|min|max)_\w+"
 )
-"""Matches the properties that are read, and those that repeat what these contain."""
+"""Matches the names of the properties that are read, and of properties that only repeat their
+contents.
+"""
 SHOWN = 6
-"""The most names that a line about unused properties lists."""
+"""The largest number of names in a line about unused properties."""
 Columns = Mapping[str, np.ndarray]
 
 
@@ -152,8 +155,8 @@ def _fused(
 
 
 def _unused(elements: Mapping[str, Columns]) -> list[str]:
-    """Returns a line that lists the properties and elements that are not read; no line if all are
-    read.
+    """Returns a list with one line about the properties and elements that are not read. The list is
+    empty if all are read.
     """
     found = [name for name in elements if name not in ("chunk", "vertex", "sh", "face")]
     found += [
@@ -177,9 +180,9 @@ def _exponential(logs: Float[np.ndarray, "g 3"]) -> Float[np.ndarray, "g 3"]:
 def _harmonics(
     columns: Columns, values: np.ndarray | None = None
 ) -> dict[str, Float[np.ndarray, "g k 3"]]:
-    """Returns the harmonics under the name "f_rest_*"; an empty dictionary if there are none.
-    values: the numbers that the bytes of a column stand for; None if columns hold the numbers
-    themselves.
+    """Returns the harmonics (g, k, 3) under the name "f_rest_*". The dictionary is empty if there
+    are none. values: the number that each byte stands for, as `REST`. None: columns hold the
+    numbers themselves.
     """
     count = sum(name.startswith("f_rest_") for name in columns)
     if count % 3 or count // 3 not in COUNTS:
@@ -245,11 +248,13 @@ WORDS = {
     "scale": _ELEVEN,
     "color": [(24, 8), (16, 8), (8, 8), (0, 8)],
 }
-"""The lowest bit and the width of each part of compressed Gaussians."""
+"""The lowest bit and the number of bits of each part of a packed word. Parts are in the order x, y,
+z, for rotations the three components in their order, and for colors red, green, blue, opacity.
+"""
 
 
 def _bits(words: np.ndarray, lowest: int, width: int) -> Float[np.ndarray, " g"]:
-    """Returns a field of bits of each word, scaled to [0, 1]."""
+    """Returns `width` bits of each word, from the bit `lowest` on, as numbers in [0, 1]."""
     return (words >> np.uint32(lowest) & np.uint32(2**width - 1)) / (2**width - 1)
 
 
@@ -477,8 +482,8 @@ ATTRIBUTES = (*NEEDED, *COEFFICIENTS)
 def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.glb` with KHR_gaussian_splatting. If writing fails, the path stays as it was.
 
-    Viewers that do not know the extension draw colored points: glTF's COLOR_0 is linear, unlike the
-    extension's coefficients.
+    Viewers that do not know the extension draw points in the colors of COLOR_0. These colors are
+    linear, as glTF wants them, while the extension's coefficients are of sRGB colors.
     """
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
     if not len(means):
@@ -525,7 +530,7 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
 
 def read_glb(data: bytes, notes: list[str]) -> Gaussians:
-    """Returns the Gaussians in the bytes of a `.glb`, those of each node moved by its transform.
+    """Returns the Gaussians in the bytes of a `.glb`, each moved by the transform of its node.
     Lines about what is left out are appended to `notes`.
 
     Raises: InvalidFileError; for damaged numbers also other errors.

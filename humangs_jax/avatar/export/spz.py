@@ -1,14 +1,16 @@
-"""`.spz` of Niantic (https://github.com/nianticlabs/spz#file-format): a header and six arrays, 20
-bytes a Gaussian and 3 more for each harmonic.
+"""`.spz` of Niantic (https://github.com/nianticlabs/spz#file-format): a header and six arrays. From
+version 3 on a Gaussian has 20 bytes, and 3 more for each harmonic.
 
-Positions are in 24-bit fixed point, opacities k / 255, f_dc = (k / 255 - 1/2) / 0.15, scales exp(k
-/ 16 - 10) metres, harmonics k / 128 - 1, the channels of each together. Quaternions have their
-three smallest components in 10 bits each; before version 3 x, y, z in a byte each. Version 1 has
-positions in 16-bit floats.
+Positions are 24-bit fixed-point numbers. A byte k stands for the opacity k / 255, for f_dc = (k /
+255 - 1/2) / 0.15, for a scale of exp(k / 16 - 10) metres, or for the harmonic k / 128 - 1. The
+three channels of a harmonic are next to each other. Quaternions have their three smallest
+components in 10 bits each; before version 3 they have x, y and z in a byte each. Version 1 has
+positions as 16-bit floats.
 
-Up to version 3 all of it is one gzip. Version 4 has a header of 32 bytes that is not compressed,
-perhaps records of others behind it, a table of (bytes, bytes unpacked) at the offset that the
-header names, and one zstd frame for each array that is not empty.
+Files up to version 3 are one gzip stream. Files of version 4 have, in this order, a header of 32
+bytes that is not compressed, perhaps records of other programs, a table at the offset that the
+header names, and a zstd frame for each array that is not empty. The table has the compressed and
+the unpacked size of each array, bytes.
 
 Libraries that write it bring a compiler (gsply) or do not install (PyPI's spz).
 """
@@ -46,31 +48,36 @@ HEADER = struct.Struct("<IIIBBBB")
 streams (0 before version 4).
 """
 TABLE_PLACE = struct.Struct("<I12x")
-"""Version 4 behind the header: the offset at which the table begins."""
+"""What follows the header in version 4: the offset of the table, in bytes from the beginning of the
+file.
+"""
 TABLE_ROW = struct.Struct("<QQ")
-"""A row of the table: the bytes of a stream, and of what it unpacks to."""
+"""A row of the table: the compressed and the unpacked size of a stream, bytes."""
 RECORD = struct.Struct("<II")
 """The beginning of a record of another program: its kind, and the number of bytes that follow."""
 COORDINATE_SYSTEM = 0xADBE0003
-"""The kind of the record that files have whose axes are not right, up and back."""
+"""The kind of a record that names the axes. Files have it if their axes are not right, up and back.
+"""
 ANTIALIASED = 1
 """The flag of files whose Gaussians were trained with the filters of Mip-Splatting."""
 MORE_BEHIND = 2
-"""The flag of files that have records of other programs."""
+"""The flag of files that contain records of other programs."""
 MOST_FRACTIONAL_BITS = 20
-"""The most fractional bits of positions, in steps of a micrometre. Gaussians that reach farther
-than 8 m have fewer.
+"""The largest number of fractional bits of positions; a step is then about a micrometre. Files with
+Gaussians farther than 8 m from the origin have fewer.
 """
 COLOR_SCALE = 0.15
 """Factor on the harmonic of degree 0 before it becomes a byte."""
 SCALE_STEPS = 16.0
-"""The number of steps of a byte by which a scale grows by the factor e."""
+"""The number of steps of its byte by which a scale grows by the factor e."""
 SCALE_ZERO = 10.0
 """The number that is added to the logarithm of a scale in metres, so that the byte is not
 negative.
 """
 HARMONIC_STEPS = 128.0
-"""The number of steps of a byte for a change of a harmonic by 1; also the byte of 0."""
+"""The number of steps of its byte by which a harmonic grows by 1. It is also the byte that stands
+for 0.
+"""
 QUATERNION_STEPS = 511
 
 
@@ -102,10 +109,10 @@ class _Header(NamedTuple):
 def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Version = 3) -> None:
     """Write a `.spz`. If writing fails, the path stays as it was.
 
-    Scales lose up to 3 %, colors, harmonics and opacities to 8 bits, components of quaternions to
-    10. Harmonics are from -1 to 1.
+    Scales change by up to 3 %. Colors, harmonics and opacities are rounded to 8 bits, components of
+    quaternions to 10 bits. Harmonics are clipped to [-1, 1].
 
-    Raises: ValueError for Gaussians of which a coordinate exceeds 8,388,607 m.
+    Raises: ValueError if a coordinate of a Gaussian exceeds 8,388,607 m.
     """
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
     # places have 24 bits: as many behind the point as the farthest Gaussian leaves
@@ -148,8 +155,9 @@ def _byte(values: Float[np.ndarray, "*b"]) -> UInt8[np.ndarray, "*b"]:
 
 
 def _packed_quaternions(quats: Float[np.ndarray, "g 4"]) -> UInt[np.ndarray, " g"]:
-    """Returns quaternions packed into uint32, (g,): the index of the largest of x, y, z, w, then a
-    sign and a size for each of the others. Sizes are shares of 1 / sqrt(2).
+    """Returns each quaternion packed into a uint32. It has the index of the largest of x, y, z, w,
+    then the sign and the size of each of the others, in this order. Sizes are shares of 1 /
+    sqrt(2), in steps of 1 / 511.
     """
     xyzw = quats[:, [1, 2, 3, 0]]
     largest = np.argmax(np.abs(xyzw), axis=1)
@@ -218,8 +226,10 @@ def read_spz(data: bytes, notes: list[str]) -> Gaussians:
 
 
 def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header:
-    """Returns the header of a file of `size` bytes, after checking that the file may unpack to what
-    it says. start: the first bytes of the file, unpacked.
+    """Returns the header of a file of `size` bytes. Before, it checks version, degree, and number
+    of Gaussians, and that a file of this size may unpack to the size in the header.
+
+    start: the first bytes of the file, unpacked. versions: the versions that are read.
 
     Raises: InvalidFileError.
     """
@@ -261,9 +271,9 @@ def _check_size(size: int, header: _Header, more: bool = False) -> None:
 def _with_table(data: bytes, notes: list[str]) -> tuple[_Header, list[bytes]]:
     """Returns the header and the six arrays of a file of version 4.
 
-    The table must fit the file and the number of Gaussians before anything is unpacked, so that
-    nothing becomes larger than it may. Lines about records that are not used are appended to
-    `notes`.
+    Before anything is unpacked, the table is checked against the file and the number of Gaussians,
+    so that nothing unpacks to more bytes than expected. Lines about records that are not used are
+    appended to `notes`.
     """
     header = _checked_header(data, (WITH_TABLE,), len(data))
     begin = HEADER.size + TABLE_PLACE.size
@@ -304,7 +314,9 @@ def _with_table(data: bytes, notes: list[str]) -> tuple[_Header, list[bytes]]:
 
 
 def _records(data: bytes) -> list[str]:
-    """Returns a line that lists the records of other programs; no line if there are none."""
+    """Returns a list with one line about the records of other programs. The list is empty if there
+    are none.
+    """
     names, at = [], 0
     while at + RECORD.size <= len(data):
         kind, size = RECORD.unpack_from(data, at)
@@ -333,13 +345,15 @@ def _unpacked(stream: bytes, size: int) -> bytes:
 
 
 def _fixed_point(positions: UInt8[np.ndarray, "g 9"], bits: int) -> Float[np.ndarray, "g 3"]:
-    """Returns numbers of 3 bytes each as floats. bits: the number of fractional bits."""
+    """Returns positions, metres, from 3 bytes for each coordinate. bits: the number of fractional
+    bits.
+    """
     padded = np.pad(positions.reshape(len(positions), 3, 3), ((0, 0), (0, 0), (1, 0)))
     return np.ascontiguousarray(padded).view("<i4")[..., 0] / 2.0 ** (8 + bits)
 
 
 def _smallest_three(packed: UInt8[np.ndarray, "g 4"]) -> Float[np.ndarray, "g 4"]:
-    """Returns unit quaternions (wxyz) from the 4 bytes that `_packed_quaternions` makes of each."""
+    """Returns the unit quaternions (wxyz) that `_packed_quaternions` packed into 4 bytes each."""
     word = np.ascontiguousarray(packed).view("<u4")[:, 0]
     signed = [word >> np.uint32(shift) & np.uint32(1023) for shift in (20, 10, 0)]
     three = np.stack([np.where(part & 512, -1.0, 1.0) * (part & 511) for part in signed], axis=1)

@@ -2,9 +2,9 @@
 expressions, no mesh.
 
 https://github.com/vrm-c/vrm-specification/tree/master/specification/VRMC_vrm_animation-1.0: a glTF
-file whose nodes are the bones of a person in T-pose. An expression is a node, and its weight is how
-far that node is moved along x. Those that are no presets of VRM are custom ones under their own
-names, as programs for ARKit's shapes expect them.
+file whose nodes are the bones of a person in T-pose. Each expression is a further node, and its
+weight is how far this node is moved along x. All are custom expressions under our names, as
+programs for ARKit's shapes expect them.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ BONES = {
 }  # fmt: skip
 """VRM's names of our joints. Animations have no jaw and no eyes."""
 VRM_FINGERS = {"pinky": "Little"}
-"""The fingers that have another name in VRM."""
+"""VRM's names of the fingers that have another name there."""
 
 
 def _bone_names() -> dict[str, str]:
@@ -55,7 +55,7 @@ def write_vrma(
     """Write a motion on the joints of an avatar as a `.vrma`. If writing fails, the path stays as
     it was. name: the name of the animation. files and up are not used.
 
-    Raises: ValueError without a motion, or for a body of other joints.
+    Raises: ValueError if there is no motion, or if the joints are not those of SMPL-X.
     """
     if motion is None:
         raise ValueError(f"{path}: a VRM animation holds a motion and no avatar: expected a motion")
