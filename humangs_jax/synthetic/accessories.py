@@ -95,7 +95,9 @@ def _ribboned(fabric: Fabric, s: Spots) -> Points:
 
 
 _Ring = tuple[Float[np.ndarray, "ring 3"], Float[np.ndarray, "ring 3"]]
-"""`_RING` points at rest, from the front over the left side, and horizontal directions outwards."""
+"""`_RING` points at rest, metres, and as many horizontal unit vectors outwards. The ring begins in
+front and runs over the left side.
+"""
 
 
 def _neck_ring(anatomy: Anatomy, lift: float) -> _Ring:
@@ -110,8 +112,9 @@ def _neck_ring(anatomy: Anatomy, lift: float) -> _Ring:
 def _ring(anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float) -> _Ring:
     """Returns a smooth ring through the skin near chosen vertices.
 
-    Each of its points is a mean of these vertices, weighted by how close their azimuth is. Azimuths
-    are about the axis x = 0, z = middle. near: whether a vertex is chosen, (n,).
+    Each point of the ring is a mean of the chosen vertices, with weights that fall with the
+    distance of their azimuths. Azimuths are about the vertical axis at x = 0, z = middle, in
+    template coordinates. near: whether a vertex is chosen, (n,).
     """
     x, _, z = anatomy.skin.template[near].T
     points, azimuths = anatomy.skin.vertices[near], np.arctan2(x, z - middle)
@@ -131,10 +134,10 @@ def _followed(
     columns: int,
     closed: bool = True,
 ) -> Surface:
-    """Sweeps a tube along a path. It moves with the nearest skin.
+    """Sweeps a tube along a path. The tube moves with the nearest skin.
 
     Its template and cloth coordinates are positions, shifted so that the neck has the height 0.19
-    m. The arguments but `anatomy` are those of `surfaces.sweep`.
+    m. The arguments after `anatomy` are those of `surfaces.sweep`.
     """
     (x, y, _) = anatomy.skin.template.T
     (vertices, faces) = sweep(path, across, widths, columns, closed)
@@ -147,7 +150,9 @@ def _followed(
 
 
 def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
-    """Builds a hood: over the head (`up`), or in folds around the neck and on the upper back."""
+    """Builds a hood. It is over the head if `up`, else it lies in folds around the neck and on the
+    upper back.
+    """
     if up:
         return hair.falling_tube(
             rng, anatomy, 0.034, 0.1, _face_opening(0.31, 1.05, 0.096), wave=0.004, ends=0.1
@@ -165,7 +170,9 @@ def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
 def _face_opening(
     middle: float, half_width: float, half_height: float
 ) -> Callable[[Field, Field], Field]:
-    """Returns a function of azimuths and heights, positive outside of an oval for the face."""
+    """Returns a function of azimuths (radians) and template heights. Its values are positive
+    outside of an oval for the face. middle, half_height: heights. half_width: radians.
+    """
     return lambda sides, height: (
         ((sides / half_width) ** 2 + ((height - middle) / half_height) ** 2 - 1) * 0.05
     )
@@ -222,7 +229,9 @@ def _on_head(anatomy: Anatomy, vertices: Points, faces: Faces, template: Points)
 
 
 def _hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Surface:
-    """Builds the brim of a hat or the peak of a cap: a sheet from the edge of the hat outwards."""
+    """Builds the brim of a hat or the peak of a cap. It is a sheet from the edge of the hat
+    outwards.
+    """
     template = anatomy.skin.template
     size = garment.sizes["brim"]
     closed = garment.kind == "brim_hat"
@@ -329,8 +338,8 @@ def _necklace(anatomy: Anatomy, length: float) -> Surface:
 def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
     """Builds a bag: a rounded box on the back, or a flat one at the hip.
 
-    All of it moves as the skin near it does on average. ease: distance of clothes from the skin
-    there, metres.
+    The whole bag moves with the mean skinning weights of the skin near it. ease: distance of
+    clothes from the skin there, metres.
     """
     x, y, z = anatomy.skin.template.T
     size = garment.sizes["size"]
@@ -366,8 +375,8 @@ def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
 def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> Surface:
     """Builds both shoes.
 
-    height: of the shaft above the floor. sole: its thickness. ease: distance between foot and
-    leather. All are in metres.
+    height: height of the shaft above the floor. sole: thickness of the sole. ease: distance between
+    foot and leather. All are in metres.
     """
     return join([_shoe(anatomy, side, height, sole, ease) for side in (0, 1)])
 

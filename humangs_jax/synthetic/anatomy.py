@@ -142,7 +142,7 @@ def limited(rotations: Rotations) -> Rotations:
 def excess(rotations: Rotations, joints: tuple[int, ...]) -> float:
     """Returns the largest angle by which one of some joints exceeds its limit, radians.
 
-    Negative if none does.
+    It is negative if all joints are within their limits.
     """
     return float(np.max(np.linalg.norm(rotations[list(joints)], axis=1) - LIMITS[list(joints)]))
 
@@ -240,9 +240,9 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -
 
 
 def _knee_angle(thigh: Vector, shin: Vector, distance: float) -> float:
-    """Returns the angle of the knee, radians, at which hip and ankle have a given distance.
+    """Returns the angle of the knee, radians, for which hip and ankle are `distance` metres apart.
 
-    thigh, shin: offsets of knee and ankle from the joint above, at rest.
+    thigh, shin: offsets of knee and ankle from the joint above, at rest, metres.
     """
     wanted = 0.5 * (distance**2 - thigh @ thigh - shin @ shin) - thigh[0] * shin[0]
     cosine, sine = thigh[1] * shin[1] + thigh[2] * shin[2], thigh[2] * shin[1] - thigh[1] * shin[2]
@@ -286,13 +286,13 @@ WRIST = 0.651
 ARMHOLE = 0.185
 """Distance from the middle (|x|) at which sleeves are sewn on, template coordinates."""
 TRUNK_GIRTH = 0.16
-"""Radius that turns angles around the trunk into metres of cloth."""
+"""Radius of cloth around the trunk, metres. An angle times this is a length around the trunk."""
 _LEG_GIRTH = 0.08
-"""Radius that turns angles around a leg into metres of cloth."""
+"""Radius of cloth around a leg, metres. An angle times this is a length around the leg."""
 ARM_GIRTH = 0.06
-"""Radius that turns angles around an arm into metres of cloth."""
+"""Radius of cloth around an arm, metres. An angle times this is a length around the arm."""
 SAME_GIRTH = 1e-4
-"""Tolerance for comparing girths."""
+"""Girths that differ by less than this are equal, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -335,10 +335,11 @@ def _leg_membership(template: np.ndarray) -> np.ndarray:
 
 
 def cloth_coordinates(template: np.ndarray) -> np.ndarray:
-    """Returns cloth coordinates (n, 4): x, y, z relative to the axis of trunk or leg, and a radius.
+    """Returns cloth coordinates (n, 4), metres: x, y, z relative to the axis of trunk or leg, and a
+    radius, the girth.
 
-    The angle atan2(x, z) is 0 in front. Times the radius, it is metres around the body. Arms have
-    coordinates relative to the axis of the trunk; `sewn_coordinates` replaces them.
+    The angle atan2(x, z) is 0 in front. The angle times the girth is the length around the body.
+    Here arms have coordinates relative to the axis of the trunk; `sewn_coordinates` replaces them.
     """
     x, y, z = template.T
     trunk = np.stack([x, y, z - 0.02, np.full_like(x, TRUNK_GIRTH)], -1)
@@ -349,7 +350,8 @@ def cloth_coordinates(template: np.ndarray) -> np.ndarray:
 def leg_coordinates(template: np.ndarray) -> np.ndarray:
     """Returns the cloth coordinates (n, 4) of trousers, which are sewn along the middle.
 
-    They are relative to the axis of the leg on the point's side, also above the crotch.
+    They are relative to the axis of the leg that is on the same side (x < 0 or x >= 0) as the
+    point, also above the crotch.
     """
     x, y, z = template.T
     knee = np.interp(-y, [0.358, 0.764, 1.159], [0.101, 0.130, 0.137])
@@ -360,11 +362,12 @@ def leg_coordinates(template: np.ndarray) -> np.ndarray:
 
 
 def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
-    """Replaces the cloth coordinates (n, 4) of points on arms and legs.
+    """Returns cloth coordinates (n, 4) with new ones for points on arms and legs.
 
-    The new ones are relative to the axis of the limb, and change abruptly at seams: at armholes and
-    in the middle of trousers. Arms are turned down, so that y runs along every limb. Points on arms
-    are replaced if their girth is the trunk's, points on legs if it is that of a leg.
+    The new coordinates are relative to the axis of the limb. They change abruptly at seams, which
+    are at armholes and in the middle of trousers. Arms are turned down, so that y runs along every
+    limb. Points on arms get new coordinates if their girth is `TRUNK_GIRTH`, points on legs if
+    their girth is `_LEG_GIRTH`.
     """
     x, y, girth = template[:, 0], template[:, 1], cloth[:, 3]
     on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(girth - TRUNK_GIRTH) < SAME_GIRTH)
@@ -381,7 +384,10 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=1)
 def _fixed(template_bytes: bytes) -> tuple[Points, Float[np.ndarray, "n 4"], Field, Field]:
-    """Returns what all bodies share: template, cloth coordinates, shares in arms and legs."""
+    """Returns what is equal for all bodies: template (n, 3), cloth coordinates (n, 4), and how much
+    each vertex belongs to an arm and to a leg, both (n,), 0 to 1. template_bytes: the template, as
+    float32.
+    """
     template = np.frombuffer(template_bytes, np.float32).reshape(-1, 3)
     # 1 on the arms, 0 on the trunk, smooth across the shoulder seam
     arm = smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])

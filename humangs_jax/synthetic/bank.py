@@ -66,7 +66,7 @@ SLOPE_STEP = 1 / 100
 SLOPE_ZERO = 128
 """The byte that stands for a slope of 0."""
 FACE_DENSITY = 2.0
-"""Texels per metre on skin and eyes of the head, divided by those on everything else."""
+"""Texels per metre on skin and eyes of the head, divided by the texels per metre elsewhere."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +78,8 @@ class BakedSubject:
     albedo: UInt8[np.ndarray, "t t 3"]
     """Colors without light, (t, t, 3), as bytes where 255 is 1. Row 0 is on top (v = 1)."""
     slopes: UInt8[np.ndarray, "t t 3"]
-    """Gradients of painted folds along the axes of `Spots.cloth`, (t, t, 3), as bytes: `SLOPE_ZERO`
-    plus a number of steps of `SLOPE_STEP`.
+    """Gradients of painted folds along the axes of `Spots.cloth`, (t, t, 3), as bytes. A byte is
+    `SLOPE_ZERO` plus the slope in steps of `SLOPE_STEP`.
     """
 
 
@@ -170,7 +170,9 @@ def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 204
 
 
 def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "t t 3"]:
-    """Returns the texture (t, t, 3) of a posed subject in its light, seen from outside."""
+    """Returns the texture (t, t, 3) of a posed subject, with its light. Everything is lit as its
+    outer side.
+    """
     ids, weights = texels(baked.atlas)
     known = ids >= 0
     albedo = baked.albedo[known].astype(np.float32) / 255
@@ -189,7 +191,7 @@ _FORMAT = "humangs-people"
 _VERSION = 2
 """Version of the format that is written and read."""
 UV_STEPS = 65535
-"""Number of steps from 0 to 1 in which texture coordinates are stored."""
+"""Texture coordinates are stored as integers from 0 to this, which stands for 1."""
 _MOST_MATERIALS = 32
 """Largest number of materials of a person; arrays of materials have this length."""
 
@@ -220,9 +222,13 @@ class PeopleBank:
     faces: UInt[Array, "p f 3"]
     """Triangles, (p, f, 3)."""
     uvs: UInt[Array, "p f 3 2"]
-    """Texture coordinates of the faces' corners, (p, f, 3, 2), in 1 / `UV_STEPS`, with v DOWN."""
+    """Texture coordinates of the faces' corners, (p, f, 3, 2), as integers from 0 to `UV_STEPS`,
+    with v DOWN.
+    """
     face_pieces: UInt8[Array, "p f"]
-    """Index of the piece that each face belongs to, (p, f), below m."""
+    """Index of the piece that each face belongs to, (p, f). A person has at most m pieces, each of
+    one material.
+    """
     sheen: Float[Array, "p m"]
     """Strength of the soft highlight of each piece, (p, m), 0 to 1."""
     groups: UInt8[Array, "p m"]
@@ -270,12 +276,13 @@ def build_bank(
     All seeds must lie in the range `split` of `subject.SPLITS`.
 
     texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 images
-    of 512. pose_count: number of poses of each person. displaced: the body to displace, one of
-    `data.views.gaussian_body`. None: the bank has no displacements. processes: number of processes
-    that make people; if more than one, they use the CPU and load the shipped body themselves.
+    of 512. pose_count: number of poses of each person. displaced: the body whose vertices are
+    displaced, as `data.views.gaussian_body` makes it. None: the bank has no displacements.
+    processes: number of processes that make people; if more than one, they use the CPU and load the
+    shipped body themselves.
 
     Raises: ValueError if there are no seeds, if a seed lies in another range, if the body is not
-    the package's body, or if the size of the textures is no such multiple.
+    the package's body, or if the size of the textures is no multiple of 128.
     """
     seeds = list(seeds)
     if not seeds:
@@ -368,7 +375,7 @@ def _person(
     pose_count: int,
     displaced: BodyModel | None,
 ) -> dict[str, np.ndarray]:
-    """Makes the arrays of one person for a bank, without padding, by name.
+    """Returns the arrays of one person for a bank, by name, without padding.
 
     body: None for the shipped body. Other arguments are those of `build_bank`.
     """
@@ -424,9 +431,11 @@ def _person(
 def to_silhouettes(
     subject: SyntheticSubject, body: BodyModel, rotations: Float[np.ndarray, "j 3"]
 ) -> Float[np.ndarray, "b 3"]:
-    """Fits displacements of a body's vertices (b, 3), metres, to silhouettes of the dressed person.
+    """Returns displacements of a body's vertices (b, 3), metres. They are fitted to silhouettes of
+    the dressed person.
 
-    Four cameras around the person see the silhouettes in one pose. rotations: that pose, (j, 3).
+    Four cameras around the person see the silhouettes in one pose. rotations: the pose, (j, 3),
+    axis-angle, radians.
     """
     views, side = 4, 960  # pixels
     rng, nowhere = np.random.default_rng([subject.seed, 23]), np.zeros(3, np.float32)

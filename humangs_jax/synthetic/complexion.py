@@ -27,10 +27,11 @@ _HAIR = {
     "grey": (0.1, 0.05, (0.3, 0.66)),
     "dyed": ((0, 1), 0.55, 0.55),
 }
-"""Hue, saturation and value of hair, or their ranges."""
+"""Hue, saturation and value of each color of hair, 0 to 1. A pair is a range."""
 _Face = tuple[Field, Field, Field, Points]
-"""Points of the face: distances |x| from the middle (n,), heights (n,), 0 behind to 1 in front
-(n,), and template coordinates (n, 3)."""
+"""Points of the face: distances |x| from the middle (n,), heights (n,), a number from 0 (behind the
+face) to 1 (in front) (n,), and template coordinates (n, 3).
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +150,9 @@ def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut)
     seed = int(rng.integers(1 << 20))
 
     def albedo(s: Spots):
-        """Returns colors: first skin, tanned arms, palms, knees and elbows, then the face."""
+        """Returns the colors (n, 3) of points. Skin is painted first, then tanned arms, palms,
+        knees and elbows, then the face.
+        """
         x, y, z = np.abs(s.template[:, 0]), s.template[:, 1], s.template[:, 2]
         result = tones.skin * (1 + 0.035 * cloud(s.template) + 0.03 * blotches(s.template))[:, None]
         result = result * (1 - tones.tan * np.clip((x - 0.2) / 0.3, 0, 1) * (y > -0.1))[:, None]
@@ -169,9 +172,10 @@ def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut)
 
 
 def _bell(*axes: tuple[Field, Field | float | int, float]) -> Field:
-    """Returns 1 at a place, and less the further points are from it, (n,).
+    """Returns a bell (n,) that is 1 at a place and falls with the distance from it.
 
-    axes: for each axis (coordinates of the points (n,), coordinate of the place, width).
+    axes: for each axis the coordinates of the points (n,), the coordinate of the place, and the
+    width of the bell.
     """
     return np.exp(-sum(((x - place) / width) ** 2 for x, place, width in axes))
 
@@ -181,7 +185,9 @@ def _tinted(colors: Points, tint: tuple[float, float, float], amount: Field) -> 
 
 
 def _hand(tones: Complexion, result: Points, x: Field, y: Field) -> Points:
-    """Paints hands: paler palms, redder knuckles and finger tips. x: |x|, y: height."""
+    """Returns the colors of points on hands, with paler palms and redder knuckles and finger tips.
+    result: the colors before. x: |x|. y: height.
+    """
     palm = np.clip((0.085 - y) / 0.012, 0, 1) * np.clip((x - 0.66) / 0.03, 0, 1)
     pale = 0.35 * tones.skin + 0.65 * np.asarray([0.82, 0.62, 0.53], np.float32)
     tip, knuckle = np.clip((x - 0.79) / 0.03, 0, 1), _bell((x, 0.745, 0.008)) * (1 - palm)
@@ -335,8 +341,8 @@ def eye_material(tones: Complexion) -> Material:
 
 
 def hair_material(rng: np.random.Generator, base: np.ndarray, haircut: Haircut) -> Material:
-    """Makes the material of hair, with fine and coarse streaks that run down from the crown and a
-    bright ring around the head.
+    """Makes the material of hair. Fine and coarse streaks run down from the crown, and a bright
+    ring goes around the head.
 
     Curly hair has fine and coarse noise instead. base: color of the hair (3,).
     """

@@ -43,7 +43,8 @@ class Spots:
     def around(self) -> Field:
         """Metres around the trunk or limb, (n,), 0 in front.
 
-        On the shoulders they are metres from the middle, with different values in front and behind.
+        On the shoulders this is the distance from the middle, metres, which changes abruptly
+        between front and back.
         """
         girth = self.cloth[:, 3]
         turned = np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * girth
@@ -56,9 +57,9 @@ class Spots:
 
     @property
     def along(self) -> Field:
-        """Metres along the trunk or limb, (n,): the height.
+        """Metres along the trunk or limb, (n,). This is the height y.
 
-        Towards the shoulders the distance from their ridge is subtracted.
+        Towards the shoulders, the distance from the shoulder's ridge is subtracted from the height.
         """
         rising = np.clip((self.template[:, 1] + 0.25) / 0.35, 0, 1) * self._on_trunk
         return self.cloth[:, 1] - rising * np.abs(self.template[:, 2] - _SHOULDER_RIDGE)
@@ -99,8 +100,8 @@ _DYES = {
     "earth": (0.11, (0.05, 0.12), (0.3, 0.7), (0.2, 0.7)),
     "navy": (0.11, (0.56, 0.66), (0.4, 0.8), (0.12, 0.45)),
 }
-"""Kinds of dyes. Each has its probability, then hue, saturation and value: two numbers are a range,
-more are a choice.
+"""Kinds of dyes. Each has its probability, then hue, saturation and value. Two numbers are a range,
+more numbers are values of which one is drawn.
 """
 
 
@@ -193,14 +194,16 @@ _CLOTHS = {
     "leggings": ("suit", 0.6),
     "wide": ("cotton", 0.4),
 }
-"""For kinds of garments, the usual cloth, and the probability of a dye of that cloth."""
+"""For each kind of garment its usual cloth, and the probability that it has a usual dye of this
+cloth.
+"""
 _COLORS = (
     (("shirt", "socks", "sneakers"), 0.45, ((0, 1), (0, 0.05), (0.72, 0.87))),
     (("sneakers", "leggings", "coat", "puffer", "slim"), 0.4, ((0, 1), (0, 0.1), (0.06, 0.16))),
     (("sneakers", *_LEATHER_SHOES), 0.6, ((0.03, 0.12), (0.0, 0.5), (0.1, 0.7))),
 )
-"""Rows of: kinds of garments, a probability, and ranges of hue, saturation and value. Rows are
-tried in order until one gives the dye; if none does, the dye is a random one.
+"""Each row has kinds of garments, the probability that they have this dye, and the ranges of its
+hue, saturation and value. Rows are tried in order. If no row gives the dye, it is a random one.
 """
 _PATTERN_RULES = (
     (("jeans", "denim_jacket"), "denim", 1, ()),
@@ -209,16 +212,17 @@ _PATTERN_RULES = (
     (("cap", "brim_hat"), "plain", 1, ("camouflage", "melange", "checks", "herringbone")),
     (("sneakers", *_LEATHER_SHOES, "belt", "watch", "necklace", "glasses"), "plain", 1, ()),
 )
-"""Rows of: kinds of garments, the pattern that replaces a random one, the probability of that, and
-patterns that are not replaced.
+"""Each row has kinds of garments, a pattern, the probability that the pattern replaces the random
+pattern of such a garment, and patterns that are never replaced.
 """
 
 
 def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabric:
     """Draws a fabric that suits a kind of garment.
 
-    plainness: probability of a plain pattern. This has one dye, or shows little of a second one.
-    Some kinds of garments replace their pattern, see `_PATTERN_RULES`.
+    plainness: probability that the pattern is drawn from the plain ones, which have one dye or show
+    little of a second dye. Otherwise it is drawn from all patterns. Some kinds of garments then
+    replace the pattern, see `_PATTERN_RULES`.
     """
     plain_ones = {"plain": 0.66, "melange": 0.2, "tweed": 0.14}
     odds = {name: share for name, (share, _) in PATTERNS.items() if share}
@@ -244,7 +248,8 @@ def _dye(rng: np.random.Generator, kind: str) -> Vector:
 def _lines(x: Field, period: float, width: float, shift: float = 0.0) -> Field:
     """Returns 1 on lines and 0 between them (n,).
 
-    x, period, width: metres. shift: of the lines, in periods.
+    x: position across the lines. period: distance between lines. width: width of a line. All are in
+    metres. shift: shift of the lines, in periods.
     """
     return band((x / period + shift) % 1 * period, 0, width)
 
@@ -428,7 +433,7 @@ def _dip_dye(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) ->
 
 
 def _tweed(s: Spots, rng: np.random.Generator, base: Vector, other: Vector) -> Points:
-    """Returns the colors of cloth of two threads, of which the second shows little, (n, 3)."""
+    """Returns the colors of cloth of two threads, (n, 3). The second thread shows little."""
     seed, share = _seed(rng), rng.uniform(0.08, 0.25)
     return mix(
         base, other, share * _grain(s, 0.004, 0.02, seed) * _grain(s, 0.02, 0.004, seed + 1) * 2

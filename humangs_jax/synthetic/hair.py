@@ -212,7 +212,9 @@ are positive where hair or cloth is, and negative where the face is free.
 
 
 def _fringe(rng: np.random.Generator, haircut: Haircut) -> _Opening:
-    """Returns the `_Opening` above the edge of a fringe. Values are heights above it, metres."""
+    """Returns the `_Opening` of a fringe. Its values are heights above the edge of the fringe,
+    metres.
+    """
     angles, heights = (np.asarray(x) for x in _FRINGE_LINES[haircut.fringe])
     phase = rng.uniform(0, 6.28, 3)
 
@@ -365,7 +367,9 @@ def falling_tube(
 
 
 def _bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
-    """Builds a ball of hair on the back of the head. elevation: above the horizontal, radians."""
+    """Builds a ball of hair on the back of the head. radius: metres. elevation: angle of the ball
+    above the horizontal, radians.
+    """
     direction = np.asarray([0, np.sin(elevation), -np.cos(elevation)])
     center = _skull(anatomy)[1] + direction * (0.095 + 0.55 * radius)
     directions, faces = surfaces.ball(12, 20)
@@ -449,10 +453,8 @@ def eyeballs(anatomy: Anatomy) -> Surface:
 
 
 def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
-    """Returns how the head of a person at rest differs from the template.
-
-    Returns: a function that maps template heights of head and neck to the person's heights, and the
-    middle of the person's skull (3,), metres.
+    """Returns a function that maps template heights of head and neck to heights of the person at
+    rest, and the middle of the person's skull (3,). Both are in metres.
     """
     neck = anatomy.joints[Joint.NECK, 1]
     factor = (anatomy.skin.vertices[:, 1].max() - neck) / (_CROWN - _NECK_HEIGHT)
@@ -466,7 +468,8 @@ def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
 def _falling_weights(
     anatomy: Anatomy, vertices: Points, template_y: Field
 ) -> Float[np.ndarray, "n j"]:
-    """Returns skinning weights (n, j): the head's at the top, the nearest skin's further down.
+    """Returns the skinning weights (n, j) of something that falls from the head. At the top they
+    are the head's weights, further down the weights of the nearest skin.
 
     template_y: template heights of the vertices (n,).
     """

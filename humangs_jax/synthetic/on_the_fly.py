@@ -43,8 +43,9 @@ from humangs_jax.synthetic.surroundings import pick
 _POSES = 2
 """Number of poses of an example."""
 _Plan = tuple[Float[Array, "_v c"], Float[Array, " _v"], Int[Array, " _v"], Float[Array, " _v"]]
-"""A plan of v views: random numbers for their cameras (v, c), azimuths in radians (v,), indices of
-their poses (v,), and probabilities of a close camera (v,)."""
+"""A plan of v views: random numbers in [0, 1) for their cameras (v, c), azimuths in radians (v,),
+indices of their poses (v,), and probabilities of a close camera (v,).
+"""
 
 
 @configuration
@@ -54,9 +55,10 @@ class OnTheFlyConfig:
     input_views: Count = 4
     """How many views the network reads."""
     view_counts: tuple[Count, ...] = ()
-    """Numbers of different input views that an example may have; each example has one of them, at
-    random. Empty: all have `input_views`. Copies of the last view fill up to `input_views`, so that
-    one program serves all numbers (see `SubjectViews.view_count`)."""
+    """Possible numbers of different input views. Each example has one of these numbers, at random.
+    Empty: all examples have `input_views`. Copies of the last view fill up to `input_views`, so
+    that one program serves all numbers (see `SubjectViews.view_count`).
+    """
     target_views: Count = 3
     """How many views the rendering is compared with."""
     input_size: Side = 256
@@ -64,13 +66,15 @@ class OnTheFlyConfig:
     target_size: Side = 256
     """Side of the targets, pixels."""
     mixed_pose_share: Share = 0.3
-    """Probability that each input of an example shows a random one of the poses, as each target
-    does. Otherwise all inputs show the first pose.
+    """Probability that the inputs of an example show random poses, each one of the example's two
+    poses. Otherwise all inputs show the first pose. Targets always show random poses.
     """
     jitter: Spread = 0.7
-    """See `surroundings.azimuths_from`."""
+    """How irregular the azimuths of the inputs are: each is off by up to half of this times the
+    spacing between neighbours.
+    """
     scattered_share: Share = 0.2
-    """See `surroundings.azimuths_from`."""
+    """Probability that the azimuths of the inputs are not evenly spaced, but scattered anywhere."""
     mirrored_share: Share = 0.5
     """Probability that left and right of an example are exchanged."""
     displaced_share: Share = 0.0
@@ -472,8 +476,8 @@ class GeneratedSource:
     examples from files and divided among devices.
     """
     person_of: Callable[[Key, int], int] | None = None
-    """Function that returns the seed of the person that `make` shows, called as
-    person_of(key, input_count). None: the key was made from that seed.
+    """Function that returns the seed of the person that `make` shows, called as person_of(key,
+    input_count). None: `make` shows the person of the seed that the key was made from.
     """
 
     def __post_init__(self):
@@ -489,10 +493,10 @@ class GeneratedSource:
         return len(SPLITS[self.split])
 
     def drawn_key(self, seed: int, index: int) -> Key:
-        """Returns the key of example number `index` of a run that `seed` starts.
+        """Returns the key of example number `index` in a run that starts from `seed`.
 
-        The key is the `subject_key` of a random person of the split, in appearance number `index`.
-        `make` may show another person, see `person_of`.
+        The key is the `subject_key` of a random person of the split; its appearance has the number
+        `index`. `make` may show another person, see `person_of`.
         """
         return subject_key(self._person(seed, index), index)
 
@@ -585,8 +589,8 @@ def on_the_fly_source(
     """Makes a source of examples of a bank, for `Loader` and `Mixture`.
 
     each_once: whether each person of the bank is shown once, in order; otherwise people are random.
-    input_counts: replace `config.input_views`; each is compiled once. on_host: see
-    `GeneratedSource`.
+    input_counts: numbers of input views, in place of `config.input_views`. A program is compiled
+    for each. on_host: see `GeneratedSource`.
     """
     if each_once:
         return EachPerson(bank, config, input_counts, on_host)

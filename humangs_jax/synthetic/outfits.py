@@ -88,7 +88,7 @@ class _Style:
     )
     """Probability of each kind of headwear. The remaining people have no headwear."""
     no_sunglasses: float = 0.96
-    """1 less the probability of sunglasses."""
+    """Probability of no sunglasses."""
 
 
 _STYLES = {
@@ -206,9 +206,10 @@ class _OneOf:
 def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
     """Draws the random value that a specification describes.
 
-    The kind of the specification decides: (low, high) gives a uniform number in that range, a dict
-    of odds one of its names, `_OneOf` a value of one of its options. A name that is in `named`
-    gives that value. Anything else, such as a number, is returned as it is.
+    There are four kinds of specifications. A pair (low, high) gives a uniform number in this range.
+    A dict of odds gives one of its names. An `_OneOf` gives the value of one of its options. A name
+    in `named` gives the value that it has there. Anything else, such as a number, is returned as it
+    is.
     """
     if isinstance(specification, tuple):
         return rng.uniform(*specification)
@@ -250,7 +251,9 @@ _NECKS = {
     "hoodie": "crew",
     "other": {"crew": 6, "vee": 2, "scoop": 0.6},
 }
-"""Necklines of tops; men's other tops have no scoop."""
+"""Specifications of the necklines of tops, by kind of top. "other" is for the other kinds; men then
+have no scoop.
+"""
 _TOP_DETAILS = (
     ("print", ("tee", "hoodie", "longsleeve", "tank"), 0.5),
     ("number", ("jersey",), 1),

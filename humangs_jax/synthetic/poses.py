@@ -1,8 +1,8 @@
 """A pose prior: draws plausible poses of people who stand, stride, crouch or reach.
 
 Poses keep to the limits of the joints, and soles are on the ground. A stance places the feet and
-the pelvis. For each arm many candidates are drawn. The one is kept whose wrist comes nearest to a
-goal and whose forearm and hand stay out of the trunk, the head, the legs and the other arm. Hands
+the pelvis. For each arm many candidates are drawn, and one is kept: its wrist comes nearest to a
+goal, and its forearm and hand stay out of the trunk, the head, the legs and the other arm. Hands
 blend a few gestures. `anatomy` has the joints, their limits and the conventions.
 """
 
@@ -102,8 +102,10 @@ def _pair(
 ) -> list[kin.Foot]:
     """Draws two flat feet, left and right, each about as far from the middle as its hip.
 
-    width: distance of a hip from the middle. spread: range of what is added to it. apart: range of
-    the shift of a foot forward or back. turn_out: range of the angle outwards.
+    Lengths are in lengths of a leg, angles in radians. width: distance of a hip from the middle.
+    spread: range of the distance by which a foot is further from the middle. apart: range of the
+    shift of a foot forward or back. turn_out: range of the angle by which a foot is turned
+    outwards.
     """
     feet = []
     for sign in (1, -1):
@@ -239,26 +241,28 @@ STANCES: dict[str, tuple[float, Callable[[np.random.Generator, float], Stance]]]
 }
 """Stances by name: the probability, and the function that draws such a stance.
 
-It takes a generator and the distance of a hip from the middle, in lengths of a leg.
+The function takes a generator and the distance of a hip from the middle, in lengths of a leg.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class _Goal:
-    """Where a wrist should be, and how the arm may bend. Pairs are ranges, angles in radians."""
+    """Where a wrist should be, and how the arm may bend. Pairs are ranges of angles, radians."""
 
     odds: float
     """Odds of this goal."""
     place: tuple[float, float, float]
-    """Place of the left wrist relative to the shoulder: axes of the chest, lengths of the arm."""
+    """Place of the left wrist relative to the left shoulder, along the axes of the chest, in
+    lengths of the arm.
+    """
     raised: tuple[float, float] = (-1.45, -0.1)
-    """Elevation of the upper arm; 0 is horizontal."""
+    """Elevation of the upper arm, radians. 0 is horizontal."""
     forward: tuple[float, float] = (-0.5, 1.4)
-    """Turn of the upper arm towards the front."""
+    """Turn of the upper arm towards the front, radians."""
     flexed: tuple[float, float] = (0.05, 2.2)
-    """Bend of the elbow."""
+    """Bend of the elbow, radians."""
     collar: float = -0.08
-    """Angle by which the collar is raised."""
+    """Angle by which the collar is raised, radians."""
 
 
 _GOALS = {
@@ -297,10 +301,10 @@ def bend_arm(
 ) -> float:
     """Sets collar, shoulder, elbow and wrist of one side in `rotations`.
 
-    Trunk, head and legs must be set before.
+    Trunk, head and legs must be set before the arm.
 
     goal: a name that `draw_goal` returns. side: 0 for left, 1 for right. other_arm: whether to keep
-    clear of the other arm too; it must then be set before.
+    clear of the other arm, too. This arm must then be set before.
 
     Returns: the distance of forearm and hand from the body, metres; negative where they are inside.
     """
@@ -421,8 +425,8 @@ def _along(
 
 
 _FINGERS = ((0, 1.0), (1, 0.15), (3, -1.2), (2, -0.6))
-"""Index, middle, pinky and ring finger, in the order of SMPL-X's joints. Each has its place among a
-gesture's curls, and the factor of the gesture's spread.
+"""Index, middle, pinky and ring finger, in the order of SMPL-X's joints. Each finger has the index
+of its curl in a gesture, and a factor on the gesture's angle between fingers.
 """
 _GESTURES = {
     "relaxed": (0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25),
@@ -434,9 +438,10 @@ _GESTURES = {
     "thumb up": (0.03, (1.2, 1.3, 1.3, 1.3), 0.0, -0.4),
     "hold": (0.11, (0.65, 0.7, 0.75, 0.8), 0.05, 0.6),
 }
-"""Gestures by name. Each has its odds; the curl of index, middle, ring and pinky, radians per
-knuckle; the angle between fingers, radians; and how far the thumb lies across the palm, from 0
-(beside the palm) to 1 (across it), negative if it points away."""
+"""Gestures by name. Each has four things: its odds; the curl of index, middle, ring and pinky,
+radians per knuckle; the angle between fingers, radians; and how far the thumb lies across the palm.
+This is 0 beside the palm, 1 across the palm, and negative if the thumb points away.
+"""
 
 
 def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> None:

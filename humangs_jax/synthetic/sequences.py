@@ -42,7 +42,9 @@ _FLAT_UNTIL = 0.55
 _SMOOTHING = 4
 """Number of frames on each side over which the height of the pelvis is smoothed."""
 _SPARE = 0.995
-"""Largest stretch of a leg that the pelvis's height asks for, as a share of the length."""
+"""Largest distance from hip to ankle for which the height of the pelvis is chosen, as a share of
+the leg's length.
+"""
 _TRIES = 12
 """Largest number of goals that are tried for an arm until one is clear of the body."""
 
@@ -52,10 +54,13 @@ _Heading = Callable[[float | np.ndarray], float | np.ndarray]
 _Track = Callable[[float], kin.Vector]
 """A function of the phase (strides) that returns the body's place on its path (3,), metres."""
 _Moves = tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], Bool[np.ndarray, "m 2"]]
-"""Rotations of the joints, positions of the pelvis, and whether each foot is on the ground."""
+"""A motion of m frames: rotations of the joints (m, j, 3), axis-angle, radians; positions of the
+pelvis (m, 3), metres; and whether the left and the right foot are on the ground (m, 2).
+"""
 _KeyPose = tuple[kin.Rotations, kin.Vector, float]
-"""A pose: rotations, the place of the pelvis on the ground (3,), and how far the pelvis is below
-the highest place that the legs allow, metres."""
+"""A pose: rotations of the joints (j, 3), radians; the place of the pelvis on the ground (3,),
+metres; and how far the pelvis is below the highest place that the legs allow, metres.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -342,7 +347,8 @@ def _key_pose(
 ) -> _KeyPose:
     """Draws a pose in which the hands are at targets and the feet at their places.
 
-    before: the pose before this one; the way from there should be clear too. None: there is none.
+    before: the pose before this one. Arms are then also kept clear of the body on the way between
+    the poses. None: there is no such pose.
     """
     # the trunk: the deeper the knees are bent, the further it leans
     rotations = np.zeros((kin.JOINTS, 3))
@@ -383,10 +389,10 @@ def _key_pose(
 
 
 def _clear_of(build: kin.Build, rotations: kin.Rotations, side: int) -> float:
-    """Returns the `arm_clearance` of a pose, metres, when the arm of a side is being placed.
+    """Returns the `arm_clearance` of a pose, metres, for placing the arm of one side.
 
-    The left arm (side 0) is placed first. For it the right arm is straightened in T-pose, out of
-    the way.
+    The left arm (side 0) is placed first. For the left arm, the right arm is set to its T-pose, out
+    of the way.
     """
     if side == 0:
         rotations = rotations.copy()
@@ -401,10 +407,10 @@ def _ride(
     feet: list[kin.Feet],
     sinks: Float[np.ndarray, " m"] | None = None,
 ) -> Float[np.ndarray, "m 3"]:
-    """Returns positions of the pelvis (m, 3) above the centers, metres.
+    """Returns positions of the pelvis (m, 3), metres.
 
-    The heights are smooth, and the legs can reach the feet. sinks: metres by which the pelvis is
-    lowered (m,). None: not at all.
+    x and z are those of `centers`. The heights are smooth and low enough for the legs to reach the
+    feet. sinks: metres by which the pelvis is lowered (m,). None: not at all.
     """
     heights = np.asarray([
         kin.highest_pelvis(build, turn, center[0], center[2], both, _SPARE)
@@ -432,5 +438,6 @@ def _ease(t: float) -> float:
 KINDS: dict[str, tuple[float, Callable[[np.random.Generator, kin.Build, int], _Moves]]] = {
     "walk": (0.5, _walk), "turn": (0.2, _turn), "reach": (0.3, _reach),
 }  # fmt: skip
-"""Kinds of motion by name: the probability, and the function that makes one. It takes a generator,
-a build and the number of frames."""
+"""Kinds of motion by name: the probability, and the function that makes such a motion. The function
+takes a generator, a build and the number of frames.
+"""

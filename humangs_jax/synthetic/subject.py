@@ -248,7 +248,8 @@ _shape = jax.jit(shape_body)
 def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> SyntheticSubject:
     """Builds the person of a seed.
 
-    person: the description to build, such as one with other clothes. None: that of the seed.
+    person: the description that is built, for example one with other clothes. None: the description
+    of the seed.
 
     Raises: ValueError if the body is not the package's body. The cuts and the paint of clothes are
     given in coordinates of the package's body.

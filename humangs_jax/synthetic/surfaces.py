@@ -56,9 +56,9 @@ def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) -> 
 class Folds:
     """A random function of points that describes creases of cloth.
 
-    It has ridges in a few directions, each direction in separate patches. All randomness is drawn
-    when the object is made. wavelength: of the ridges, about, metres. upright: whether all
-    directions are close to the y axis.
+    It has ridges in a few directions, each direction in separate patches. All random numbers are
+    drawn when the object is made. wavelength: rough distance between ridges, metres. upright:
+    whether all ridges run roughly along y.
     """
 
     def __init__(
@@ -162,7 +162,9 @@ class Surface:
         return dataclasses.replace(self, vertices=np.asarray(vertices, np.float32))
 
     def mapped(self, function: Callable[[np.ndarray], np.ndarray], faces: np.ndarray) -> "Surface":
-        """Returns a surface with other faces, and a function applied to all arrays of vertices."""
+        """Returns a surface with other faces. Its vertices, weights and attributes are those of
+        this surface after `function` was applied to each array.
+        """
         attributes = {name: function(value) for name, value in self.attributes.items()}
         return Surface(
             function(self.vertices), faces.astype(np.int32), function(self.weights), attributes
@@ -189,12 +191,14 @@ def rigid(vertices: Points, faces: Faces, joint: int, joints: int) -> Surface:
 
 
 def vertex_normals(vertices: Points, faces: Faces) -> Points:
-    """Returns the unit normals of vertices (n, 3), where faces count by their area."""
+    """Returns the unit normals of vertices (n, 3): means of the normals of their faces, weighted by
+    area.
+    """
     return unit(vertex_area_vectors(vertices, faces).astype(np.float32))
 
 
 def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
-    """Returns the directed edges (e, 2) that only one face has; these are the hems."""
+    """Returns the directed edges (e, 2) that only one face has. These edges are the hems."""
     edges = edges_of(faces).astype(np.int64)
     count = int(faces.max()) + 1
     keys = np.minimum(edges[:, 0], edges[:, 1]) * count + np.maximum(edges[:, 0], edges[:, 1])
@@ -231,7 +235,9 @@ def smooth(values: _Values, faces: Faces, iterations: int, keep_hems: bool = Fal
 
 
 def compact(surface: Surface, face_mask: Bool[np.ndarray, " f"]) -> Surface:
-    """Returns the faces where a mask (f,) is true, with only the vertices that they use."""
+    """Returns the surface with only the faces for which a mask (f,) is true, and only the vertices
+    of these faces.
+    """
     faces = surface.faces[face_mask]
     used = np.zeros(len(surface.vertices), bool)
     used[faces] = True
@@ -337,7 +343,9 @@ def ball(rows: int, columns: int) -> tuple[Points, Faces]:
 def tube(
     levels: Float[np.ndarray, " r"], angles: Float[np.ndarray, " c"]
 ) -> tuple[Field, Field, Faces]:
-    """Makes a tube: the level (n,) and the angle (n,) of each vertex, row by row, and the faces."""
+    """Makes a tube. Returns the level (n,) and the angle (n,) of each vertex, row by row, and the
+    faces.
+    """
     faces = grid_faces(len(levels), len(angles), closed=True)
     return np.repeat(levels, len(angles)), np.tile(angles, len(levels)), faces
 
@@ -398,8 +406,9 @@ _EMPTY = 1e-3
 _GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
 _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
-"""Values of 1 / cos(a - b) for pairs of angles a and b; infinite where the cosine is at most 0.1.
-The radius of a convex silhouette at a is the least support(b) / cos(a - b) over all b.
+"""1 / cos(a - b) for each pair of the angles a and b of a silhouette, (ANGLES, ANGLES); infinite
+where the cosine is at most 0.1. With support(b), the largest extent of the points in direction b,
+the radius of a convex silhouette at a is the least support(b) / cos(a - b) over all b.
 """
 
 

@@ -92,8 +92,9 @@ def close_cameras(
 ) -> Camera:
     """Makes a batch of square cameras that see parts of a person, one for each azimuth in radians.
 
-    Each looks at a point between the middle of the person and the surface, `_CLOSE_FACTOR` bounding
-    radii away, and farther where the surface would be nearer than `CLEARANCE`.
+    Each camera looks at a point between the middle of the person and the surface. Its distance from
+    this point is drawn from `_CLOSE_FACTOR`, in bounding radii. It is moved away until no vertex is
+    nearer than `CLEARANCE`.
     """
     center, radius = bounding_sphere(vertices)
     count = len(azimuths)
@@ -145,8 +146,9 @@ def camera_from(
 ) -> Camera:
     """Makes a square camera of `size` pixels that looks at a posed person.
 
-    u: random numbers in [0, 1), (5,). count: number of vertices before the padding. azimuth:
-    radians. close: probability of a close camera; any other camera sees the whole person.
+    u: random numbers in [0, 1), (5,). vertices: of the posed person, metres, with padding. count:
+    number of vertices before the padding. azimuth: radians. close: probability of a close camera;
+    any other camera sees the whole person.
     """
     is_close, tilt, spread, outwards, place = u
     low, high = vertices.min(0), vertices.max(0)
@@ -223,13 +225,14 @@ def azimuths_from(
     scattered_share: float,
     count: Int[Array, ""] | None = None,
 ) -> Float[Array, " v"]:
-    """Makes azimuths of v cameras, radians: evenly spaced, or with a given probability scattered.
+    """Makes azimuths of v cameras, radians. They are evenly spaced, or, with a given probability,
+    scattered.
 
     Evenly spaced azimuths have a random start, and each is off by up to half of `jitter` times the
     spacing. Scattered azimuths lie anywhere.
 
     u: 2 + 2 v random numbers in [0, 1). scattered_share: probability of scattered azimuths. count:
-    number of evenly spaced azimuths that go around once. None: all v.
+    number of evenly spaced azimuths in a full turn. None: all v.
     """
     v = len(u) // 2 - 1
     scattered, start, offsets, places = u[0], u[1], u[2 : 2 + v], u[2 + v :]
@@ -375,8 +378,9 @@ def _lights(
     """Makes lights from their angles, strengths and tints.
 
     numpy: the module that the arrays belong to, numpy or jax.numpy. angles, elevations: of the
-    three lights, radians. power: strengths of the three lights. tint: deviations of their colors
-    (3, 3). warmth: of the key light.
+    three lights, radians, the key light first. power: strengths of the three lights. tint:
+    deviations of their colors from white (3, 3). warmth: how warm the key light is. sky, ground,
+    gain: as in `Lights`, (3,).
     """
     flat = numpy.cos(elevations)
     directions = numpy.stack(
@@ -396,10 +400,10 @@ def shaded_vertices(
 ) -> tuple[_Values, _Values]:
     """Returns how much light reaches each vertex of a posed person.
 
-    faces: triangles, given for training on the fly. The middles of the faces then fill the grid
-    too, because meshes may have edges longer than a voxel. The way to the light is then sampled at
-    the nearest voxels, which takes an eighth of the lookups. None: only vertices fill the grid, and
-    the samples are interpolated.
+    faces: triangles, for training on the fly. With them, the middles of the faces fill the grid,
+    too, because meshes may have edges longer than a voxel. The way to the light is sampled at the
+    nearest voxels, which takes an eighth of the lookups. None: only vertices fill the grid, and the
+    samples on the way to the light are interpolated.
 
     Returns: the openness of each vertex to its surroundings (n,), in [0.35, 1], and the share of
     the light from `direction` that arrives at each vertex (n,), in [DARKEST, 1].

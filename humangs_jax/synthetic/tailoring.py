@@ -34,7 +34,7 @@ from humangs_jax.synthetic.surfaces import (
 )
 
 TRUNK_HALF_WIDTH = 0.25
-"""In T-pose everything with a larger |x| than this is an arm, template coordinates."""
+"""In T-pose, points with a larger |x| than this belong to arms, template coordinates."""
 NECKLINES = {
     "crew": (0.0, 0.085),
     "vee": (0.0, 0.085),
@@ -42,11 +42,11 @@ NECKLINES = {
     "high": (0.052, 0.085),
     "collar": (0.012, 0.085),
 }
-"""Necklines by name: how far the plane of the neckline is raised, and the distance from the axis of
-the neck beyond which the shoulder is always covered; metres.
+"""Necklines by name. Each has the height by which the plane of the neckline is raised, and the
+distance from the axis of the neck beyond which shoulders are always covered, both in metres.
 """
 HEM_MARGIN = 0.012
-"""Skin that is further inside of a hem than this is removed, metres of template coordinates."""
+"""Skin is removed if it is further inside of a hem than this, metres in template coordinates."""
 
 
 def neckline(template: Points, style: str, depth: float) -> Field:
@@ -95,8 +95,8 @@ def trousers(template: Points, top: float, end: float) -> Field:
 def front_opening(template: Points, gap: float, spread: float) -> Field:
     """Returns a field (n,) that is positive everywhere but in an opening down the front.
 
-    gap: half of the opening's width at the chest, metres. spread: metres per metre by which half of
-    the width grows downwards. The opening is also wider at the neck.
+    gap: half of the opening's width at the chest, metres. spread: growth of half of the width,
+    metres per metre downwards. The opening is also wider at the neck.
     """
     x, y, z = template.T
     wide = gap + spread * np.maximum(-0.05 - y, 0) + 0.25 * np.maximum(y - 0.04, 0) * (y < 0.25)
@@ -212,7 +212,7 @@ class Fit:
     leg: float = 0.0
     """Distance from the leg that is added at the ankle. Towards the crotch it falls to 0."""
     leg_hang: float = 3.0
-    """Slope as `hang`, for the cloth of each leg."""
+    """Slope by which the cloth of each leg may narrow downwards, metres per metre, as `hang`."""
     fold: float = 0.004
     """Height of the folds; 0 for none."""
     hem: float = 0.008
@@ -220,11 +220,13 @@ class Fit:
     quilt: float = 0.0
     """Distance between padded rings; 0 for none."""
     inner: float = 0.0
-    """Least distance from the skin, because of the clothes below."""
+    """Least distance from the skin, which leaves room for the clothes below."""
     calm: float = 9.0
-    """Height above which there are no folds."""
+    """Height above which there are no folds, as y in cloth coordinates."""
     skirted: bool = False
-    """Whether the shell goes around both legs together, as tops do, and not around each."""
+    """Whether the shell goes around both legs together, as tops do. Otherwise it goes around each
+    leg.
+    """
 
 
 def shell(
@@ -247,10 +249,10 @@ def shell(
 
 
 def finished(surface: Surface, iterations: int, hem: float) -> Surface:
-    """Finishes a surface: smooths its skinning weights, and turns in its hems.
+    """Returns a surface with smoothed skinning weights and hems that are turned in.
 
-    Only the attributes `template` and `cloth` are kept. iterations: of smoothing. hem: depth that
-    is turned in, metres.
+    Only the attributes `template` and `cloth` are kept. iterations: how often weights are smoothed.
+    hem: depth that is turned in, metres.
     """
     weights = smooth_weights(surface.weights, surface.faces, iterations)
     kept = {name: surface.attributes[name] for name in ("template", "cloth")}
@@ -341,7 +343,9 @@ def _fold_heights(
     )
 
     def bend(height, wide):
-        """Returns a bump of a width around `height` metres below along = 0."""
+        """Returns a bump (n,) along the body: 1 at y = -height in cloth coordinates. wide: width,
+        metres.
+        """
         return np.exp(-(((along + height) / wide) ** 2))
 
     elbows = arm * (bend(0.14, 0.07) + 0.8 * bend(0.34, 0.06))
@@ -364,8 +368,8 @@ def _push(
 ) -> Points:
     """Moves points away from an axis to at least `ease + extra` metres outside of silhouettes.
 
-    across: the two axes across the axis. along: positions of the points on the axis (n,). amount:
-    share of the move for each point (n,), 0 to 1.
+    across: indices of the two coordinates across the axis. along: positions of the points on the
+    axis (n,). amount: share of the move for each point (n,), 0 to 1.
     """
     center, axes = boundary.center(along), list(across)
     angle, radius = polar(points[:, axes], center)
@@ -390,10 +394,10 @@ def skirt(
     """Makes a skirt: a tube around the hips and both legs.
 
     heights: template heights of the top and the bottom. ease: distance from hips and legs, metres.
-    flare: metres by which the radius grows per metre downwards. pleats: their number, and their
+    flare: growth of the radius, metres per metre downwards. pleats: number of pleats, and their
     depth in metres. gap: half of the width of an opening in front, metres; negative for none.
-    spread: metres by which half of that width grows per metre downwards. cling: metres from the top
-    over which the skirt does not flare.
+    spread: growth of half of the opening's width, metres per metre downwards. cling: length from
+    the top over which the skirt does not flare, metres.
     """
     top, bottom = heights
     # rows are at most 35 mm high

@@ -129,7 +129,9 @@ def _trunk(s: Spots) -> Field:
 
 
 def _from_the_side(s: Spots) -> Field:
-    """Returns the distance of points from the nearer side of trunk or limb (n,), metres."""
+    """Returns the distance of points from the side of the trunk or limb, (n,), metres. Of the two
+    sides the nearer one counts.
+    """
     return np.abs(np.abs(s.around) - 0.5 * np.pi * s.cloth[:, 3])
 
 
@@ -146,9 +148,9 @@ def _seamed(colors: Points, s: Spots) -> Points:
 
 
 def _hemmed(colors: Points, s: Spots, hem: float, sleeve: float | None) -> Points:
-    """Adds stitches at height y = hem on trunk or legs, and at |x| = sleeve on arms.
+    """Adds stitches at the height y = hem on trunk or legs, and at |x| = sleeve on arms.
 
-    sleeve: None: there are no stitches on arms.
+    hem, sleeve: template coordinates. If `sleeve` is None, there are no stitches on arms.
     """
     x, y, _ = s.template.T
     on_arm = np.abs(x) > 0.2
@@ -187,7 +189,9 @@ def _printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garmen
 
     # paint the print once, around its own middle
     def motif(result, x, y, where):
-        """Adds the print to colors. x, y: points in metres from its middle. where: share of it."""
+        """Returns colors with the print. x, y: places of the points relative to the middle of the
+        print, metres. where: share of the print at each point, 0 to 1.
+        """
         if kind in ("words", "number"):
             if framed and kind == "words":
                 box = band(np.abs(x), -1, (0.5 * width + 1.5) * cell) * band(
@@ -448,7 +452,7 @@ def buckled(s: Spots, garment: Garment) -> Points:
 def bagged(s: Spots, garment: Garment) -> Points:
     """Returns the colors (n, 3) of a bag with a zip around the top and a front pocket.
 
-    The template coordinates of a bag's points are those in a box from -1 to 1.
+    The template coordinates of a bag are positions in a box from -1 to 1.
     """
     rng, base = garment.fabric.rng(2), garment.fabric.base
     ink = color(0.1, 0.05, rng.choice([0.1, 0.7]))

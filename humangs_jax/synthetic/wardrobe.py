@@ -19,7 +19,8 @@ from humangs_jax.synthetic.tailoring import HEM_MARGIN, Fit, shell, skirt
 from humangs_jax.synthetic.trimmings import PADDED, QUILT, sewn
 
 _Cut = tuple[Callable[..., np.ndarray], *tuple[Any, ...]]
-"""A function of `tailoring` that takes template points first, and its further arguments."""
+"""A function of `tailoring`, and its arguments after the first one, which is the template points.
+"""
 
 _LAYER = 0.006
 """Distance of a layer from the layer below it, metres."""
@@ -57,7 +58,7 @@ class Outfit:
     removed: np.ndarray
     """Whether clothes hide each body vertex, (n,)."""
     rng: np.random.Generator
-    """Generator of the garment that is being put on."""
+    """Random generator of the garment that is being put on."""
     trunk: float = 0.0
     """Distance of the outermost layer on the trunk from the skin, metres."""
     legs: float = 0.0
@@ -83,11 +84,12 @@ class Outfit:
         self.pieces.append(Piece(surface, material, shown))
 
     def hide(self, cover: Callable[[Points], Field], margin: float, cloth: bool = True) -> None:
-        """Hides what lies more than a margin inside of the hems of the garment that is put on next.
+        """Hides what the next garment covers: all that lies more than `margin` metres inside of its
+        hems.
 
         cover: function of template points (n, 3) that returns how far they are inside of the
-        garment's hems (n,), metres, negative outside. margin: metres. For cloth it is at least
-        30 mm. cloth: whether cloth is hidden too; otherwise only skin is.
+        garment's hems (n,), metres, negative outside. margin: for cloth at least 30 mm are taken.
+        cloth: whether cloth is hidden, too; otherwise only skin is.
         """
         field = cover(self.template)
         self.cover = np.maximum(self.cover, field)

@@ -66,12 +66,12 @@ from humangs_jax.synthetic.surroundings import (
 HELD_OUT = "held_out"
 """Name of the sub-folder for held-out views in a subject's folder."""
 CAPTURE = "capture.json"
-"""Name of the file of a capture that is written last."""
+"""Name of the last file that is written of a capture."""
 
 
 class Stream:
-    """Numbers of the random streams of a seed that poses and cameras are drawn from. Stream 0 and
-    those from 11 on make the person.
+    """Numbers of the random streams of a seed from which poses and cameras are drawn. Stream 0 and
+    the streams from 11 on are for the person and for banks of people.
     """
 
     POSES, CAMERAS, HELD_OUT_CAMERAS, CLOSE_CAMERAS, MOTION = range(1, 6)
