@@ -107,7 +107,9 @@ def log_brightness(
 def turned_normals(
     normals: Float[Array, "g 3"], linear: Float[Array, "g 3 3"]
 ) -> Float[Array, "g 3"]:
-    """Returns the unit normals of surfaces after linear maps; 0 where a map has rank 1."""
+    """Returns the unit normals of surfaces after linear maps. A normal is 0 where the map has rank
+    1 or 0.
+    """
     # the inverse transpose, up to a positive factor: rows of cofactors
     rows = [jnp.cross(linear[:, (i + 1) % 3], linear[:, (i + 2) % 3]) for i in range(3)]
     turned = jnp.einsum("gij,gj->gi", jnp.stack(rows, axis=1), normals, precision=EXACT)
@@ -267,7 +269,7 @@ class Avatar(Batchable):
 
     @property
     def expression_names(self) -> tuple[str, ...]:
-        """The names of the coefficients of a pose's expression; none without a face."""
+        """The names of the coefficients of a pose's expression. Empty if there is no face."""
         if self.face is None:
             return ()
         return self.face.expressions.names
@@ -376,8 +378,8 @@ class Avatar(Batchable):
 
 
 def recorded_source(path: str | os.PathLike[str]) -> str | None:
-    """Returns the checksum of what an avatar file was made from, as it was given to `Avatar.save`;
-    None for a file without one.
+    """Returns the checksum of what an avatar was made from, as `Avatar.save` has written it into
+    the file. None if the file has no such checksum.
 
     Raises: FileNotFoundError if there is no such file; FileError if it is no avatar of this
     version.
@@ -463,8 +465,8 @@ _FACE = (
     *("row", "eyes", "beside", "stretching"),
     *("hidden_normals", "hidden_directions", "hidden_shown", "in_mouth", "lips", "lip_directions"),
 )
-"""The arrays of a face. Their keys in files begin with `face_`, and those of the hidden Gaussians
-with `face_hidden_`.
+"""Names of the arrays of a face. Their keys in files begin with `face_`. The arrays of the hidden
+Gaussians have further keys, which begin with `face_hidden_`.
 """
 
 

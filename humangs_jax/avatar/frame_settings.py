@@ -52,7 +52,7 @@ class FrameSettings:
         # not on construction: the command line would make a box of it
         """Check that all settings are in range.
 
-        Raises: ValueError naming the setting that is not.
+        Raises: ValueError naming a setting that is out of range.
         """
         for field in dataclasses.fields(self):
             check_range(FrameSettings, field.name, getattr(self, field.name), field.name)

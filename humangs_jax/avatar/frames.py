@@ -71,8 +71,8 @@ def draw(
     exposure_gains: Float[np.ndarray, "v 3"] | None = None,
 ) -> Iterator[Rendering]:
     """Yields one rendering for each pose and its camera. how: the configuration. None: the preset
-    `avatar.rendering`, for which the avatar was trained. exposure_gains: gains of the cameras, see
-    `data.exposure`.
+    `avatar.rendering`, for which the avatar was trained. exposure_gains: factors on the colors in
+    each image, (v, 3), see `data.exposure`.
     """
     if how is None:
         how = SPLAT_PRESETS[avatar.rendering]
@@ -342,8 +342,8 @@ def motion_views(
     """Puts a motion on the floor, and returns a pose and a camera for each of its frames.
 
     Arguments: turn: degrees by which the camera goes around the person during the motion. follow:
-    whether the camera goes along with the person; if not, it stands still, far enough away to keep
-    the person in the image.
+    whether the camera goes along with the person. If not, it looks at one point, from far enough
+    away to keep the person in the image.
 
     Raises: ValueError if the motion has another number of joints than the avatar, or the shot is
     out of range.

@@ -204,8 +204,8 @@ def reconstruct_batch(
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
         config: of the network.
-        captures: of people, whose shapes may differ; or functions that load one each, when its turn
-            comes.
+        captures: the captures, of people whose shapes may differ, or functions that return one
+            capture each. A function is called when its turn comes.
         batch: captures at a time.
 
     Yields:

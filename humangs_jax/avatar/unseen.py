@@ -133,9 +133,9 @@ class Regions(NamedTuple):
     head: Bool[Array, " n"]
     """Which vertices belong to the head, (n,)."""
     free: Bool[Array, " n"]
-    """Which vertices take guesses, (n,): all but the face."""
+    """Which vertices take guesses, (n,): all except the face's."""
     sources: Bool[Array, " n"]
-    """Which vertices give guesses, (n,): all but those of the head that are not hair."""
+    """Which vertices give guesses, (n,): the vertices of hair, and all that are not on the head."""
     features: Float[Array, "n f"]
     """The features of the vertices, (n, f), metres."""
     mirrored: Float[Array, "n f"]

@@ -47,9 +47,9 @@ def check_video(
     """Check that a video with these frames can be written, before they are drawn. Returns the
     video's format.
 
-    Raises: ValueError for a suffix that is no video (no suffix is a folder of PNG files), for
-    transparency in a format without it, for a GIF that would not fit into memory, or if the path is
-    a folder in place of a file, or a file in place of a folder.
+    A path without a suffix is a folder of PNG files. Raises: ValueError for another suffix, for
+    transparency in a format without it, for a GIF that would not fit into memory, for a video whose
+    path is a folder, or for a folder whose path is a file.
     """
     path = Path(path)
     suffix = path.suffix.lower()

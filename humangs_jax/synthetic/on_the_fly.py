@@ -507,14 +507,14 @@ class GeneratedSource:
         ]
 
     def describe(self, seed: int, index: int, input_count: int) -> str:
-        """See `Source`."""
+        """Returns a text that names the person and the appearance of an example, see `Source`."""
         person = self._person(seed, index)
         if self.person_of is not None:
             person = self.person_of(self.drawn_key(seed, index), input_count)
         return _described(person, index)
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
-        """See `Source`."""
+        """Returns example number `index` of a run that starts from `seed`, see `Source`."""
         example = self.make(self.drawn_key(seed, index), input_count)
         return jax.tree.map(np.asarray if self.on_host else jnp.asarray, example)
 
@@ -532,9 +532,9 @@ class EachPerson:
     config: OnTheFlyConfig
     """What each example shows."""
     input_counts: tuple[int, ...] = (4,)
-    """As `GeneratedSource.input_counts`."""
+    """Numbers of input photos that an example may have, as in `GeneratedSource`."""
     on_host: bool = False
-    """As `GeneratedSource.on_host`."""
+    """Whether the arrays of an example are copied to the host, as in `GeneratedSource`."""
 
     @property
     def broken(self) -> Mapping[str, str]:
@@ -545,12 +545,14 @@ class EachPerson:
         return self.bank.people
 
     def describe(self, seed: int, index: int, input_count: int) -> str:
-        """See `Source`."""
+        """Returns a text that names the person and the appearance of an example, see `Source`."""
         person = int(self.bank.seeds[index % self.bank.people])
         return _described(person, self._appearance(seed, index))
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
-        """See `Source`. The index decides the person, seed and index decide the appearance."""
+        """Returns an example of person `index` of the bank, see `Source`. seed and index decide the
+        appearance.
+        """
         person = index % self.bank.people
         key = subject_key(int(self.bank.seeds[person]), self._appearance(seed, index))
         config = dataclasses.replace(self.config, input_views=input_count)

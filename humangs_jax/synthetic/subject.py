@@ -1,9 +1,9 @@
 """Makes a synthetic person from a seed, and renders the person in a pose.
 
-`describe` makes the description: a few numbers, in milliseconds, so that thousands of people can be
-counted without any geometry. `make_subject` builds mesh, materials and lights from it, and the
-measures that the pose prior needs. Views are rasterized at twice their size, shaded at each sample,
-and averaged.
+`describe` makes only the description, which is a few numbers. It takes milliseconds, so that
+thousands of people can be counted without any geometry. `make_subject` builds mesh, materials and
+lights from the description, and the measures that the pose prior needs. Views are rasterized at
+twice their size, shaded at each sample, and averaged.
 
 A seed names a person. Each purpose, such as training or testing, has a range of seeds (`SPLITS`),
 and the ranges share no person. People that are written to files are made from the seed, by numpy.
@@ -54,8 +54,9 @@ from humangs_jax.synthetic.surroundings import Lights, sample_lights
 
 
 GENERATOR_VERSION = 2
-"""Raised whenever the same seed makes another person, pose or image. Manifests record it; sets of
-different versions are not mixed in one folder."""
+"""Version of the generator. It is raised whenever a seed makes another person, pose or image than
+before. Manifests record it; sets of different versions are not mixed in one folder.
+"""
 
 SPLITS = {
     "train": range(0, 1_000_000),

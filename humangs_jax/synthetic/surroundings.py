@@ -1,10 +1,10 @@
 """Makes cameras and light around a synthetic person, and shades the person's surface.
 
-People that are written to files get both from a numpy generator; people made on the fly get both
-from random numbers on the device. Cameras are like those of the published protocol: around the
-person, near the horizon, with a vertical field of view of 60 degrees. The light is soft: sky,
-ground, three wide lights, occlusion and soft shadows. A point has the same color from wherever it
-is seen. Occlusion and the shadow of the key light are computed at vertices, in a voxel grid that
+People that are written to files get cameras and light from a numpy generator. People made on the
+fly get them from random numbers on the device. Cameras are like those of the published protocol:
+around the person, near the horizon, with a vertical field of view of 60 degrees. The light is soft:
+sky, ground, three wide lights, occlusion and soft shadows. A point has the same color from wherever
+it is seen. Occlusion and the shadow of the key light are computed at vertices, in a voxel grid that
 holds the posed person.
 """
 

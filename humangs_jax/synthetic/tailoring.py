@@ -71,9 +71,10 @@ def neckline(template: Points, style: str, depth: float) -> Field:
 
 
 def sleeves(template: Points, end: float) -> Field:
-    """Returns a field (n,) that is positive everywhere but on arms beyond |x| = end.
+    """Returns a field (n,) that is positive everywhere except on arms beyond |x| = end.
 
-    With end < 0.2 the top is sleeveless, and its armholes widen down to the armpits.
+    With end < 0.2 the top is sleeveless. The edge of its armholes then moves outwards below y =
+    0.03.
     """
     x, y = np.abs(template[:, 0]), template[:, 1]
     if end < 0.2:
@@ -93,7 +94,7 @@ def trousers(template: Points, top: float, end: float) -> Field:
 
 
 def front_opening(template: Points, gap: float, spread: float) -> Field:
-    """Returns a field (n,) that is positive everywhere but in an opening down the front.
+    """Returns a field (n,) that is positive everywhere except in an opening down the front.
 
     gap: half of the opening's width at the chest, metres. spread: growth of half of the width,
     metres per metre downwards. The opening is also wider at the neck.
@@ -106,8 +107,8 @@ def front_opening(template: Points, gap: float, spread: float) -> Field:
 def collar(template: Points, low: float, high: float, gap: float = 0.012) -> Field:
     """Returns a field (n,) that is positive on a band around the neck, open in front.
 
-    low, high: heights of the lower and upper edge, which are tilted as a neckline is. gap: half of
-    the width of the opening, metres.
+    low, high: template heights of the lower and the upper edge at z = 0. Both edges are tilted like
+    a neckline. gap: half of the width of the opening, metres.
     """
     x, y, z = template.T
     radial, plane = np.sqrt(x * x + (z + 0.005) ** 2), y + 0.42 * z

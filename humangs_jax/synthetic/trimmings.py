@@ -356,9 +356,10 @@ _SEWN_ON = (
     (("coat", *DRESSES), "sash", _sashed),
     (("jeans",), "turn_up", _turned_up),
 )
-"""Rows of: kinds of garments; the detail that a garment needs to have the trimming (None: every
-garment of these kinds has it); the trimming; its further arguments. The order matters, because all
-trimmings of a garment draw from one generator."""
+"""Each row has four parts: kinds of garments; the detail that such a garment needs to have the
+trimming (None: all have it); the function of the trimming; and the function's further arguments.
+The order matters, because all trimmings of a garment draw from one generator.
+"""
 
 
 def sewn(

@@ -68,8 +68,8 @@ _TURNS = {"y": (1.0, 0.0, 0.0, 0.0), "-y": (0.0, 0.0, 0.0, 1.0), "z": (_HALF, _H
 
 
 def up_turn(up: Up) -> tuple[float, float, float, float]:
-    """Returns the rotation (quaternion, wxyz) that turns +y to the named axis: about z for -y,
-    about x for z.
+    """Returns the rotation (quaternion, wxyz) that turns +y to the named axis. It is about z for
+    -y, and about x for z.
 
     Raises: ValueError for another axis.
     """
@@ -300,7 +300,7 @@ def _versioned(version: int | None) -> dict[str, int]:
 
 def _between_worlds(gaussians: Gaussians, form: ExportFormat) -> Gaussians:
     """Returns Gaussians turned from a world with y up to the world that viewers of a format expect,
-    or back. Both directions have the same turns, since half turns are their own inverse.
+    or back. One function serves both directions, since half turns are their own inverse.
     """
     if form.backwards:
         gaussians = rotated(gaussians, BACKWARDS)
@@ -312,8 +312,9 @@ def _written() -> Formats[ExportFormat]:
 
 
 def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], notes: list[str]) -> Gaussians:
-    """Returns Gaussians made of the arrays of a file: means, quaternions (wxyz), scales, opacities,
-    colors and perhaps harmonics, in this order, each under its name in the file.
+    """Returns Gaussians made of the arrays of a file. The arrays are means, quaternions (wxyz),
+    scales, opacities, colors and perhaps harmonics, in this order. Their keys are the names in the
+    file, which errors show.
 
     Gaussians with a number that is not finite are left out, and a line with their count is appended
     to `notes`.
@@ -443,7 +444,8 @@ def export(
         name: the name of the animation in the file.
 
     Returns:
-        The files, without those that a format puts beside them (`.mtl` and `.png` of an `.obj`).
+        The paths of the files. Files that a format puts beside them (`.mtl` and `.png` of an
+        `.obj`) are not included.
 
     Raises:
         ValueError: for another suffix, for a format that cannot hold what is asked for, or if

@@ -49,7 +49,7 @@ from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 TEXTURE_SIZE = 1024
 """Texels along a side, each about 2 mm on an adult. Gaussians are 5 to 10 mm apart."""
 NEIGHBOURS = 32
-"""The number of Gaussians that color a point: those with the nearest means."""
+"""The number of Gaussians that color a point. They are the ones with the nearest means."""
 CHUNK = 16384
 """Number of points that are colored at a time. This takes some 100 MB."""
 SMALLEST_SCALE = 1e-4
