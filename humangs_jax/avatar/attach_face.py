@@ -67,7 +67,9 @@ SOFT = 0.3
 opening's radius beyond its edge.
 """
 AROUND_EYE = (0.02, 0.045)
-"""Distances from the centre of an eye, metres, between which skin gives its color to the lids."""
+"""The least and the largest distance from the centre of an eye of the skin that gives its color to
+the lids, metres.
+"""
 BESIDE = 8
 """The largest number of neighbours from which the stretch of a vertex is computed."""
 RIDGE = 0.01

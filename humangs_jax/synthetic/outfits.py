@@ -540,7 +540,8 @@ def _shoes(
 ) -> list[Garment]:
     """Chooses shoes, and socks where they can be seen.
 
-    Only women wear boots, and not with trousers that are too wide for them.
+    Only women wear tall boots, and not with trousers that are too wide for such boots. Ankle boots
+    take their place.
     """
     lower = next(g for g in worn if g.kind in BOTTOMS + SKIRTS + DRESSES)
     kind = drawn(rng, style.shoes)

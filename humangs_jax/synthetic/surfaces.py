@@ -430,7 +430,9 @@ class Boundaries:
         ).astype(np.float32)
 
     def radius(self, level: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        """Returns radii (n,) at positions along the axis and angles around it, interpolated."""
+        """Returns radii (n,) at positions along the axis (n,) and angles around it (n,), radians.
+        They are interpolated.
+        """
         t = np.clip(
             np.interp(level, self.levels, np.arange(len(self.levels))), 0, len(self.levels) - 1.001
         )

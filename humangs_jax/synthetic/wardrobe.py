@@ -88,8 +88,8 @@ class Outfit:
         hems.
 
         cover: function of template points (n, 3) that returns how far they are inside of the
-        garment's hems (n,), metres, negative outside. margin: for cloth at least 30 mm are taken.
-        cloth: whether cloth is hidden, too; otherwise only skin is.
+        garment's hems (n,), metres, negative outside. margin: metres; for cloth it is at least
+        0.03. cloth: whether cloth is hidden, too. If not, only skin is.
         """
         field = cover(self.template)
         self.cover = np.maximum(self.cover, field)

@@ -54,9 +54,7 @@ logger = logging.getLogger(__name__)
 SH_C0 = 0.28209479177387814
 """The constant spherical harmonic Y00 = 1 / (2 sqrt(pi))."""
 SEEN = 0.5
-"""Gaussians of at least this opacity are seen, and can be the lowest ones, which stand on the
-floor.
-"""
+"""Gaussians of at least this opacity are seen. The lowest of them stands on the floor."""
 BACKWARDS = (0.0, 0.0, 1.0, 0.0)
 """The rotation (quaternion, wxyz) of half a turn about y."""
 _HALF = float(np.sqrt(0.5))
