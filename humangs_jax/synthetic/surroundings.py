@@ -558,9 +558,9 @@ def dyes_from(
 ) -> Float[Array, "m 3 3"]:
     """Makes a matrix for each piece that changes the hue, saturation and brightness of its cloth.
 
-    The hue is turned about the grey axis for half of the groups of pieces; saturation and
-    brightness change for all of them. Pieces of one group are dyed alike, and pieces that are not
-    dyeable have the identity.
+    A group's hue is turned about the grey axis with a probability of 1/2. Saturation and brightness
+    change for all groups. Pieces of one group are dyed alike, and pieces that are not dyeable have
+    the identity.
 
     u: random numbers in [0, 1), (4, m). groups: the number of each piece's group (m,). dyeable:
     more than 0 where a piece may be dyed (m,).

@@ -80,8 +80,8 @@ class Packed:
     shape coefficient, divided by step, metres. shape_joints float32 (s, j, 3), how joints move,
     metres.
 
-    Face, if the avatar has one: face_..., see `page_face.pack_face`. Hidden Gaussians of the face
-    come last.
+    Face, if the avatar has one with fewer than 255 expressions: face_..., see
+    `page_face.pack_face`. Hidden Gaussians of the face come last.
     """
 
     header: dict[str, Any]
@@ -452,7 +452,8 @@ def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
 
 def known_body(avatar: Avatar) -> BodyModel | None:
     """Returns the shipped body that has the avatar's vertices, for sliders of shape. Returns None
-    if no shape of that body has these vertices.
+    if no shape of that body has these vertices, if the faces differ, or if refinement has added
+    Gaussians.
     """
     if avatar.parents != PARENTS:
         return None
