@@ -218,9 +218,9 @@ def without_pixel_footprint(avatar: Avatar) -> Avatar:
 
 def with_pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Avatar:
     """Returns the avatar with the low-pass of the photos that it will be fitted to. A Gaussian
-    keeps its low-pass if this is for smaller pixels.
+    keeps its own low-pass if that is for smaller pixels than the photos' pixels.
 
-    The avatar looks as before. Where its low-pass was larger, the difference is now an ordinary
+    The avatar looks as before. Where its own low-pass was larger, the difference is now an ordinary
     part of the scales, which a fit can reduce.
     """
     return replace(avatar, gaussians=_pixel_footprint_of(avatar, views))

@@ -41,9 +41,7 @@ COLORS = {
 }
 """The RGB colors of parts that no photo shows. Lids have the color of the skin around the eye."""
 CLOSING = 4.0
-"""How fast a lid appears: the shown share of its opacity is this factor times the coefficient of
-its blink, up to 1.
-"""
+"""The shown share of a lid's opacity is this factor times the coefficient of its blink, up to 1."""
 OPAQUE = 0.97
 COVER = 0.6
 """Standard deviation of a hidden Gaussian along a side of its quadrangle, divided by the length of
@@ -59,16 +57,15 @@ Gaussians of the eye are about as thick.
 """
 EYE = (0.0165, 0.0095, 0.005, 0.03)
 """Four lengths in metres: half of the width and half of the height of the opening between the lids,
-then the least and the largest distance from the eye's centre, forwards, that Gaussians of the eye
-have.
+then the range of distances in front of the eye's centre in which Gaussians show the eye.
 """
 SOFT = 0.3
 """Gaussians outside of the opening belong to the eye in part, until they are this share of the
 opening's radius beyond its edge.
 """
 AROUND_EYE = (0.02, 0.045)
-"""The least and the largest distance from the centre of an eye of the skin that gives its color to
-the lids, metres.
+"""Range of distances from an eye's centre, metres. Skin within the range gives its color to the
+lids.
 """
 BESIDE = 8
 """The largest number of neighbours from which the stretch of a vertex is computed."""

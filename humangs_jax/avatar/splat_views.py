@@ -1,4 +1,4 @@
-"""Draws images of any Gaussians, those of other programs too, from a circle of cameras or from the
+"""Draws images of any Gaussians, also of other programs, from a circle of cameras or from the
 cameras of a calibration. Large scenes are drawn in bands of rows, in bounded memory.
 """
 
@@ -42,7 +42,9 @@ the radius of the share `SHOWN`. There are no outliers then, as around a person.
 ROOM = 1.1
 """Factor on the least distance from which the cameras see the Gaussians."""
 PAIRS = 4_000_000
-"""The most (splat, tile) pairs that are drawn at once, in some hundred megabytes."""
+"""The largest number of (splat, tile) pairs that are drawn at once. They take some hundred
+megabytes.
+"""
 
 
 def circle_cameras(

@@ -186,7 +186,7 @@ def _share_of(body: BodyModel, joints: tuple[str, ...]) -> Float[Array, " n"]:
 
 
 def _mirrored(name: str) -> str:
-    """Returns the name of the same joint on the other side."""
+    """Returns the name of the joint on the other side. A joint in the middle keeps its name."""
     side, _, part = name.partition("_")
     other = {"left": "right", "right": "left"}
     if side in other:
@@ -300,8 +300,8 @@ of the words.
 
 
 def guess_line(capture: Capture) -> str | None:
-    """Returns one line that names the sides and parts of the person that no photo of a capture
-    shows; None if all are shown.
+    """Returns one line that names the sides and parts of the person that are guesses, see
+    `unseen_sides`. None if photos show all of them.
     """
     names = [f"the {name}" for name in unseen_sides(capture)]
     if not names:
