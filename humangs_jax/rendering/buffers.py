@@ -38,8 +38,8 @@ def round_up(size: int, smallest: int = 64) -> int:
 
 
 def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
-    """Returns the `max_pairs` of a traced call whose configuration has None. It is enough for a
-    person, and never more than can be needed.
+    """Returns the room for (splat, tile) pairs that a traced call gets if `SplatConfig.max_pairs`
+    is None. It is enough for a person, and never more than can be needed.
 
     g: number of Gaussians. width, height, tile_size: pixels.
     """
@@ -50,8 +50,8 @@ def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
 
 
 def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
-    """Returns the configuration with `default_pairs` if its `max_pairs` is None, for traced
-    calls.
+    """Returns the configuration for a traced call. If `max_pairs` is None, it becomes
+    `default_pairs`.
     """
     if config.max_pairs is not None:
         return config
@@ -66,11 +66,11 @@ def plan_buffers(
     config: SplatConfig | str = DEFAULT_CONFIG,
     margin: float = 1.25,
 ) -> SplatConfig:
-    """Returns a configuration with buffers for one camera, or for the most demanding camera of a
-    batch, times `margin`.
+    """Returns a configuration whose buffers have room for `margin` times what a camera needs. In a
+    batch, the most demanding camera counts.
 
-    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. It
-    measures concrete arrays, so call it outside of transformations.
+    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation.
+    `plan_buffers` measures concrete arrays, so call it outside of transformations.
 
     No margin is enough for Gaussians that are optimised for long, because they grow. If pairs no
     longer fit, `Rendering.overflow` is above 0, and `SplatConfig.warn_overflow` logs it. Then plan
@@ -98,15 +98,19 @@ def plan_buffers(
 
 
 ROOMY = 2.0
-"""Largest size of buffers, relative to the need, that is accepted to save compiling a program."""
+"""Planned buffers are used for another view if none is larger than this many times what the view
+needs. Larger buffers would cost more time than another compilation.
+"""
 _PLANNED: dict[tuple[SplatConfig, int, int], list[tuple[int, int]]] = {}
-"""Rows and pairs that were planned in this process, by configuration, width and height."""
+"""`max_rows` and `max_pairs` of the buffers planned in this process, by configuration, width and
+height.
+"""
 
 
 def plan_near(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
-    """Returns a configuration with buffers for one camera. Buffers that were planned before are
-    taken if everything fits and they are at most `ROOMY` times the need, because drawing with them
-    costs less than another compilation.
+    """Returns a configuration with buffers for one camera. Buffers from an earlier call are used
+    again if everything fits and none is larger than `ROOMY` times the need. Drawing with them costs
+    less than another compilation.
     """
     rows, pairs = _needed(gaussians, camera, config)
     known = _PLANNED.setdefault((config, camera.width, camera.height), [])

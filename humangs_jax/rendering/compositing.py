@@ -50,8 +50,8 @@ from humangs_jax.rendering.splat_rows import R00, R01, R11, Composited
 from humangs_jax.rendering.tiling import TileGrid, TileLists
 
 Schedule = Callable[[TileGrid, SplatConfig], Callable[..., PyTree]]
-"""Type of the functions that make a drawing function, or its gradient, for one grid and one
-configuration.
+"""A function that takes a grid and a configuration. It returns a drawing function or a gradient
+function.
 """
 
 

@@ -13,10 +13,11 @@ the same list". The first list of a step may continue from the step before. A st
 on the sum of its last list, and the next step adds it. The backward pass forms the sums over i <= j
 of w_i g . f_i by the same two products.
 
-T agrees with that of the other schedule to |log T| eps. Behind the stop, rounding can raise log T
-only while alpha is 0. Hence the final log T is the sum of log(1 - alpha) over the splats before the
-stop. A NaN spreads to other tiles of its step. Sums over splats are scattered, so on a GPU the last
-bit may differ between runs.
+The relative difference between this T and the T of the schedule for CPUs is about |log T| eps.
+After a pixel has ended, rounding can lift its running log T above the stop again only where alpha
+is 0. Such splats add nothing. Hence the final log T is the sum of log(1 - alpha) over the splats
+before the stop. A NaN spreads to other tiles of its step. The values of a splat are summed by
+scattering, so on a GPU the last bit may differ between runs.
 """
 
 import functools
@@ -56,7 +57,7 @@ them.
 """
 STEP_CHUNKS = 2048
 """Largest B, the number of chunks in a step. The product over earlier chunks costs 2 B / k flops
-per pair, at this B half of the triangular product.
+per pair. At this B that is half of what the triangular product costs.
 """
 
 
@@ -115,8 +116,8 @@ class _Step(NamedTuple):
     peaks: Float[Array, " g"]
     """The largest w of each splat so far, (g,), as in `Composited`."""
     medians: Float[Array, "t p"] | None
-    """The smallest z so far behind which T is one half or less, (t, p), as in `Composited`. None if
-    it is not wanted.
+    """The smallest z so far behind which T is one half or less, (t, p), as in `Composited`. None
+    unless `config.depth_median`.
     """
     tail: _Tail
     """Sum of log(1 - alpha) of the last list so far, which may continue in the next step."""
@@ -124,8 +125,8 @@ class _Step(NamedTuple):
 
 @functools.lru_cache
 def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Composited]:
-    """Returns a drawing function with the arguments and results of the function that
-    `forward_by_blocks` returns.
+    """Returns the drawing function (splats, items, starts, counts) -> `Composited`, as
+    `forward_by_blocks` does.
     """
     log_stop = _log_stop(config)
 
@@ -180,8 +181,8 @@ def forward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Comp
 
 @functools.lru_cache
 def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Array]:
-    """Returns a gradient function with the arguments and results of the function that
-    `backward_by_blocks` returns.
+    """Returns the gradient function (splats, items, starts, lengths, g, Q) -> sums over pixels for
+    each splat, as `backward_by_blocks` does.
     """
     log_stop = _log_stop(config)
 
@@ -272,9 +273,10 @@ def _fading(raw: Array, config: SplatConfig) -> tuple[Array, Array]:
 def _sums_before(
     x: Float[Array, "b k p"], tiles: Int[Array, " b"], tail: _Tail
 ) -> tuple[Array, Array]:
-    """Returns two sums of x (B, k, p) along its lists: the sum of everything before each chunk,
-    (B, p), and the sum from the beginning of the chunk up to before each splat, (B, k, p). tail:
-    the sum of the list that continues from the step before.
+    """Returns two sums of x (B, k, p) along its lists. The first, (B, p), is of everything before
+    each chunk. The second, (B, k, p), is of everything before each splat within its chunk.
+
+    tail: sum of the list that continues from the step before.
     """
     b, k, _ = x.shape
     triangle = jnp.broadcast_to(jnp.asarray(np.tri(k, k=-1), x.dtype), (b, k, k))

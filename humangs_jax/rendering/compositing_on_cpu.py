@@ -7,8 +7,9 @@ forward pass has two chains, one for T and one for everything else, so that XLA 
 each chain, which runs in registers. Once a pixel has ended, the loop carries -T, which keeps the
 final T.
 
-Compile with `core.processes.compiler_options`. Its options keep XLA from sharing small kernels out
-over threads, which would cost more than it gains, and from removing the barriers.
+Compile with `core.processes.compiler_options`. Its options keep XLA from removing the optimization
+barriers. They also keep XLA from dividing small kernels among threads, which would cost more than
+it gains.
 """
 
 import functools
@@ -52,8 +53,8 @@ class _Chain(NamedTuple):
     peaks: Float[Array, " g"]
     """The largest w of each splat so far, in all blocks, (g,)."""
     medians: Float[Array, "block p"] | None
-    """The smallest z so far behind which T is one half or less, (block, p). None if it is not
-    wanted.
+    """The smallest z so far behind which T is one half or less, (block, p). None unless
+    `config.depth_median`.
     """
 
 
@@ -120,8 +121,8 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Comp
             final = jnp.abs(chain.transmittance)  # the sign marked pixels that had ended
 
             def placed(of_all, of_block):
-                """Returns the values of all tiles with those of this block's tiles put in. Padding
-                is dropped.
+                """Returns `of_all`, the values of all tiles, with the tiles of this block replaced
+                by `of_block`. Padding tiles are dropped.
                 """
                 return of_all.at[tile].set(of_block, mode="drop", unique_indices=True)
 
@@ -157,7 +158,9 @@ class _BackwardChain(NamedTuple):
     seen: Float[Array, "block p"]
     """Sum of w g . f so far."""
     sums: Float[Array, "g width"]
-    """The result: a row for each splat, summed over the chunks and blocks so far."""
+    """The sums for each splat that `backward_by_blocks` describes, over the chunks and blocks so
+    far.
+    """
 
 
 @functools.lru_cache

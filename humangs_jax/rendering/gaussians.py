@@ -48,14 +48,16 @@ class Gaussians(Batchable):
     never to the means.
     """
     pixel_footprint: Annotated[Float[Array, " g"] | None, NOT_NEGATIVE] = None
-    """Side of the pixels of the images whose low-pass the scales contain (`avatar.animate`), (g,),
-    metres. Renderers then add at most `MIP_EPS2D` pixels^2. In images with larger pixels, they dim
-    the Gaussians that this enlarges. None: the scales contain no low-pass.
+    """Side of a pixel at each Gaussian, (g,), metres. The scales contain the low-pass of images
+    with such pixels (`avatar.animate`). Renderers then add a variance of at most `MIP_EPS2D`
+    pixels^2. If the pixels of their image are larger, they also dim the Gaussian, because the added
+    variance enlarges it. None: the scales contain no low-pass.
     """
     harmonics: Float[Array, "g k 3"] | None = None
-    """Factors of the spherical harmonics, which add colors by the direction of sight (see below),
-    (g, k, 3), or None. Degrees are 1 (k = 3), 1 to 2 (k = 8) or 1 to 3 (k = 15), in the frame of
-    the means. `skin_gaussians` turns them with the Gaussians, so those of an avatar are in its
+    """Coefficients of real spherical harmonics, (g, k, 3), or None. The harmonics add colors that
+    depend on the direction of sight, see `added_colors`. Degree 1 has k = 3, degrees 1 and 2 have k
+    = 8, and degrees 1 to 3 have k = 15. Directions are in the frame of the means. `skin_gaussians`
+    turns the harmonics with the Gaussians, so the harmonics of an avatar are in the frame of its
     T-pose.
     """
 
@@ -123,9 +125,10 @@ def skin_gaussians(
     Harmonics are turned by the rotation that is read from the transform.
 
     With "affine", the linear part of the transform is multiplied into `deformations`, and so
-    transforms the whole covariance. With "rotation", as published, the linear part times the
-    Gaussian's rotation matrix is read as a quaternion. Where the blended transform is no rotation,
-    the quaternion's norm is not 1. Draw with `normalize_quats=False` to reproduce this.
+    transforms the whole covariance. With "rotation", as published, the linear part is multiplied by
+    the Gaussian's rotation matrix, and the product is converted to a quaternion. If the blended
+    transform is no rotation, the norm of this quaternion is not 1. To reproduce this, draw with
+    `normalize_quats=False`.
 
     Raises: ValueError for another mode, or for `rotation` of Gaussians that have deformations
     already.
@@ -259,14 +262,14 @@ def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
 COUNTS = (0, 3, 8, 15)
 """Number of functions of the degrees 1 to l, for l = 0 to 3."""
 POINTS = 32
-"""Number of directions, spread evenly, at which turned functions are evaluated. It is larger than
-the number of functions.
+"""Number of directions, spread evenly, at which `turned_harmonics` evaluates the functions. It is
+larger than the number of functions.
 """
 
 
 def check_count(count: int) -> None:
-    """Checks that a number of functions is 3, 8 or 15, which whole degrees have. Raises:
-    ValueError.
+    """Checks that a number of harmonics is 3, 8 or 15, the numbers of degrees 1, 1 to 2 and 1 to 3.
+    Raises: ValueError.
     """
     if count not in COUNTS[1:]:
         raise ValueError(
@@ -280,8 +283,8 @@ def basis(
     z: Array | np.ndarray | float,
     count: int,
 ) -> list:
-    """Returns the values of Y_1 to Y_count at unit vectors, a list. x, y, z: coordinates of the
-    vectors. Raises: as `check_count`.
+    """Returns a list of the spherical harmonics Y_1 to Y_count at unit vectors, each in the shape
+    of x. x, y, z: coordinates of the vectors. Raises: ValueError, as `check_count`.
     """
     check_count(count)
     xx, yy, zz = x * x, y * y, z * z
@@ -304,8 +307,8 @@ def basis(
 def added_colors(
     harmonics: Float[Array, "g k 3"], x: Array, y: Array, z: Array
 ) -> Float[Array, "g 3"]:
-    """Returns the sum over k of Y_k(d) harmonics_k, (g, 3), for unit vectors d given as planes of
-    (g,).
+    """Returns the colors that harmonics add in the directions d, (g, 3): the sum over k of Y_k(d)
+    harmonics_k. x, y, z: coordinates of the unit vectors d, (g,) each.
     """
     values = jnp.stack(basis(x, y, z, harmonics.shape[1]), axis=-1)
     return jnp.sum(values[..., None] * harmonics, axis=1)
@@ -327,8 +330,8 @@ def turned_harmonics(
 
 @functools.cache
 def _points(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns unit vectors on a spiral, (p, 3), and the matrix (k, p) that maps values at these
-    vectors to the factors of k functions.
+    """Returns unit vectors spread evenly over the sphere, (p, 3), and a matrix (k, p). The matrix
+    times the values of a function at these vectors gives the coefficients of k harmonics.
     """
     z = 1 - (2 * np.arange(POINTS) + 1) / POINTS
     angle = np.pi * (1 + math.sqrt(5)) * np.arange(POINTS)

@@ -1,14 +1,15 @@
 """EWA projection: 3D Gaussians to 2D Gaussians on the image (Zwicker et al. 2001; Kerbl et al.
 2023).
 
-With p = (X, Y, Z) the mean in the camera's frame, fx, fy, cx, cy of K and W the camera's rotation,
+Let p = (X, Y, Z) be the mean in the camera's frame, fx, fy, cx and cy the entries of K, and W the
+camera's rotation. Then
 
     mean2d = (fx X/Z + cx, fy Y/Z + cy)
     J      = [[fx/Z, 0, -fx X/Z^2], [0, fy/Z, -fy Y/Z^2]]
     cov2d  = M M^T + eps2d I,   M = J W A R diag(s)
 
-where J is the projection's derivative at p, and A R diag(s) the factor of the covariance; M is
-(2, 3).
+where J is the projection's derivative at p, and A R diag(s) the factor of the covariance; M is (2,
+3).
 
 Everything is kept as planes of g numbers rather than as (g, 2, 2) arrays: XLA then fuses the
 projection, and its gradient, into a few loops. The determinant of cov2d is not computed from its
@@ -18,10 +19,10 @@ cov2d^-1 / 2, whose gradient is written by hand for the same reason.
 
 The added variance makes small Gaussians larger. If the scales contain the low-pass of pixels of s
 metres (`Gaussians.pixel_footprint`), the opacity is multiplied by sqrt(det(M M^T + e I) / det
-cov2d). Here e, the smaller of eps2d (s fx/Z)^2 and eps2d, is the variance that was added in images
-of such pixels. So the total weight of a Gaussian stays the same in smaller images (Mip-Splatting's
-2D filter, https://arxiv.org/abs/2311.16493, equation 9, which has e = 0). `SplatConfig.antialiased`
-dims all other Gaussians with e = 0.
+cov2d). Here e is the smaller of eps2d (s fx/Z)^2 and eps2d. The first is the variance that was
+added in images with such pixels, in pixels^2 of this image. So the total weight of a Gaussian stays
+the same in smaller images (Mip-Splatting's 2D filter, https://arxiv.org/abs/2311.16493, equation 9,
+which has e = 0). `SplatConfig.antialiased` dims all other Gaussians with e = 0.
 
 If the camera has a lens, mean2d is where the lens puts (X/Z, Y/Z). J is then the derivative of the
 whole map (`geometry.lens`): the focal lengths of K, times the Jacobian of the lens, times the
@@ -126,9 +127,9 @@ def project_gaussians(
     """Returns every Gaussian projected onto the image, as `config` says. This is the first step of
     `splatting.render`.
 
-    With `config.jacobian_margin`, the Jacobian is evaluated no farther beyond the border of the
-    image than this fraction of half the field of view. It applies to pinhole cameras without
-    distortion.
+    `config.jacobian_margin` enlarges the image on each side by this fraction of half its width (or
+    height). For a centre outside of the enlarged image, the Jacobian is evaluated at the nearest
+    point of the enlarged image. This applies to pinhole cameras without distortion.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
     eps2d = added_variance(gaussians.pixel_footprint, config.eps2d)
@@ -222,8 +223,8 @@ def _dimming(m0: Planes, m1: Planes, determinant: Array, eps2d: float, footprint
     """Returns the factor of the opacity, (g,). It is at least `LEAST_DIMMING`, and 1 where the
     determinant overflows.
 
-    footprint: side of the pixels of the images that the scales were fitted to, in pixels of this
-    image.
+    footprint: `Gaussians.pixel_footprint` in pixels of this image, (g,). 0 for Gaussians without
+    one.
     """
     finite = determinant < jnp.inf
     m0, m1 = ([jnp.where(finite, entry, 0.0) for entry in row] for row in (m0, m1))
@@ -248,14 +249,15 @@ def _conic_factor(m0: Planes, m1: Planes, eps2d: float) -> tuple[Array, Array, A
         dL/dM = -2 r^T k r M.
 
     For a needle of length l and width w, in pixels, the entries of r are of the order of 1 / w, but
-    r's product with its long axis is of the order of 1. In
+    r times the long axis is of the order of 1. In
 
         (r M)_0j = r00 / yy (sum_i m1_i (m_j x m_i) + eps2d m0_j),     (r M)_1j = r11 m1_j
 
-    the term that would cancel, m_j x m_j, is left out. Autodiff sums two terms that cancel, through
-    yy and through the determinant; that is ten times less accurate. Once the determinant passes
-    2e19 pixels^4 (7e4 pixels square), its square overflows. One of the terms is then lost, and the
-    gradient along the long axis is as large as across.
+    the term that would cancel, m_j x m_j, is left out. Autodiff would sum two terms that cancel,
+    one through yy and one through the determinant, and would be ten times less accurate. Above a
+    determinant of 2e19 pixels^4 (7e4 pixels square), the square of the determinant overflows.
+    Autodiff would then lose one of the terms, and the gradient along the long axis would be as
+    large as across.
     """
     _, xy, yy, determinant = _covariance(m0, m1, eps2d)
     regular = determinant > 0

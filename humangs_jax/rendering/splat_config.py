@@ -37,9 +37,10 @@ the same value. Opacity is not compensated for it (gsplat "classic").
 """
 
 MIP_EPS2D = 0.1
-"""Added variance for Gaussians whose scales contain the low-pass of the images that they were
-fitted to, pixels^2. It is about the footprint of a pixel. Images of other sizes then show the
-Gaussians as wide as the fitted images do (Mip-Splatting, https://arxiv.org/abs/2311.16493).
+"""Variance that is added to Gaussians whose scales contain a low-pass (`Gaussians.pixel_footprint`)
+instead of `EPS2D`, pixels^2. It is about the footprint of a pixel. Images of all sizes then show
+the Gaussians as wide as the images to which they were fitted (Mip-Splatting,
+https://arxiv.org/abs/2311.16493).
 """
 
 LEAST_DIMMING = 1e-4
@@ -63,8 +64,9 @@ of this or less. INRIA and gsplat have the same value.
 """
 
 LARGEST_FOOTPRINT = 1e9
-"""Largest coordinate of the axes (one standard deviation long) of a projected Gaussian, pixels.
-Gaussians with a larger coordinate are not drawn, because its fourth power could overflow float32.
+"""Largest absolute coordinate of the three axes of a projected Gaussian, pixels. The axes are one
+standard deviation long. Gaussians with a larger coordinate are not drawn, because its fourth power
+could overflow float32.
 """
 
 
@@ -80,10 +82,10 @@ class SplatConfig:
     eps2d: Annotated[float, Range(0, 1e6)] = EPS2D
     """Variance that is added to projected variances, pixels^2."""
     antialiased: bool = False
-    """Whether opacities are dimmed as the added variance enlarges the footprint, so that the total
-    weight of a Gaussian stays the same (gsplat's "antialiased"; Mip-Splatting's 2D filter).
-    Gaussians with a `pixel_footprint` are always dimmed, but only where a pixel of the image is
-    larger, at their depth, than `pixel_footprint`.
+    """Whether opacities are dimmed because the added variance enlarges the footprint. The total
+    weight of a Gaussian then stays the same (gsplat's "antialiased"; Mip-Splatting's 2D filter).
+    Gaussians with a `pixel_footprint` are always dimmed, but only where a pixel of the image covers
+    more than `pixel_footprint` metres at their depth.
     """
     alpha_min: Annotated[float, Range(1e-12, 1)] = ALPHA_MIN
     """Smaller alphas are skipped."""
@@ -97,9 +99,10 @@ class SplatConfig:
     )
     """A pixel ends before its transmittance would fall to this."""
     jacobian_margin: Spread | None = None
-    """None: the exact Jacobian. A number: the Jacobian is evaluated no farther beyond the border of
-    the image than this fraction of half the field of view. INRIA and gsplat have 0.3. It applies to
-    pinhole cameras without distortion.
+    """None: the Jacobian of the projection is exact. A number: the image is enlarged on each side
+    by this fraction of half its width (or height). For a centre outside of the enlarged image, the
+    Jacobian is evaluated at the nearest point of the enlarged image. INRIA and gsplat have 0.3. It
+    applies to pinhole cameras without distortion.
     """
     normalize_quats: bool = True
     """Whether quaternions are normalised. INRIA's rasterizer does not."""
@@ -115,9 +118,9 @@ class SplatConfig:
     image depends on tile_size.
     """
     square: bool = False
-    """Whether footprints are those of INRIA: squares around the splat, on tiles as INRIA counts
-    them. Half a side is `radius_sigma`, which must not be None, times the larger standard
-    deviation, rounded up to pixels.
+    """Whether footprints are INRIA's: squares around the splats, on the tiles that INRIA's
+    rasterizer counts for them. Half a side is `radius_sigma` times the larger standard deviation,
+    rounded up to pixels. `radius_sigma` must not be None.
     """
     visibility: bool = knob(
         False,
@@ -166,9 +169,9 @@ class SplatConfig:
         gain="8 is best on CPUs: 4 takes 2.3 x, 16 takes 1.3 x the time",
         measured="performance.md",
     )
-    """Side of a tile, pixels. This field and the next ones are the schedule. They change the time,
-    and the image only by rounding. With a radius_sigma, tile_size also decides where splats are cut
-    off.
+    """Side of a tile, pixels. `tile_size`, `block` and `chunk` make the schedule. They change the
+    time that drawing takes, and the image only by rounding. With a radius_sigma, tile_size also
+    decides where splats are cut off.
     """
     block: Chunk = 32
     """Number of tiles that are composited together, on CPUs only. From 16 to 64 times differ by 4
@@ -235,12 +238,12 @@ def splat_config(config: SplatConfig | str) -> SplatConfig:
 
 
 def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
-    """Returns the configuration with the conventions that weights record for drawing. rendering:
-    "exact" or "inria".
+    """Returns the configuration with the conventions of a preset, "exact" or "inria". rendering:
+    the preset's name, which weights record.
 
-    The configuration is returned unchanged if it differs from the preset of the other name in all
-    of `jacobian_margin`, `normalize_quats` and `square`. Otherwise all fields in which the two
-    presets differ take the values of `rendering`. Other fields stay as the user has set them.
+    All fields in which the two presets differ take the values of the preset `rendering`. Other
+    fields stay as the user has set them. The configuration is returned unchanged if its
+    `jacobian_margin`, `normalize_quats` and `square` all differ from the other preset.
     """
     wanted, other = SPLAT_PRESETS["inria"], SPLAT_PRESETS["exact"]
     if rendering == "exact":

@@ -34,7 +34,7 @@ LOG_OPACITY = 5
 FEATURES = slice(6, None)
 """Columns of red, green, blue, z, and any further features."""
 Z = 9
-"""Column with z."""
+"""Column with z, metres. `splatting` measures z from the nearest Gaussian."""
 HALF = 0.5
 """Transmittance at the median depth."""
 
@@ -77,10 +77,10 @@ class Composited(NamedTuple):
 
 
 def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """Returns the function, wrapped so that `vmap` calls it once, with the tiles of all images
-    together. Its arguments are (splats, items, starts, further arrays per tile...).
+    """Returns the function in a form that `vmap` calls once, with the tiles of all images together.
+    Its arguments are (splats, items, starts, further arrays per tile...).
 
-    The function must return arrays per tile or per splat. They are divided among the images
+    The function must return arrays per tile or per splat. `vmap` divides them among the images
     afterwards.
     """
     function = jax.custom_batching.custom_vmap(function)
@@ -112,12 +112,12 @@ def take_chunk(
 ) -> tuple[
     Int[Array, "b k"], Float[Array, "b k width"], Float[Array, "2 b k"], Float[Array, "b k p"]
 ]:
-    """Returns the first k splats of each of b lists. A list is `items[start : start + count]`, and
-    lies on its tile of `tiles`.
+    """Returns the first k splats of each of b lists. List i is `items[starts[i] : starts[i] +
+    counts[i]]`, and belongs to the tile `tiles[i]`.
 
-    The results are the numbers of the splats (b, k), which are g past the end of a list; their rows
-    (b, k, width); x and y of their centres (2, b, k), relative to the tile's centre, pixels; and
-    their raw alphas (b, k, p), which are 0 past the end.
+    There are four results: the numbers of the splats, (b, k), which are g past the end of a list;
+    their rows, (b, k, width); x and y of their centres relative to the tile's centre, (2, b, k),
+    pixels; and their raw alphas at the tile's pixels, (b, k, p), which are 0 past the end.
     """
     # numbers and rows of the splats
     slot = jnp.arange(k, dtype=jnp.int32)

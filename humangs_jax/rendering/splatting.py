@@ -190,8 +190,8 @@ def render_views(
 ) -> Rendering:
     """Draw every camera of a batch (leading axis v), one after the other. Working memory does not
     grow with v. The memory for values that a gradient needs later grows with v. `jax.vmap` of
-    `render` draws all views at once and holds the buffers of all views. On CPUs it is as fast, but
-    slower with gradients of many views.
+    `render` draws all views at once, and holds the buffers of all views. On CPUs, `jax.vmap` is as
+    fast as `render_views`, but slower if gradients of many views are taken.
 
     Args:
         gaussians: as `render`.
@@ -223,8 +223,8 @@ def visible_gaussians(
     config: SplatConfig | str = DEFAULT_CONFIG,
     threshold: float = ALPHA_MIN,
 ) -> Bool[Array, " g"]:
-    """Returns which Gaussians weigh at least `threshold` on some pixel of some camera, (g,).
-    `cameras` has one leading axis.
+    """Returns which Gaussians have a weight alpha T of at least `threshold` on some pixel of some
+    camera, (g,). `cameras` has one leading axis.
 
     The other Gaussians, such as those inside of an avatar, can be left out for similar cameras.
     """
@@ -370,8 +370,8 @@ def _color(background: object, dtype: np.dtype) -> Array:
 
 
 def _of_bytes(color: Any) -> bool:
-    """Returns whether an array of integers has a value above 1, as colors in bytes have. False for
-    traced values, which cannot be read, and for floats.
+    """Returns whether an array of integers has a value above 1, which suggests colors of 0 to 255.
+    False for traced values, which cannot be read, and for floats.
     """
     if isinstance(color, Tracer) or jnp.issubdtype(color.dtype, jnp.inexact):
         return False
@@ -500,8 +500,9 @@ def _blank(
 
 
 def _powers(behind: Float[Array, " g"], visible: Array) -> Float[Array, "g 2"]:
-    """Returns z and z^2 of each Gaussian, (g, 2). z is relative to the mean z of the visible
-    Gaussians, because small numbers have small squares. It is 0 for the others.
+    """Returns z and z^2 of each Gaussian, (g, 2), metres and metres^2. z is measured from the mean
+    z of the visible Gaussians, because small numbers have small squares. Gaussians that are not
+    visible have 0.
     """
     count = jnp.maximum(jnp.sum(visible), 1)
     z = jnp.where(visible, behind - lax.stop_gradient(jnp.sum(behind) / count), 0.0)

@@ -3,8 +3,9 @@ buffer of fixed size.
 
 Splatting takes five steps. All have static shapes, and no gradient passes the first three:
 
-1. `expand` gives each item as many slots as it touches tiles, one for each (tile, item) pair.
-   Splats take two such steps, first to rows of tiles, then to tiles (`emit_pairs`).
+1. `expand` gives each item one slot for each tile that the item touches. A slot is a (tile, item)
+   pair. Splats take two such steps (`emit_pairs`): from splats to rows of tiles, and from rows to
+   tiles.
 2. `sort_into_tiles` sorts the (tile, item) pairs by tile, and by item inside a tile. If items are
    numbered by depth (`depth_order`), every list runs front to back.
 3. `blocks_by_length` orders tiles by falling list length. A block of consecutive tiles then has
@@ -20,7 +21,8 @@ cut off.
 
 A splat's footprint is the ellipse d^T cov2d^-1 d <= reach around its centre, outside of which alpha
 < alpha_min. The footprint meets a tile if it meets the rectangle spanned by the tile's pixel
-centres. With D the determinant of cov2d, the ellipse spans, dy below its centre,
+centres. Let D be the determinant of cov2d. At dy below the centre, the left and the right border of
+the ellipse are at
 
     dx = (xy / yy) dy -+ sqrt(D / yy (reach - dy^2 / yy)),     |dy| <= sqrt(reach yy).
 
@@ -47,7 +49,8 @@ _ROW = 64
 
 
 Size = Any
-"""An integer; where only counts are computed, also an array of JAX without axes."""
+"""An integer. For a grid that only counts (`count_pairs`), it may also be a JAX array without axes.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,10 +143,11 @@ class TileBlocks(NamedTuple):
 def cumsum(x: Int[Array, " n"]) -> Int[Array, " n"]:
     """Returns the inclusive running sum of int32 numbers >= 0, saturating at `SUM_LIMIT`.
 
-    Any 64 consecutive numbers must sum to less than 2^24. There are three levels: rows of 64
-    numbers are summed by a product with a triangular matrix, rows of 64 of their totals by another
-    product, and the few totals left by comparing all with all. This is faster than `jnp.cumsum` on
-    a CPU, does not wrap, and does not have logarithmically many steps to compile.
+    Any 64 consecutive numbers must sum to less than 2^24. There are three levels. Rows of 64
+    numbers are summed by a product with a triangular matrix. The totals of 64 rows each are summed
+    by another such product. The few totals that are left are summed with a mask of all pairs. This
+    is faster than `jnp.cumsum` on a CPU, does not wrap, and does not have logarithmically many
+    steps to compile.
     """
     n = x.shape[0]
     within = _sums_in_rows(_in_rows(x))
@@ -191,7 +195,7 @@ def owners(
     first: Int[Array, " n"], size: int, start: Int[Array, ""] | int = 0
 ) -> Int[Array, " size"]:
     """Returns the item that owns each of the slots start .. start + size - 1, (size,). Item i owns
-    the slots from first[i] up to, but without, first[i + 1].
+    the slots first[i] .. first[i + 1] - 1.
 
     A running sum counts the items that begin at or before a slot, and the last of these items owns
     the slot. Items without slots begin together with the next item that has any. The result is
@@ -244,9 +248,9 @@ def sort_into_tiles(
     """Sorts pairs (tile, item) into one list per tile, ascending by item. Pairs of tile
     `tile_count` ("no tile") are left out.
 
-    If the tile number and the item number fit together in a uint32, one sort of such keys is enough
-    (sorting keys with a payload costs several times as much). Otherwise the pairs are sorted by two
-    keys.
+    If a tile number and an item number fit together in a uint32, the pairs are packed into such
+    keys, and only the keys are sorted. (Keys with a payload take several times as long to sort.)
+    Otherwise the pairs are sorted by two keys.
     """
     bits = _bits_for(item_count)
     if (tile_count + 1) << bits <= 1 << 32:

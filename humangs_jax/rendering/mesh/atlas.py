@@ -2,11 +2,11 @@
 are packed into the unit square.
 
 A chart is a connected set of faces of one piece that look towards about the same side, projected
-along the mean of their normals (or along one of `SIDES` if the mean looks away from a face). Where
-a chart folds over itself, the hidden faces become separate charts. To find them, the charts are
-rasterized once with the highest face in front and once with the lowest. Charts are placed as
-bitmaps, the largest first, each at the first free place. All charts have one scale, which is
-multiplied by the density that the caller asks for.
+along the mean of their normals. If a face is too oblique to the mean, the chart is projected along
+one of `SIDES` instead. Where a chart folds over itself, the hidden faces become separate charts. To
+find them, the charts are rasterized once with the highest face in front and once with the lowest.
+Charts are placed as bitmaps, the largest first, each at the first free place. All charts have one
+scale, which is multiplied by the density that the caller asks for.
 
 Texture coordinates follow `rendering.mesh.rasterizer.sample_texture`: u to the right, v up.
 """
@@ -62,7 +62,7 @@ class Atlas:
     size: int
     """Side of the texture, texels."""
     texel: float
-    """Side of a texel on the flat chart where the density is 1, metres."""
+    """Side of a texel in the plane of a chart with density 1, metres."""
 
 
 def unwrap(
@@ -151,8 +151,9 @@ def _adjacent(faces: np.ndarray) -> np.ndarray:
 
 
 def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Returns the side of each face, (f,): the one that it faces most, unless its neighbours agree
-    on another side that it also faces.
+    """Returns the index in `SIDES` of the side that each face is given, (f,). It is the side that
+    the face looks towards most. If its neighbours agree on another side that the face also looks
+    towards, it is that side.
     """
     cosines = normals @ SIDES.T
     allowed = cosines >= np.minimum(LEAST_COSINE, cosines.max(1, keepdims=True))
@@ -186,9 +187,10 @@ def _flatten(
     sides: np.ndarray,
     density: np.ndarray,
 ) -> _Flat:
-    """Returns the charts laid into planes across their mean normals, or across a side where the
-    mean normal looks away from a face. Each chart is turned so that its box is small, and scaled by
-    its density.
+    """Returns the charts, each projected onto a plane. The plane is perpendicular to the mean of
+    the chart's normals. If the cosine between the mean and a normal is below `LEAST_COSINE`, the
+    plane is perpendicular to the chart's side instead. Each chart is turned so that its bounding
+    box is small, and scaled by its density.
     """
     count = int(charts.max()) + 1
     # a vertex is a point in each chart that it belongs to
@@ -296,8 +298,9 @@ def _rasterize(
     """Returns the face of every texel, (size, size), which is -1 where there is no face, and the
     weights of the face's corners, (size, size, 3). Row 0 is the top.
 
-    pixels: points (u, 2), texels, y up. depth: of the points; the nearest face is taken. faces:
-    indices of points, (f, 3).
+    pixels: points (u, 2), texels, y up. depth: depths of the points, (u,), or one for all. The face
+    with the smallest depth is taken. faces: indices of the points at the corners of each face, (f,
+    3).
     """
     points = np.stack(
         [pixels[:, 0] * depth, (size - pixels[:, 1]) * depth, depth * np.ones(len(pixels))], 1
@@ -312,8 +315,8 @@ def _rasterize(
 
 
 def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s 3"]]:
-    """Returns the face that every texel shows, which is -1 where there is no face, and the weights
-    of the face's corners.
+    """Returns the face that every texel shows, (s, s), and the weights of the face's corners, (s,
+    s, 3). The face is -1 where there is none.
 
     Row 0 is the top (v = 1).
     """
@@ -321,8 +324,8 @@ def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s
 
 
 def _pack(flat: _Flat, size: int) -> Atlas:
-    """Returns the atlas with each chart, as a bitmap of cells, at the first free place. All charts
-    shrink together until they fit.
+    """Returns the atlas. Each chart, the largest first, is put at the first place where its bitmap
+    of cells is free. If not all charts fit, all are made smaller.
     """
     # the boxes alone would fill the square: a start that is too large
     scale = size / np.sqrt(np.prod(_sizes(flat), 0).sum())
@@ -342,7 +345,9 @@ def _pack(flat: _Flat, size: int) -> Atlas:
 
 
 def _place(flat: _Flat, scale: float, size: int) -> np.ndarray | None:
-    """Returns the corners of the charts (charts, 2), texels. None if the charts do not fit."""
+    """Returns the lower left corner of each chart, (charts, 2), texels, y up. None if the charts do
+    not fit.
+    """
     cell = size // CELLS
     masks = _bitmaps(flat, scale, cell)
     if sum(np.count_nonzero(mask) for mask in masks) > CELLS * CELLS:
@@ -376,8 +381,8 @@ def _first_free(free: np.ndarray, mask: np.ndarray) -> tuple[int, int] | None:
 
 
 def _bitmaps(flat: _Flat, scale: float, cell: int) -> list[np.ndarray]:
-    """Returns for every chart which cells (rows, columns) the boxes of its faces touch, with half a
-    gutter around them.
+    """Returns a mask of cells, (rows, columns), for every chart. It is True where a cell touches
+    the bounding box of a face, widened by half a gutter.
     """
     corners = (flat.points * scale)[flat.faces]
     low = np.floor(corners.min(1) / cell).astype(np.int64)

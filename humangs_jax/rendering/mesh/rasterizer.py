@@ -57,7 +57,9 @@ class RasterConfig:
     small steps on the overhead of more steps.
     """
     fragments_per_step: Slice = 1 << 16
-    """Slots for pixels in a step of the inner loop. The trade-off is that of `rows_per_step`."""
+    """Slots for pixels in a step of the inner loop. As with `rows_per_step`, large and small steps
+    both cost time.
+    """
 
 
 DEFAULT_CONFIG = RasterConfig()
@@ -65,9 +67,7 @@ DEFAULT_CONFIG = RasterConfig()
 
 @pytree_dataclass
 class Fragments(Batchable):
-    """The face, the place on it and the depth that a camera sees at each pixel of a mesh's
-    image.
-    """
+    """The seen face of a mesh, the place on the face, and the depth, at each pixel of a camera."""
 
     face_ids: Int[Array, "h w"]
     """Index of the face that is seen, (h, w); -1 where there is none."""
@@ -130,8 +130,8 @@ def interpolate_attributes(
     """Returns the attributes interpolated over the seen surface, (h, w, c). They are `background`
     where there is no face.
 
-    faces: rows of `attributes` at the corners of each face, in the order of the rasterized faces.
-    They need not be the faces that were rasterized: with texture faces and texture coordinates, the
+    faces: indices into `attributes` of the corners of each face. Face i must be the face i that was
+    rasterized, but its indices may be others. With texture faces and texture coordinates, the
     result is the texture coordinate of every pixel.
     """
     if faces.shape[0] == 0:
@@ -207,9 +207,9 @@ def _rows(
 
 
 def _spans(corners: Array, row: Array, width: int) -> tuple[Array, Array]:
-    """Returns the first column of the pixel centres that may lie inside a face in one row of
-    pixels, (n,), and the number of such columns, (n,). corners: of the face, (n, 9). row: number of
-    the row.
+    """Returns the columns whose pixel centres may lie inside a face, in one row of pixels: the
+    first column, (n,), and the number of columns, (n,). corners: x, y and z of the corners of each
+    face, (n, 9). row: number of the row for each face, (n,).
     """
     y = row.astype(corners.dtype) + 0.5
     left, right = jnp.full_like(y, jnp.inf), jnp.full_like(y, -jnp.inf)
