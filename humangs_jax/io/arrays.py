@@ -51,9 +51,10 @@ def numbers(
 
     Arguments:
         file, field: for the error.
-        shape: expected sizes of the axes; None in it is any size, and None for it any shape.
+        shape: expected sizes of the axes, with None for any size. If shape is None, any shape is
+            accepted.
         some: whether there must be at least one number.
-        nulls: whether null becomes NaN; numbers then need not be finite.
+        nulls: whether null becomes NaN. Numbers that are not finite are then accepted, too.
         largest: largest magnitude that is allowed.
         dtype: type of the numbers in the array that is returned.
         error: class of the error.
@@ -250,8 +251,8 @@ class ArrayFile:
         its first bytes or its suffix say so.
 
         Arguments: wanted: says by name which arrays of an archive to read; None: all.
-        Raises: `error` if the file is damaged or larger than the limits allow; for a missing file
-        see `reading`.
+        Raises: `error` if the file is damaged or larger than the limits allow; FileNotFoundError or
+        `error` if it is missing, see `reading`.
         """
         with reading(path, "file of arrays", error):
             with open_file(path) as file:
@@ -289,8 +290,8 @@ class ArrayFile:
         )
 
     def number(self, key: str) -> float:
-        """Returns the single number in the array of a key, which may have any rank. Raises:
-        `error`.
+        """Returns the only number in the array of a key. The array may have any number of axes.
+        Raises: `error`.
         """
         return float(self.numbers(key, (1,) * self.array(key).ndim).reshape(-1)[0])
 

@@ -25,9 +25,8 @@ from humangs_jax.core.processes import undisturbed
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
-"""Seconds without a change after which a temporary file or folder counts as abandoned, where it is
-not known whether its process still runs. On a shared disk, another machine may be writing it for so
-long.
+"""A temporary file or folder counts as abandoned after so many seconds without a change, if it is
+not known whether its process still runs. On a shared disk, another machine may be writing it.
 """
 MOVE_AWAY = "move it away, or choose another folder"
 """Advice in errors about a file that has the name of an output and that humangs did not write."""
@@ -43,7 +42,7 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Writes text to a file in UTF-8. If writing fails, the path stays as it was. Bytes of file
-    names that are no UTF-8 are written unchanged.
+    names that Python could not decode (surrogateescape) are written unchanged.
 
     Raises: OSError.
     """
@@ -51,8 +50,9 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def _encoded(text: str) -> bytes:
-    """Returns the bytes that `write_text` writes. If the text has a lone surrogate that stands for
-    no byte, all its lone surrogates are escaped.
+    """Returns a text in UTF-8, as `write_text` writes it. Lone surrogates that stand for bytes
+    (surrogateescape) become these bytes. If the text has another lone surrogate, all lone
+    surrogates are written as escapes.
     """
     try:
         return text.encode("utf-8", "surrogateescape")
@@ -107,8 +107,10 @@ def _move_all(sources: Mapping[Path, Path | None], beside: Path | None = None) -
     """Renames the source of each path to the path, in order, or deletes the path if its source is
     None. If one of them fails, the paths changed before it are put back as they were.
 
-    Arguments: beside: the folder in which old files are kept until the end; None: that of each.
-    Raises: OSError, which names the path. If a path is a folder, nothing is changed before.
+    Arguments: beside: the folder in which old files are kept until the end. None: each is kept
+    where it lies.
+    Raises: OSError, which names the path. If a path is a folder, the error comes before anything is
+    changed.
     """
     for path in sources:
         if path.is_dir() and not path.is_symlink():
@@ -261,11 +263,13 @@ def check_replaceable(
 ) -> None:
     """Checks that a folder can be replaced. Call it before the work begins.
 
-    Arguments: mark: a file that all folders of this kind hold. The folder has to be empty or, with
-    `overwrite`, to hold this file; without a mark it may hold anything. inputs: what the work
-    reads, which may not lie in the folder, because it would be deleted. None is left out.
-    Raises: ValueError for one of these, and for a symbolic link, a file, the working folder or one
-    above it, a mount point, or a folder beside which nothing can be written.
+    Arguments: mark: a file that all folders of this kind hold. The folder has to be empty, or to
+    hold this file and `overwrite` to be True. Without a mark it may hold anything. inputs: paths
+    that the work reads. They may not lie in the folder, because they would be deleted. Paths of
+    None are ignored.
+    Raises: ValueError if the content of the folder or an input forbids to replace it. Also if it is
+    a symbolic link, a file, a mount point, the working folder or a folder above that, and if
+    nothing can be written in the folder above.
     """
     # the place can be replaced
     folder = Path(folder)
@@ -362,15 +366,16 @@ def add_files(
     so a kill seldom falls between two of them, and the moves of two processes do not mix. The
     folder may be a mount point or the working folder.
 
-    Arguments: paths of files are relative to `folder`. without: files that are out of date. Those
-    that are not replaced are deleted after the last move. invalid: files that must never lie beside
-    the new ones. They are deleted before the first move. last: the file that is moved last. If it
-    was not there before, it shows that all others are in place. first: the file that is moved
-    first. It shows that the others are ours. ours: says whether an existing file may be replaced
-    or deleted; None: all may be. Files of `without` that are not ours stay.
-    Raises: ValueError for a file that would be replaced, or is invalid, and is not ours, see
-    `check_ours`; OSError, which names `folder` or the file, if a file cannot be written; anything
-    that `write` raises.
+    Arguments: paths of files are relative to `folder`. without: files that are out of date. If no
+    new file replaces them, they are deleted after the last move. invalid: files that must never lie
+    beside the new ones. They are deleted before the first move. last: the file that is moved last.
+    If it was not there before, its presence shows that all others are in place. first: the file
+    that is moved first. Its presence shows that the other files are ours. ours: says whether an
+    existing file may be replaced or deleted; None: all may be. Files of `without` that are not ours
+    stay.
+    Raises: ValueError, see `check_ours`, if a file would be replaced or is in `invalid`, and is not
+    ours; OSError, which names `folder` or the file, if a file cannot be written; anything that
+    `write` raises.
     """
     folder = Path(folder)
     # in it where it exists: then on the same disk, even if others hold what is beside it
@@ -428,7 +433,8 @@ def check_ours(
 
 @contextlib.contextmanager
 def only_writer(folder: str | os.PathLike[str], *, replaced: bool = False) -> Generator[None]:
-    """Keeps other processes that call this out of a folder while this process writes to it.
+    """Keeps other processes out of a folder while this process writes to it. This works among
+    processes that call `only_writer`.
 
     The lock ends with the process, even if the process is killed. Where there are no locks
     (Windows, some network disks), nothing is checked.
@@ -514,7 +520,8 @@ def _naming(path: Path, temporary: Path) -> Generator[None]:
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Checks that a file can be made, or a folder with its parents. Call it before the work begins.
 
-    It makes a temporary file, because permissions do not tell of full, read-only and network disks.
+    The check makes a temporary file, because permissions do not show whether a disk is full or
+    read-only, or what a network disk allows.
 
     Raises: OSError, which names `path`.
     """
@@ -555,10 +562,11 @@ def _sweep(parent: Path) -> None:
 def _abandoned(path: Path, machine: str, pid: int) -> bool:
     """Says whether a temporary file or folder counts as abandoned. False if it does not exist.
 
-    That of another process on this machine is abandoned once the process has ended. All others are
-    abandoned if nothing in them has changed for `ABANDONED_SECONDS`: those of other machines, and
-    those with the id of this process, which an earlier process of a restarted container may have
-    had. On systems other than POSIX, this holds for all.
+    On POSIX systems, a file of another process on this machine is abandoned once the process has
+    ended. All other files are abandoned if nothing in them has changed for `ABANDONED_SECONDS`.
+    This holds for files of other machines, and for files with the id of this process: before a
+    container was restarted, another process may have had this id. On other systems it holds for all
+    files.
     """
     if machine == MACHINE and pid != os.getpid() and os.name == "posix":
         return path.exists() and not _runs(pid)
@@ -571,8 +579,8 @@ def _abandoned(path: Path, machine: str, pid: int) -> bool:
 
 
 def _runs(pid: int) -> bool:
-    """Says whether a process with this id runs on this machine, which must be a POSIX system: on
-    others this would end the process.
+    """Says whether a process with this id runs on this machine. Call it on POSIX systems only:
+    elsewhere it would end the process.
     """
     try:
         os.kill(pid, 0)

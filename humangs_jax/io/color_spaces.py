@@ -1,10 +1,10 @@
 """Converts colors from a file's encoding to sRGB: ICC profiles, the code points of ITU-T H.273, and
 gamma with chromaticities.
 
-A conversion has three steps: a curve from levels to light, a matrix from the primaries of the file
-to those of sRGB, and the curve of sRGB (of BT.709 for HLG). Profiles that consist of tables (of
-printers, scanners, CMYK) are left to Little CMS. In images of high dynamic range, the white of a
-sheet of paper counts as 1, and light above 0.75 is compressed below 1.
+A conversion has three steps: a curve from levels to linear light, a matrix from the primaries of
+the file to the primaries of sRGB, and the curve of sRGB (or of BT.709 for HLG). Profiles that
+consist of tables (of printers, scanners, CMYK) are left to Little CMS. In images of high dynamic
+range, the white of a sheet of paper counts as 1, and light above 0.75 is compressed below 1.
 """
 
 import contextlib
@@ -20,21 +20,22 @@ from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.io.reading import InvalidFileError
 
 Curve = Callable[[Float[np.ndarray, "*shape"]], Float[np.ndarray, "*shape"]]
-"""A function from levels in [0, 1] to light, in which white is 1."""
+"""A function from encoded levels in [0, 1] to linear light, in which white is 1."""
 
 
 class Encoding(NamedTuple):
     """The way in which a file encodes colors."""
 
     curves: tuple[Curve, ...]
-    """Curves from levels to light, one for each channel or one for all."""
+    """Curves from encoded levels to linear light, one for each channel or one for all."""
     matrix: Float[np.ndarray, "3 3"]
     """Matrix (3, 3) from light of the file's primaries to light of sRGB's."""
     bright: bool = False
     """Whether light may be far beyond white."""
     camera: bool = False
-    """Whether the file stores light as it was before the camera. Such light is encoded as cameras
-    do (BT.709), not as screens show it."""
+    """Whether the curves give the light in front of the camera (HLG), not the light of a screen.
+    Such light is then encoded as cameras do (BT.709), not by the curve of sRGB.
+    """
 
 
 # Curves
@@ -42,22 +43,26 @@ class Encoding(NamedTuple):
 
 
 def srgb_to_light(levels: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Returns light of levels by the curve of sRGB, IEC 61966-2-1."""
+    """Returns the linear light that sRGB levels encode (IEC 61966-2-1). White is 1."""
     return np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
 
 
 def light_to_srgb(light: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Returns levels of light in [0, 1], the inverse of `srgb_to_light`."""
+    """Returns the sRGB levels, in [0, 1], of linear light in [0, 1]. Inverse of `srgb_to_light`."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
 def light_to_bt709(light: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Returns levels of light in [0, 1] as cameras encode it, ITU-R BT.709."""
+    """Returns the levels, in [0, 1], by which cameras encode linear light in [0, 1] (ITU-R
+    BT.709).
+    """
     return np.where(light < 0.018, 4.5 * light, 1.099 * light**0.45 - 0.099)
 
 
 def _pq_to_light(levels: np.ndarray) -> np.ndarray:
-    """Returns light of levels by the curve PQ, SMPTE ST 2084. White paper is 1."""
+    """Returns the linear light that levels encode by the curve PQ (SMPTE ST 2084). White paper is
+    1.
+    """
     root = levels ** (1 / 78.84375)
     nits = 10_000 * (np.maximum(root - 0.8359375, 0) / (18.8515625 - 18.6875 * root)) ** (
         1 / 0.1593017578125
@@ -66,8 +71,8 @@ def _pq_to_light(levels: np.ndarray) -> np.ndarray:
 
 
 def _hlg_to_light(levels: np.ndarray) -> np.ndarray:
-    """Returns the light in front of the camera for levels of the curve HLG, ARIB STD-B67. White
-    paper is 1.
+    """Returns the light in front of the camera that levels encode by the curve HLG (ARIB STD-B67).
+    White paper is 1.
     """
     a, b, c = 0.17883277, 0.28466892, 0.55991073
     light = np.where(levels <= 0.5, levels**2 / 3, (np.exp((levels - c) / a) + b) / 12)
@@ -79,8 +84,8 @@ def _power(exponent: float) -> Curve:
 
 
 def _compressed(light: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Returns light whose largest channel is compressed below 1; up to 0.75 light is unchanged. All
-    three channels are scaled alike, so the hue stays.
+    """Returns light whose largest channel is compressed below 1. If the largest channel is at most
+    0.75, the light is unchanged. All three channels are scaled alike, so the hue stays.
     """
     knee = 0.75  # light up to here stays
     largest = np.maximum(light.max(axis=-1, keepdims=True), 1e-6)
@@ -121,7 +126,7 @@ PQ = 16
 HLG = 18
 """Number of the transfer function HLG in H.273."""
 UNSPECIFIED = 2
-"""Code point of H.273, for primaries as for curves, of a file that leaves them open."""
+"""Code point of H.273 by which a file leaves its primaries or its curve open."""
 
 
 def _xyz(xy: tuple[float, float]) -> np.ndarray:
@@ -158,9 +163,9 @@ def of_code_points(primaries: int, transfer: int) -> Encoding | None:
 def of_gamma(gamma: float | None, chromaticities: tuple[float, ...] | None) -> Encoding | None:
     """Returns the encoding that PNG's gAMA and cHRM describe. None if it is sRGB's.
 
-    A number that cannot be used, and chromaticities of no real colors, are read as sRGB's; the
-    other one of the two still counts. chromaticities: x and y of white, red, green and blue, in
-    this order.
+    A gamma that cannot be used is read as sRGB's curve, and chromaticities that are no real colors
+    as sRGB's primaries. Each is judged without the other. chromaticities: x and y of white, red,
+    green and blue, in this order.
     """
     curve, matrix = srgb_to_light, np.eye(3)
     # PNG files say 1 / 2.2 of sRGB; what programs write of videos (1 / 1.96) is shown as sRGB, too
@@ -192,7 +197,7 @@ def is_srgb(encoding: Encoding) -> bool:
 
 
 def in_srgb(levels: Float[np.ndarray, "n 3"], encoding: Encoding) -> Float[np.ndarray, "n 3"]:
-    """Returns the colors in sRGB of a file's levels, (n, 3), both in [0, 1]."""
+    """Converts a file's levels to sRGB. levels and result: (n, 3), in [0, 1]."""
     curves = encoding.curves * (3 // len(encoding.curves))
     light = np.stack([curve(levels[:, i]) for i, curve in enumerate(curves)], axis=-1)
     return _encode(encoding)(_light_in_srgb(light, encoding))
@@ -214,8 +219,8 @@ def _encode(encoding: Encoding) -> Curve:
 def pixels_in_srgb(
     levels: UInt[np.ndarray, "h w c"], most: int, encoding: Encoding
 ) -> Float[np.ndarray, "h w 3"]:
-    """Returns the colors in sRGB, (h, w, 3), in [0, 1], of whole levels from 0 to `most` with one
-    channel (grey) or three.
+    """Returns an image's colors in sRGB, (h, w, 3), in [0, 1]. levels: integers from 0 to `most`,
+    with one channel (grey) or three.
     """
     height, width, channels = levels.shape
     curves = encoding.curves * (3 // len(encoding.curves))
@@ -265,7 +270,8 @@ class Profile(NamedTuple):
 def read_profile(data: bytes) -> Profile:
     """Returns the ICC profile in some bytes.
 
-    Raises: InvalidFileError if the profile is damaged, or is not one of a photo.
+    Raises: InvalidFileError if the profile is damaged, or does not describe a photo in RGB, grey or
+    CMYK.
     """
     # the header: size (profiles of presses have up to 3 MB), signature, kind of device and colors
     most = 4 << 20

@@ -18,9 +18,9 @@ others as float32.
 
 
 class Decoded:
-    """Keeps pixels by the content of their files, so that a copy of a photo counts as the same
-    photo. Photos are read in turn, again and again. So the first photos stay, and photos that no
-    longer fit are not kept.
+    """Keeps the pixels of photos, by the content of their files. A copy of a photo thus counts as
+    the same photo. When there is no more room, further photos are not kept. The first ones stay,
+    because photos are read in turn, again and again.
 
     Arguments: most: limit of memory, bytes.
     """
@@ -58,8 +58,8 @@ _current: contextvars.ContextVar[Decoded | None] = contextvars.ContextVar("decod
 @contextlib.contextmanager
 def decoded_once(most: int = 256 << 20) -> Generator[None]:
     """Lets `io.images` decode each photo only once within the block. Pixels are kept as long as
-    they fit into `most` bytes, by default those of twenty photos of four megapixels. At the end of
-    the block all are dropped.
+    they fit into `most` bytes. By default that is enough for twenty photos of four megapixels. At
+    the end of the block all pixels are dropped.
     """
     token = _current.set(Decoded(most))
     try:
@@ -81,7 +81,7 @@ def kept_photos() -> Decoded | None:
 
 
 def content_key(data: bytes, as_stored: bool = False) -> bytes:
-    """Returns the key of the pixels of a file. data: bytes of the file. as_stored: whether the
-    pixels are not converted to sRGB.
+    """Returns the key under which the pixels of a file are kept. data: bytes of the file.
+    as_stored: whether the pixels are left as stored, not converted to sRGB.
     """
     return hashlib.blake2b(data, salt=bytes([as_stored])).digest()

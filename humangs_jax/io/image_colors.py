@@ -30,9 +30,9 @@ logger = logging.getLogger(__name__)
 def colors_in_srgb(
     path: str | Path, image: Any, data: bytes, levels: UInt[np.ndarray, "h w c"], most: int
 ) -> Float[np.ndarray, "h w 3"] | None:
-    """Returns the colors of a photo in sRGB, (h, w, 3), in [0, 1]. None if the levels are to be
-    taken as sRGB: the file says so or says nothing, or its color profile cannot be used, which is
-    logged.
+    """Returns the colors of a photo in sRGB, (h, w, 3), in [0, 1]. Returns None if the levels are
+    to be taken as sRGB. That is so if the file says so or says nothing, or if its color profile
+    cannot be used. A profile that cannot be used is logged.
 
     path: for the warning. image: the PIL.Image. data: bytes of the file. levels: the photo's
     levels, (h, w, c), from 0 to `most`.
@@ -60,8 +60,8 @@ def colors_in_srgb(
 
 
 def _encoding_in_header(image: Any, data: bytes) -> Encoding | None:
-    """Returns the color encoding that numbers in a photo's header state. None if the ICC profile
-    decides, if there is one; without a profile, None stands for sRGB.
+    """Returns the color encoding that numbers in a photo's header state. If the result is None, the
+    ICC profile decides. Without a profile, None stands for sRGB.
 
     In a PNG, a cICP chunk decides first, then an ICC profile, then an sRGB chunk, then gAMA and
     cHRM. A cICP chunk with a code point for "unspecified" decides only if its other code point
@@ -98,7 +98,7 @@ def _by_tables(
     """Returns colors converted by Little CMS, (h, w, 3), in [0, 1]. None if the profile calls
     itself sRGB.
 
-    Little CMS gets 8 bits of a channel here. If the file has 16 bits, the lower ones are added
+    Little CMS converts 8 bits of each channel. If the file has 16 bits, the lower 8 bits are added
     unchanged. Raises: InvalidFileError for a grey photo, or if the profile cannot be used.
     """
     from PIL import Image

@@ -30,8 +30,8 @@ SCAN = 0xDA
 WITH_LENGTH = frozenset(
     (*range(0xC0, 0xC8), *range(0xC9, 0xD0), SCAN, 0xDB, 0xDC, 0xDD, *range(0xE0, 0xF0), 0xFE)
 )
-"""Markers that are followed by two bytes of length, as libjpeg reads them. No length follows the
-others, or libjpeg ends there.
+"""Markers that are followed by two bytes of length, as libjpeg reads them. After other markers no
+length follows, or libjpeg stops reading.
 """
 
 
@@ -143,8 +143,9 @@ def check_png_chunks(data: bytes) -> None:
 
 
 def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] | None:
-    """Returns the width and height that EXIF's tags state, if a photo of `size`, (width, height),
-    was cut out of such a frame. Else returns None.
+    """Returns the width and height that EXIF's tags state, if they show that the photo was cut out
+    of a frame of that size. Otherwise returns None. tags: EXIF's tags. size: (width, height) of the
+    photo.
     """
     # EXIF's width and height of the photo as it was taken
     width, height = tags.get(0xA002), tags.get(0xA003)
@@ -161,8 +162,8 @@ def other_frame(tags: dict[int, Any], size: tuple[int, int]) -> tuple[int, int] 
 
 
 def _same_shape(size: tuple[int, int], frame: tuple[int, int]) -> bool:
-    """Says whether two sizes have the same ratio of sides, within one pixel and a hundredth for
-    rounding.
+    """Says whether two sizes have the same ratio of sides. Because of rounding, each side may be
+    off by one pixel plus a hundredth of the side.
     """
     scale = np.hypot(*size) / np.hypot(*frame)
     off = np.abs(scale * np.asarray(frame) - size)

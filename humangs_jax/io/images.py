@@ -69,13 +69,14 @@ EXIF_MARKS = (
     b"adobe.com/xap",
     b"com.adobe.xmp",
 )
-"""Byte strings, at least one of which is in every file with EXIF. Without them no tags are read,
-because that would decode a PNG. An AVIF file may be turned without EXIF.
+"""Byte strings, at least one of which is in every file with EXIF. In files without them, tags are
+not looked for, because Pillow would decode a whole PNG to find them. "ftypavi" is among them
+because an AVIF file may be turned without EXIF.
 """
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOR_TYPES = {2: "RGB", 4: "LA", 6: "RGBA"}
-"""Color types of PNG files that Pillow silently cuts from 16 to 8 bits. It reads grey alone (type
-0) in full.
+"""Color types of PNG files, with Pillow's names. If such a file has 16 bits, Pillow silently keeps
+the upper 8 bits. Pillow keeps all bits of type 0 (grey).
 """
 MARK_KEY = "Software"
 DRAWN = "humangs_jax"
@@ -111,14 +112,18 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     """Returns a mask, coverage in [0, 1], (h, w), from a grey image or from another image that
     segmentation tools write.
 
-    In an image with a palette or colors, the mask is 1 where the image has the one label (of a
-    palette) or the one color that is not the background. The background is black, and label 0 if
-    that label is used. A palette of several greys is read like a grey image. An alpha channel is
-    the mask if the colors are those of a photo, all alike, or the same mask.
+    In an image with a palette, the mask is 1 where the image has the only label besides the
+    background. If label 0 is used, it is the background, and has to be black. Otherwise the only
+    black label is the background. A palette of several greys is read like a grey image.
 
-    Raises: as `read_image`; FileError if it is not clear which part is the person: for several
-    labels or colors, a label 0 that is not black, no black, or an alpha channel and greys that
-    differ.
+    In an image with colors, the mask is 1 where the image has the only color besides black.
+
+    The alpha channel is the mask if the colors are a photo's, or are all alike, or are the same
+    mask.
+
+    Raises: as `read_image`; FileError if it is not clear which part is the person. This is so if
+    there are several labels or colors, if label 0 is not black, if nothing is black, or if the
+    alpha channel and the greys differ.
     """
     # labels of a palette without transparency
     with open_image(path) as (image, data):
@@ -200,8 +205,8 @@ def _mask_of_alpha(colors: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def orientation(path: str | Path) -> int:
-    """Returns the EXIF orientation of a photo, from 1 to 8, see `oriented`. 1 is shown as stored; a
-    photo without a flag has 1, too.
+    """Returns the EXIF orientation of a photo, from 1 to 8, see `oriented`. 1 means that the photo
+    is shown as stored. A photo without a flag has 1, too.
 
     Raises: as `open_image`.
     """
@@ -329,8 +334,8 @@ def is_own_picture(path: str | Path) -> bool:
 
 
 def is_own_output(path: str | Path) -> bool:
-    """Says whether a new output may replace a file. True for an own picture, for a file with
-    another suffix than .png, and for one that cannot be read as an image.
+    """Says whether a new output may replace a file. True if the file shows results
+    (`is_own_picture`), if its suffix is not .png, and if it cannot be read as an image.
     """
     if Path(path).suffix.lower() != ".png" or is_own_picture(path):
         return True

@@ -374,9 +374,9 @@ def _names_in(text: str) -> list[str]:
     """Returns the file names that the name of a material or texture may stand for, the likeliest
     first.
 
-    The first is the name unchanged, with its spaces. The next ones are without quotes and options
-    of textures, and without Windows separators. The last is the first of several materials in one
-    line.
+    The first is the name unchanged, with its spaces. The second is the name without the options of
+    textures and without quotes. In the third, slashes replace the backslashes of Windows. The last
+    is the first of several .mtl files in one line.
     """
     # before the name of a texture stand options, as `-s 1 1 1` or `-clamp on`
     options = r"^(?:-\w+(?:\s+(?:on|off|[lrgbmz]|[-+.\deE]+))+\s+)+"

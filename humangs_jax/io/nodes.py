@@ -13,16 +13,16 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.io.reading import InvalidFileError, shown
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
-"""What a track of an animation can move -> number of values at each of its times."""
+"""Number of values at each time, by what a track of an animation moves."""
 
 
 Nodes = list[dict[str, Any]]
 Track = tuple[Float[np.ndarray, " keys"], Float[np.ndarray, "keys c"], bool]
-"""Times in ascending order, values, and whether a value stays until the next time instead of being
-interpolated.
+"""Times in ascending order, (keys,), seconds; values at these times, (keys, c); and whether a value
+holds until the next time, instead of being interpolated.
 """
 Tracks = dict[tuple[int, str], Track]
-"""Tracks by number of the node and path, which is a key of `PATHS`."""
+"""Tracks by (number of the node, path). The path is a key of `PATHS`."""
 
 
 def node_parents(nodes: Nodes) -> list[int]:
@@ -114,8 +114,8 @@ def _local(
 
 
 def _sampled(track: Track, times: Float[np.ndarray, " m"], path: str) -> Float[np.ndarray, "m c"]:
-    """Returns the values of a track at some times, (m, c). Times outside of the track's get its
-    first or last value. path: what the track moves.
+    """Returns the values of a track at some times, (m, c). Before the first and after the last time
+    of the track, its first and last value hold. path: what the track moves.
     """
     keys, values, stepped = track
     if stepped or len(keys) == 1:

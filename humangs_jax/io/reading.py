@@ -61,7 +61,8 @@ class Limits:
     Gaussians, or bytes of an EXR file that is written.
     """
     plain_bytes: int = 256 << 20
-    """Bytes to which a file of any size may unpack, and bytes of a sparse matrix made dense."""
+    """Bytes to which a file of any size may unpack. Also bytes of a sparse matrix as a full array.
+    """
     ratio: int = 100
     """Largest unpacked size relative to the size of the file. It applies to unpacked sizes beyond
     `plain_bytes`.
@@ -105,9 +106,11 @@ class Limits:
     frames_per_photo: int = 100
     """Frames of a capture without poses, divided by its photos."""
     people: int = 100_000
-    """People in keypoint files together with their images, or people in a motion file."""
+    """People and images in keypoint files, counted together, or people in a motion file."""
     parts: int = 2000
-    """Materials of an OBJ, and its textures with them, or parts of a GLB file's meshes."""
+    """Materials of an OBJ file, files of materials and textures that it names, or parts of the
+    meshes in a GLB file.
+    """
     entries: int = 1_000_000
     """Files and folders in a folder that is searched for photos or keypoints."""
 
@@ -158,8 +161,8 @@ def _limits_of_text(text: str) -> Limits:
 
 
 class _Shown(reprlib.Repr):
-    """Shows values as `repr` does, but shortened, so that values that hold many others or
-    themselves can be shown, too.
+    """Shows values as `repr` does, but shortened. So it can also show values that hold many other
+    values, or themselves.
     """
 
     def __init__(self) -> None:
@@ -178,8 +181,8 @@ class _Shown(reprlib.Repr):
         return f"an integer of {x.bit_length():,} bits"
 
     def repr_instance(self, x: object, level: int) -> str:
-        """Shows texts as `repr` does, also those of subclasses, None and numbers, also numpy's, as
-        `str` does, and any other object by the name of its type.
+        """Shows texts as `repr` does, also texts of subclasses. Shows None and numbers as `str`
+        does, also numpy's numbers. Shows any other object by the name of its type.
         """
         if isinstance(x, str):
             return self.repr_str(str(x), level)
@@ -188,7 +191,9 @@ class _Shown(reprlib.Repr):
         return f"a {type(x).__name__}"
 
     def repr_bool(self, x: object, level: int) -> str:
-        """Shows booleans, also numpy's, whose type has the same name."""
+        """Shows booleans as `str` does. `reprlib` also calls this for numpy's booleans, because
+        their type has the same name.
+        """
         return str(x)
 
 
@@ -281,9 +286,11 @@ def _why(kind: str, error: Exception) -> str:
 
 
 def check_limit(name: str, amount: float | int, unit: str) -> None:
-    """Checks an amount against a limit.
+    """Checks an amount against a limit. name: field of `Limits`. unit: what is counted, for the
+    error.
 
-    Raises: InvalidFileError if the amount is larger. It names the limit and says how to raise it.
+    Raises: InvalidFileError if the amount is larger. The error names the limit and says how to
+    raise it.
     """
     most = getattr(limits(), name)
     if amount > most:

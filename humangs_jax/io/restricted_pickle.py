@@ -74,8 +74,9 @@ class _Looked:
         return self.file.readline()
 
     def array_bytes(self, count: int) -> bytes:
-        """Returns the next `count` bytes of the file as the bytes of an array, which lie between
-        two instructions. Raises: InvalidFileError within a frame.
+        """Returns the next `count` bytes of the file, which are bytes of an array between two
+        instructions. Raises: InvalidFileError if they lie in a frame, which the unpickler reads as
+        a whole.
         """
         if self.file.tell() != self.seen:
             raise InvalidFileError("the bytes of an array within a frame of instructions")
@@ -193,7 +194,7 @@ class Named(NamedTuple):
 class StandIn:
     """An object of a pickle whose class is not loaded. `state` holds its state as a dict.
 
-    A pickle cannot change the class itself, because BUILD calls `__setstate__`, which needs an
+    A pickle cannot change this class: BUILD sets state only through `__setstate__`, which needs an
     object.
     """
 
@@ -209,7 +210,9 @@ class StandIn:
         return made
 
     def __setstate__(self, state: Any) -> None:
-        """Updates `state` by what BUILD hands over: a dict, or a tuple whose dicts are taken."""
+        """Updates `state` with what BUILD passes: a dict, or a tuple, of which only the dicts are
+        used.
+        """
         parts = state if isinstance(state, tuple) else (state,)
         for part in parts:
             if isinstance(part, dict):
@@ -217,12 +220,14 @@ class StandIn:
 
 
 class PlainDict(dict):
-    """A dict that stands for a dict of a class that is not loaded. It ignores attributes."""
+    """A dict that stands for an object of a subclass of dict, such as OrderedDict, because that
+    class is not loaded. Attributes that the pickle sets are ignored.
+    """
 
     __slots__ = ()
 
     def __setstate__(self, state: Any) -> None:
-        """Ignores the attributes of the dict."""
+        """Ignores attributes that the pickle sets on the dict."""
 
 
 class RestrictedUnpickler(pickle.Unpickler):
@@ -397,14 +402,15 @@ def _numbers(value: Any) -> np.ndarray:
 
 
 class _Sparse(StandIn):
-    """A sparse matrix. Its entries are given by coordinates, or are compressed along `axis`, which
-    then has index pointers that count the entries.
+    """A sparse matrix. If `axis` is None, each entry has a row and a column. If `axis` is 0 or 1,
+    the matrix is compressed along its rows or its columns: index pointers count the entries in each
+    of them.
     """
 
     axis: int | None = None
 
     def _places(self, count: int) -> list[np.ndarray]:
-        """Returns the row and the column of each entry."""
+        """Returns the row and the column of each entry, (count,) each. count: number of entries."""
         if self.axis is None:
             return [
                 _numbers(x)
@@ -538,7 +544,7 @@ def objects(value: Any) -> Any:
 def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
     """Returns an array in the machine's byte order, made from bytes of a file.
 
-    The bytes may hold what numpy itself never writes: any byte of a boolean other than 0 becomes
+    A byte of a boolean may have a value that numpy never writes. Any value other than 0 becomes
     True.
 
     Raises: InvalidFileError for strings with characters that do not exist.

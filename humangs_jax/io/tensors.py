@@ -169,8 +169,8 @@ def _ordered_dict(*arguments: Any) -> PlainDict:
 def _storage_of_bytes(data: bytes) -> _Storage:
     """Returns the storage of a tensor in a plain pickle, which is a separate stream of bytes.
 
-    The stream consists of a magic number, pickles (of a version, the machine, the storage and a
-    list of its name), the count of its numbers, and the numbers.
+    The stream consists of five pickles, the count of the numbers, and the numbers. The pickles hold
+    a magic number, a version, a description of the machine, the storage, and a list with its name.
 
     Raises: InvalidFileError.
     """
@@ -394,8 +394,8 @@ def read_safetensors(
 
 
 def read_values(path: str | os.PathLike[str]) -> Any:
-    """Returns the content of a pickle, of a file of joblib or `torch.save`, or of an npy of an
-    object. It consists of dicts, lists and values that `as_array` takes.
+    """Returns the content of a pickle, of a file of joblib or `torch.save`, or of an npy file that
+    holds a Python object. The content consists of dicts, lists and values that `as_array` takes.
 
     Nothing in the file is run. Raises: FileNotFoundError; FileError as `read_pickle`.
     """
