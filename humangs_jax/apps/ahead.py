@@ -1,8 +1,8 @@
 """Lists what `humangs start` will call. From these calls, threads compile programs while photos are
 read, people are found and bodies are fitted (`core.processes.Ahead`).
 
-A program depends on shapes, not on values. So photos whose body is not known yet get one in the
-usual pose. A wrong guess only costs time.
+A program depends on shapes, not on values. So a program can be compiled before the body is known:
+the photos then get a body in the usual pose. A wrong guess only costs time.
 """
 
 import dataclasses
@@ -37,8 +37,8 @@ shipped_weights = functools.cache(load_weights)
 
 
 def calls_of_found_people(photos: int) -> Iterator[Call]:
-    """Yields the calls of the fit to keypoints that the detector will find in this number of
-    photos. Assumes photos of one moment, and that hands are found.
+    """Yields the calls of the fit to the keypoints that the detector finds in photos. Assumes that
+    all photos are of one moment, and that hands are found. photos: number of photos.
     """
     yield from calls_of_fit(load_body(), MEDIAPIPE_69, photos)
 

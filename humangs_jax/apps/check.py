@@ -3,9 +3,9 @@ numbers that show what is wrong.
 
 Blue is the person's left side, red is the right side, and the green line is the boundary of the
 body. Photo and body should coincide. A yellow line is the boundary of the displaced body that
-`reconstruct` uses. The displacement is the capture's, or else the one to the masks that
-`reconstruct` finds, with a skirt if the masks show one. `apps.quick_check` names what is wrong with
-a view.
+`reconstruct` uses. If the capture has no displacement, `reconstruct` finds one that moves the body
+to the masks. It adds a skirt if the masks show one. `apps.quick_check` names what is wrong with a
+view.
 
 On the sheet of a fit a disc is a keypoint: blue for the person's left, red for the right, white for
 the middle. A ring is an outlier. A line leads from the keypoint to a cross, which is the landmark
@@ -56,8 +56,8 @@ _LONGEST_SIDE = 512
 
 @dataclasses.dataclass(frozen=True)
 class _Tints:
-    """Colors and opacity of the body on the sheet. Colors are red, green and blue in [0, 1], but
-    for `cross`.
+    """Colors and opacity of the body on the sheet. Colors are red, green and blue in [0, 1], except
+    `cross`, which is in 0 to 255.
     """
 
     left: tuple[float, float, float] = (0.15, 0.45, 1.0)
@@ -125,7 +125,7 @@ class CheckReport:
     moved.
     """
     registered: bool = False
-    """Whether the displacement is that of the capture itself. Else `reconstruct` finds it from the
+    """Whether the displacement comes with the capture. If not, `reconstruct` finds it from the
     masks.
     """
     skirt: bool = False
@@ -179,9 +179,9 @@ def check_capture(
     """Draws the posed body over every photo, writes the sheet as a PNG, and reports how well they
     agree.
 
-    Arguments: capture: a plain capture is prepared for the network that comes with the package. One
-    that is already prepared for a network stays as it is. keypoints: keypoints of the views, if
-    they are known. They show whether cameras are wrong, which changes the advice in warnings.
+    Arguments: capture: a plain capture is prepared for the network that comes with the package. A
+    prepared capture stays as it is. keypoints: keypoints of the views, if they are known. They show
+    whether cameras are wrong, which changes the advice in warnings.
     Raises: OSError if the sheet cannot be written.
     """
     if isinstance(capture, PreparedCapture):
@@ -277,9 +277,10 @@ def _prepared(capture: Capture) -> PreparedCapture | None:
 
 
 def _shown(whole: Capture, small: Capture, vertices: dict[int, Float[Array, "n 3"]]) -> Capture:
-    """Returns the capture that the sheet shows: photos cut to the person, at most 512 pixels a
-    side, or `small` where the cut photos would be nearly the whole ones. vertices: of the posed
-    body, by frame.
+    """Returns the capture that the sheet shows. Its photos are cut to the person, and have at most
+    512 pixels a side. If no photo shows the person, or if the cut photos would be nearly as large
+    as the whole ones, the result is `small`. whole, small: the capture with its photos, and with
+    reduced photos. vertices: of the posed body, by frame, (n, 3), metres.
     """
     close, _ = around_person(whole, vertices)
     if close is whole:

@@ -77,8 +77,8 @@ def run_demo(
 
     Files are inputs.png, novel_views.png (truth, feed-forward, error), novel_views.exr,
     animation.mp4 and .gif, avatar.npz, avatar.ply, avatar.html (see docs/viewer.md) and
-    report.json. With `refine` there is also refined.png (truth, feed-forward, refined), and
-    animation and avatar files are those of the refined avatar.
+    report.json. With `refine` there is also refined.png (truth, feed-forward, refined), and the
+    animation and the files of the avatar are made from the refined avatar.
 
     Arguments:
         weights: file of the network's weights; None: the shipped ones.
@@ -101,8 +101,8 @@ def run_demo(
 
 
 def _check_place(out: Path) -> None:
-    """Checks that a folder is one of an earlier demonstration, or has no file with the name of one
-    that will be written.
+    """Checks that the demonstration can write into a folder. The folder must be from an earlier
+    demonstration, or have none of the files that will be written.
 
     Raises: ValueError, see `io.atomic.check_ours`.
     """
@@ -249,8 +249,8 @@ def _scores(images: np.ndarray, truth: Capture) -> dict[str, Any]:
 
 def _timed(timings: dict, name: str, run: Callable[[], Any], twice: bool = False) -> Any:
     """Runs a stage, records its time in `timings`, seconds, and returns the result. twice: whether
-    the stage runs a second time. Then the second time is recorded as "run", and what the first run
-    took longer as "compile".
+    the stage runs a second time. Then the time of the second run is recorded as "run", and the time
+    by which the first run was longer as "compile".
     """
     start = time.perf_counter()
     compiling = stage(COMPILING) if twice else contextlib.nullcontext()

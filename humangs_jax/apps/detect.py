@@ -100,8 +100,8 @@ class _Sheet:
     )
     """Colors of the people on the sheet, by number."""
     faint: float = 0.45
-    """Opacity of the color over a person's pixels, 0 to 1. Where somebody is chosen, the others
-    have half of it.
+    """Opacity of the color over a person's pixels, 0 to 1. If a person is chosen, all other people
+    have half of this opacity.
     """
 
 
@@ -133,8 +133,8 @@ def found_in_photos(folder: Path) -> list[PhotoPeople]:
 
 
 def left_out(folder: Path) -> str | None:
-    """Returns one line that names what `found_in_photos` does not use of a folder. None where it
-    uses all, and for a capture folder.
+    """Returns one line that names the files of a folder that `found_in_photos` does not use.
+    Returns None if it uses all files, and for a capture folder.
 
     Raises: CaptureError if the folder has no photos.
     """
@@ -228,9 +228,12 @@ def with_masked(
     masks: Sequence[Float[np.ndarray, "_h _w"]],
     on_white: Sequence[Float[np.ndarray, "_h _w 3"]],
 ) -> list[PhotoPeople]:
-    """Returns the photos, with the person of each given mask among the people of its photo if the
-    detector finds this person. Where nobody found matches the mask, the detector looks again at the
-    photo cut to the mask, and the person found there is added.
+    """Returns the photos. The person of each given mask is among the people of its photo, if the
+    detector finds this person.
+
+    Where nobody found in a photo matches the mask, the detector looks again at the photo cut to the
+    mask. If a person found there has at least half of the mask's area, the person is added to the
+    photo. People whose masks lie mostly on this person's mask are then removed.
 
     Arguments: masks: one per photo, (h, w), 0 to 1. on_white: the photos cut to their masks, white
     elsewhere.
@@ -258,8 +261,8 @@ def with_masked(
 
 
 def _overlap(found: PersonInPhoto | None, mask: Float[np.ndarray, "h w"]) -> float:
-    """Returns the intersection over union, 0 to 1, of a person's mask and a mask of the whole
-    photo.
+    """Returns the intersection over union, 0 to 1, of a found person's mask and a given mask, which
+    is as large as the photo. Returns 0 for None.
     """
     if found is None:
         return 0.0
@@ -292,8 +295,9 @@ def person_in_capture(
     person: int | None = None,
 ) -> tuple[list[PhotoPeople], int]:
     """Finds the people in the photos of a capture folder, and returns them with the number of the
-    intended person. Keypoints decide who is intended, if there are any; else the number that was
-    asked for, else masks, else size.
+    intended person. Keypoints decide who is intended. Without keypoints, `person` decides, which is
+    the number that was asked for. Without a number, the masks decide. Without masks, the only large
+    person is intended.
 
     Raises: see `found_in_photos`, `choose` and `person_of`. Also ValueError for a photo whose
     keypoints belong to nobody found in it.
@@ -327,7 +331,7 @@ def person_of(
 ) -> tuple[list[PhotoPeople], int]:
     """Finds the person that the given keypoints or masks show. Returns the photos, in which this
     person has the same number everywhere, and the number. Where a photo's keypoints or masks
-    contradict the match between photos, they decide.
+    contradict the match between photos, the keypoints or masks decide.
 
     Arguments: sheet: where to write the sheet of people if this is refused.
     Raises: ValueError if the keypoints or masks belong to nobody found, or if a photo has none and
@@ -369,9 +373,9 @@ def _has_any(given: Keypoints | Masks, view: int) -> bool:
 
 
 def _agreement(found: PersonInPhoto | None, given: Keypoints | Masks, view: int) -> float:
-    """Returns how well a found person agrees with the keypoints or the mask of a view. It is the
-    sum of the person's mask at the seen keypoints, or of its product with the given mask. 0 for
-    None.
+    """Returns how well a found person agrees with the keypoints or the mask of a view. For
+    keypoints, it is the sum of the values of the person's mask at the seen keypoints. For a mask,
+    it is the sum of the products of the two masks. It is 0 if `found` is None.
     """
     if found is None:
         return 0.0
@@ -475,14 +479,13 @@ def _found(
 
 
 def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> int:
-    """Returns the number of the intended person. It is the number that was asked for, or that of
-    the only large person.
+    """Returns the number of the intended person: `person` if a number was asked for, else the
+    number of the only large person.
 
     Arguments: person: the number that was asked for; None: none was. sheet: where the numbers can
     be looked up. It is written if the choice fails.
-    Raises: ValueError if no photo has a person, if none has this number, if photos show several
-    large people and none was asked for,
-    or if it is unclear who is who.
+    Raises: ValueError if no photo has a person, if nobody has this number, if photos show several
+    large people and no number was asked for, or if it is unclear who is who.
     """
     try:
         return _chosen(photos, person, sheet)
@@ -625,8 +628,8 @@ def write_found(
             changed to name the masks, and unknown/ gets the places where others may hide the
             person.
         overwrite: whether files that were not written by this function may be replaced, too.
-    Raises: ValueError if the names of two photos differ in the suffix only, or if a file of others
-    is in the way, see `check_found_place`.
+    Raises: ValueError if the names of two photos differ in the suffix only, or if a file that we
+    did not write is in the way, see `check_found_place`.
     """
     # photos that differ in their suffix only would share a mask
     files = [_mask_name(photo.name) for photo in photos]

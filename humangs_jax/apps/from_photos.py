@@ -152,10 +152,10 @@ def avatar_from_photos(
         person: number of the person, if several people are in the photos. It is the number in the
             file of keypoints, or on people.png if there is no such file.
         height: height of the person, metres. It gives the scale if there is no calibration. None:
-            that of an average person.
+            the height of an average person.
         scale: metres per unit of the calibration. None: 1.
-        up: axis of the calibration's world that points up, such as "+z". None: that of the
-            calibration's format.
+        up: axis of the calibration's world that points up, such as "+z". None: the axis that the
+            calibration's format defines.
         without_masks: whether masks are not used, because there is only white behind the person.
         fit_masks: whether the boundaries of masks are moved to the edges in the photos.
         refinement: how the avatar is refined. None: not at all.
@@ -220,7 +220,9 @@ class FromPhotos:
     if there are any.
     """
     keypoints: Path | None = None
-    """File or folder of keypoints. None: those in the folder of photos, if there are any."""
+    """File or folder of keypoints. None: the keypoints in the folder of photos, if there are
+    any.
+    """
     person: int | None = None
     """Number of the person, if there are several. None: the only one, or the only large one."""
     height: float | None = None
@@ -228,8 +230,8 @@ class FromPhotos:
     scale: float | None = None
     """Metres per unit of the calibration. None: 1."""
     up: str | None = None
-    """The axis of the calibration's world that points up; None: that of the calibration's
-    format.
+    """The axis of the calibration's world that points up. None: the axis that the calibration's
+    format defines.
     """
     without_masks: bool = False
     """Whether masks are ignored, because there is only white behind the person."""
@@ -420,8 +422,8 @@ class FromPhotos:
         yield Step(f"{' and '.join(wanted)} found in the photos: {sheet} shows them")
 
     def _known(self, material: PhotoFolder, *, masks_by_detector: bool) -> Known:
-        """Returns what the fit needs to know. Keypoints are those of the detector if the folder has
-        none.
+        """Returns what the fit needs to know. If the folder has no keypoints, the keypoints are
+        those that the detector has written.
         """
         return Known(
             folder=material.folder,
@@ -546,9 +548,9 @@ class FromPhotos:
     def _with_own_poses(
         self, photos: Path, bodies: list[RefinedCapture], record: FitRecord
     ) -> Generator[Step, None, tuple[list[RefinedCapture], FitRecord]]:
-        """Fits a pose for each photo if all photos share one pose and show that the person moved
-        between them. Returns the new bodies and the record of the fit that belongs to them, or else
-        the given bodies and record.
+        """Fits a pose to each photo, if all photos share one pose but show that the person moved
+        between them. Returns the new bodies and the record of their fit. If no poses are fitted, it
+        returns `bodies` and `record`.
 
         Arguments: photos: folder from which the photos were imported, for their times. bodies: for
         loose and tight clothes.

@@ -193,8 +193,8 @@ def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choic
 
 
 def _cropped(files: list[Path]) -> tuple[str, ...]:
-    """Returns a tuple of one line that names the photos whose EXIF describes a frame of another
-    shape. Such photos were cropped. Empty if there are no such photos.
+    """Returns one line, in a tuple, that names the photos whose EXIF describes a frame of another
+    shape. Such photos were cropped. The tuple is empty if there are no such photos.
     """
     frames = [(file, cropped_from(file)) for file in files]
     found = [(file, frame) for file, frame in frames if frame is not None]
@@ -247,7 +247,8 @@ def _written(
 ) -> PhotosImported:
     """Finds the cameras from the person, and writes the capture.
 
-    Arguments: images: folder of the photos. choice: names the masks to be imported; None: none are.
+    Arguments: images: folder of the photos. choice: has the folders of the masks to import. None:
+    no masks are imported.
     """
     photos, number, shown, seen, cropped = looked
     found = cameras_from_person(seen, height=height)

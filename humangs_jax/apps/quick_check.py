@@ -35,16 +35,16 @@ class _Limits:
     a fifth of a silhouette that the body does not. At half, the pose or the camera is wrong.
     """
     sure_iou: float = 0.6
-    """Intersection over union that a view needs once a mistake is undone, so that the mistake
-    explains it.
+    """Intersection over union that a view must have after a mistake is undone. Then the mistake
+    explains the view.
     """
     inside: float = 0.5
     """Share of the body's points in the frame below which there is a warning."""
     sure_inside: float = 0.9
     """Share of the body's points that have to be in the frame once a mistake is undone."""
     height: float = 0.05
-    """Height of the body as a share of the image's height. A smaller body has its lengths in
-    another unit.
+    """Least height of the body in the image, as a share of the image's height. The lengths of a
+    smaller body are probably in another unit than metres.
     """
     turn: float = 2 * math.pi + 0.5
     """Length of the longest rotation vector that is accepted, radians. Rotation vectors are at most
@@ -149,8 +149,8 @@ def faults(capture: Capture) -> Faults:
 
 
 class _View(NamedTuple):
-    """What is compared of one view. The arrays are NumPy's, because JAX would compile each small
-    operation.
+    """The data of one view that is checked. The arrays are NumPy's, because JAX would compile each
+    small operation.
     """
 
     name: str
@@ -260,9 +260,9 @@ def _cause(view: _View, body: Cells) -> str | None:
 
 
 def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
-    """Returns the views whose cameras seem to be exchanged. Keys are indices of views, values are
-    indices of the views whose cameras would fit them. Empty if an exchange does not explain all of
-    its views.
+    """Finds views whose cameras seem to be exchanged. Returns, for the index of each such view, the
+    index of the view whose camera would fit it. The result is empty if the exchange does not
+    explain every one of these views, or if mirrored photos would explain them as well.
     """
 
     def drawn(i, j):

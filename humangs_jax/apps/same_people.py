@@ -2,10 +2,11 @@
 
 In the simplest case each photo shows one large person, who is the same everywhere. Where several
 are large and cameras are calibrated, people of one moment are matched by how well their landmarks
-triangulate. Over time they are matched by where they are, in space, or in the photo of one camera.
-Without calibrated cameras nothing decides who of several large people is who. Colors are no proof,
-since photos may be exposed differently. Somebody who was matched to nobody may still be the person.
-Only somebody who is in a photo together with the person is surely somebody else.
+triangulate. From one moment to the next, people are matched by their place in space, or else by
+their place in the photos of one camera. Without calibrated cameras nothing decides who of several
+large people is who. Colors are no proof, since photos may be exposed differently. Somebody who was
+matched to nobody may still be the person. Only somebody who is in a photo together with the person
+is surely somebody else.
 """
 
 import dataclasses
@@ -41,12 +42,12 @@ class PersonInPhoto(NamedTuple):
     corner: tuple[int, int]
     """Row and column of the first pixel of the mask in the photo."""
     area: float
-    """Number of pixels of the person. For somebody who may be covered by others it is at least an
-    estimate for the person without cover.
+    """Number of pixels of the person. If other people may cover the person, it is at least a tenth
+    of the detector's crop. That is about the area of a person who stands free.
     """
     mirrored: bool = False
-    """Whether left and right of the landmarks were exchanged, as other views showed. The landmarks
-    here are right again.
+    """Whether the detector exchanged left and right of the landmarks, as other views showed. The
+    landmarks here are corrected.
     """
     apart: bool = False
     """Whether the landmarks do not fit those of other photos of the same moment. Then the camera is
@@ -166,12 +167,12 @@ def _matched(
 
 
 def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]:
-    """Joins people who are the only large ones of their photos into one person, even where they
-    were not matched. Returns the rows with the joined person, or the given rows where nothing is
+    """Joins people who are each the only large person of a photo into one person, even if they were
+    not matched. Returns the rows with the joined person. Returns the given rows if nobody is
     joined.
 
-    Two people that one photo shows together stay two. Nobody is joined if somebody else remains
-    large, because a person alone in a photo could then be either.
+    Two people who are in one photo together are not joined. If somebody else would still be large,
+    nobody is joined, because a person who is alone in a photo could then be either of the two.
     """
     alone = {large[0] for large in map(_large, rows) if len(large) == 1}
     if not alone:
@@ -235,8 +236,8 @@ def exchanged(found: PersonInPhoto) -> PersonInPhoto:
 
 
 def rivals(photos: Sequence[PhotoPeople]) -> list[int]:
-    """Returns the numbers of people who could be the intended person as well as number 0, by their
-    pixels in all photos together.
+    """Returns the numbers of the people, other than number 0, who could be the intended person as
+    well. Their pixels in all photos together decide.
     """
     areas = _areas(photos)
     return [i for i in range(1, len(areas)) if areas[i] > _RIVAL * areas[0]]

@@ -119,8 +119,8 @@ class Settings:
         return prepare_capture(capture, views=self.views)
 
     def shot(self, shot: FrameSettings) -> FrameSettings:
-        """Returns the settings of frames, drawn as these settings say. A `splat` that is given in
-        `shot` stays, and so does `prune`.
+        """Returns `shot` with the way of drawing of these settings. A `splat` other than
+        "as_trained" stays as it is in `shot`. `prune` is True if `shot` or these settings have it.
         """
         splat = self.splat if shot.splat == "as_trained" else shot.splat
         return dataclasses.replace(shot, splat=splat, prune=shot.prune or self.prune)
@@ -288,7 +288,8 @@ def tune(
         reconstruct_ms: longest time in which the avatar may be made, with refinement, milliseconds.
             None: no limit.
         frame_ms: longest time that a frame may take, milliseconds. None: no limit.
-        memory_mb: most memory that this may add to the process, MiB. None: no limit.
+        memory_mb: most memory that making the avatar and drawing its frames may add to the process,
+            MiB. None: no limit.
         size: side of the frames, pixels.
         progress: whether to show a progress bar.
 

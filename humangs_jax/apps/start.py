@@ -451,8 +451,8 @@ def better_body(
     photos = _photos_to_hold_out(first)
 
     def compile_refinement(avatar: Avatar, read: PreparedCapture) -> None:
-        """Queues the programs that refine any of the avatars by the photos that are read, then
-        those for all photos.
+        """Queues the programs of refinement for compilation: first for the photos `read`, then for
+        all photos. The programs suit all avatars that are compared.
         """
         if ahead is not None and refinement is not None:
             ahead.add(calls_of_refine(avatar, read, refinement))
@@ -483,9 +483,10 @@ def better_body(
 
 
 def _distances(capture: Capture) -> Float[np.ndarray, "v v"]:
-    """Returns distances between the directions in which cameras see the person, (v, v), in the axes
-    of the pelvis. So they also work for somebody who turns in front of one camera. Unit vectors are
-    compared, and 9 is added on the diagonal so that no photo is its own neighbour.
+    """Returns distances between the directions in which the cameras see the person, (v, v).
+
+    Directions are unit vectors in the axes of the pelvis, so they also differ if somebody turns in
+    front of one camera. 9 is added on the diagonal, so that no photo is its own nearest neighbour.
     """
     frames = np.asarray(capture.frames)
     pelvis = np.asarray(capture.poses.rotations, np.float64)[frames, 0]

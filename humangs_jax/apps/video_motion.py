@@ -238,9 +238,12 @@ def rate_and_count(video: Path) -> tuple[float, int]:
 def look_at_video(
     video: Path, count: int, person: int | None, kept: Path | None
 ) -> tuple[dict[str, np.ndarray], tuple[int, int]]:
-    """Looks for a person in each frame. Returns arrays with a row per frame, and the width and
-    height of the frames. Arrays are `points`, `confidences` and `world` as in `Keypoints`; `again`,
-    the detector's two points, (m, 2, 2), pixels; and `face`, scores of the face.
+    """Looks for a person in each frame. Returns arrays by name, with a row per frame, and the width
+    and height of the frames, pixels.
+
+    The arrays `points`, `confidences` and `world` are as in `Keypoints`. `again` has the points of
+    hips and head around which the next frame is cut, (m, 2, 2), pixels. `face` has the scores of
+    the face.
 
     Arguments: count: number of frames, for the progress bar. person: number of the person; None:
     the largest. kept: file for landmarks, see `fit_video`.

@@ -136,7 +136,7 @@ def seconds_of_photos(folder: Path, names: Sequence[str]) -> Float[np.ndarray, "
     names of the photos.
 
     Returns None if the folder of photos is not of one video, if the video does not have a rate, or
-    if names have no ascending numbers.
+    if the names do not end in ascending numbers.
     """
     known = None
     if (folder / MARK).is_file():
@@ -177,8 +177,8 @@ def _by_direction(video: Path, sharpness: Float[np.ndarray, " n"]) -> list[int]:
 def followed(frames: Iterable[UInt[np.ndarray, "h w 3"]], count: int) -> Iterable[Landmarks | None]:
     """Follows the largest person of the first frame that shows somebody. Yields the person's
     landmarks in each frame, or None where nobody is found. If the person is lost, the largest
-    person who is found next is followed. It ends early if nobody is found in `PATIENCE` frames in a
-    row.
+    person who is found next is followed. The generator ends early if nobody is found in `PATIENCE`
+    frames in a row.
     """
     networks, last, missed = Networks(), None, 0
     for frame in bar(frames, total=count, desc="following the person", unit="frame"):

@@ -8,8 +8,8 @@ from humangs_jax.core.configuration import Range, Seed, Share, Spread, Steps, We
 from humangs_jax.rendering.splat_config import SplatConfig
 
 SCENE_SPLAT = SplatConfig(jacobian_margin=0.3)
-"""The renderer's settings, as gsplat draws. In scenes around the cameras, Gaussians beside the
-cameras would otherwise cover whole images.
+"""The renderer's settings, with a `jacobian_margin` as gsplat has. In scenes that surround the
+cameras, Gaussians beside a camera would cover whole images with the exact Jacobian.
 """
 Capacity = Annotated[int, Range(1, 100_000_000)]
 """A number of Gaussians."""
@@ -66,8 +66,8 @@ class SceneConfig:
     scale_penalty: Weight = 0.01
     """Weight of the mean scale, in extents of the cameras."""
     noise: Weight = 5e5
-    """Weight of the noise of the means (`mcmc_noise`), relative to their learning rate and to 1 /
-    extent squared.
+    """Weight of the noise of the means. The `rate` of `mcmc_noise` is this weight times the
+    learning rate of the means, in metres, divided by the square of the extent of the cameras.
     """
     relocate_every: Steps = 100
     """Number of steps from one relocation to the next. A relocation moves dead Gaussians and uses

@@ -42,15 +42,15 @@ from humangs_jax.scenes.steps import (
 )
 
 MARGIN = 2.0
-"""Size of the buffers, relative to the number of pairs when they are planned. The number of pairs
-grows.
+"""Size of the buffers when they are planned, relative to the number of pairs. It leaves room,
+because the number of pairs grows.
 """
 CHECK_EVERY = 25
 """Number of steps from one check to the next. A check finds out whether all pairs have fit."""
 SAVE_SECONDS = 60.0
 """Seconds between two checkpoints."""
 MARK = "humangs_jax scene"
-"""Text in a checkpoint that distinguishes it from other files, because its name may be any."""
+"""Text in a checkpoint by which it is recognised, because a checkpoint may have any name."""
 
 
 class SceneFit(NamedTuple):
@@ -183,8 +183,8 @@ def _kind(camera: Camera) -> tuple[Any, ...]:
 def _plans(
     gaussians: Gaussians, views: Sequence[Camera], config: SceneConfig
 ) -> dict[tuple[Any, ...], SplatConfig]:
-    """Returns the configuration with which images are drawn, by the kind of their camera. It has
-    buffers.
+    """Returns the configuration of the renderer, with buffers, for each kind of camera
+    (`_kind`).
     """
     kinds: dict[tuple[Any, ...], list[Camera]] = {}
     for camera in views:

@@ -6,9 +6,9 @@ may ever have Gaussians, and `used` says which of them are Gaussians. These func
 of cloning, splitting and pruning:
 
 - `mcmc_relocate` moves Gaussians that have become transparent, and slots that are used from now on,
-  onto other Gaussians. These are drawn at random in proportion to their opacity. The N Gaussians
-  that then lie in one place look like the Gaussian that was there. If o was its opacity and s its
-  scales, theirs are (equation 9)
+  onto other Gaussians. The other Gaussians are drawn at random in proportion to their opacity. The
+  N Gaussians that then lie in one place look like the Gaussian that was there. If it had the
+  opacity o and the scales s, each of the N has (equation 9)
 
       o' = 1 - (1 - o)^(1/N),
       s' = s o / sum_{i=1}^{N} sum_{k=0}^{i-1} C(i-1, k) (-1)^k o'^(k+1) / sqrt(k+1);
@@ -42,7 +42,7 @@ SHARPNESS = 100.0
 value.
 """
 STEP = 0.1
-"""Distance of the nodes of the integral. The trapezoidal rule converges exponentially at this
+"""Distance between the nodes of the integral. The trapezoidal rule converges exponentially at this
 distance; tests compare it with the double sum.
 """
 REACH = 5.0
@@ -61,16 +61,17 @@ class Relocated(NamedTuple):
     used: Bool[Array, " g"]
     """Which slots hold a Gaussian, (g,)."""
     moved: Bool[Array, " g"]
-    """Which slots have changed, (g,): those that were moved, and those onto which others were
-    moved. The optimizer should forget its moments of these slots.
+    """Which slots have changed, (g,): the slots that were moved, and the slots onto which others
+    were moved. The optimizer should reset its moments of these slots.
     """
 
 
 def divided(
     opacity_logits: Float[Array, " g"], copies: Float[Array, " g"]
 ) -> tuple[Float[Array, " g"], Float[Array, " g"]]:
-    """Returns the logits of the opacities o' of N = `copies` Gaussians that together look as one,
-    (g,), and the ratio s' / s of their scales, (g,).
+    """Divides each Gaussian into N = `copies` Gaussians that together look like it. Returns the
+    logits of their opacities o', (g,), and the ratio s' / s of the new scales to the old ones,
+    (g,).
     """
     logits = jnp.minimum(opacity_logits, math.log(MOST / (1 - MOST)))
     depth = jax.nn.softplus(logits) / copies  # -log(1 - o')

@@ -30,8 +30,8 @@ is below this.
 CANDIDATES = 16
 """The number of random points for each Gaussian. One of them becomes the Gaussian."""
 SMALLEST = 1e-4
-"""The least scale of a Gaussian at the start, as a share of the extent of the cameras. Points may
-coincide.
+"""The least scale of a Gaussian at the start, as a share of the extent of the cameras. Without it,
+the scale would be 0 where points coincide.
 """
 Points = Gaussians | np.ndarray | Array | tuple[Any, Any] | None
 """The points where Gaussians begin: points (n, 3), a pair of points and colors (n, 3) in [0, 1], or

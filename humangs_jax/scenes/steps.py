@@ -27,7 +27,7 @@ from humangs_jax.scenes.config import SceneConfig
 from humangs_jax.scenes.mcmc import mcmc_noise, mcmc_penalty, mcmc_relocate
 
 HIDDEN = -20.0
-"""The logit of the opacity of unused slots. It is so low that they meet no tile."""
+"""The logit of the opacity of unused slots. It is so low that unused slots touch no tile."""
 ADAM = optax.scale_by_adam(eps=1e-15)
 
 
@@ -44,7 +44,7 @@ class SceneState:
     moments: PyTree
     """The moments of Adam, in the structure of the parameters."""
     overflow: Int[Array, ""]
-    """The largest number of (splat, tile) pairs of a step that did not fit, since the buffers were
+    """The number of (splat, tile) pairs that did not fit, in the worst step since the buffers were
     planned.
     """
 
