@@ -700,7 +700,7 @@ def hidden_by_others(
     photo: PhotoPeople, person: int, mask: Float[np.ndarray, "h w"] | None = None
 ) -> Bool[np.ndarray, "h w"] | None:
     """Returns the pixels where other people in a photo may stand in front of the person, (h, w).
-    None where nobody does.
+    Returns None if nobody does.
 
     Arguments: mask: mask of the person that replaces the detected one, (h, w), 0 to 1.
     """

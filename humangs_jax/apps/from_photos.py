@@ -283,7 +283,8 @@ class FromPhotos:
 
     def mark(self, **more: Any) -> dict[str, dict[str, Any]]:
         """Returns the name and the content of the file that marks a folder as made by a run. The
-        content is the photos and the options that a later run has to repeat. more: further entries.
+        content has the path of the photos, and the options that a later run has to repeat. more:
+        further entries.
         """
         return {
             START_MARK: {"photos": str(self.photos.resolve()), "options": self._decisive(), **more}

@@ -31,8 +31,9 @@ class _Limits:
     """Thresholds for the agreement of body and photo."""
 
     iou: float = 0.5
-    """Intersection over union below which body and mask do not agree. Clothes and hair cover about
-    a fifth of a silhouette that the body does not. At half, the pose or the camera is wrong.
+    """Intersection over union below which body and mask do not agree. About a fifth of a silhouette
+    is clothes and hair, which the body does not cover. If body and mask share less than half, the
+    pose or the camera is wrong.
     """
     sure_iou: float = 0.6
     """Intersection over union that a view must have after a mistake is undone. Then the mistake

@@ -50,8 +50,8 @@ class PersonInPhoto(NamedTuple):
     landmarks here are corrected.
     """
     apart: bool = False
-    """Whether the landmarks do not fit those of other photos of the same moment. Then the camera is
-    off, or this is somebody else.
+    """Whether the landmarks contradict the landmarks in other photos of the same moment. Then the
+    camera is off, or this is somebody else.
     """
     covered: bool = False
     """Whether other people may stand in front of this person."""

@@ -127,8 +127,8 @@ def inspect_folder(
     keypoints: Path | None = None,
     others: Path | None = None,
 ) -> PhotoFolder:
-    """Returns what a folder has. Files or folders that the arguments name replace those in the
-    folder.
+    """Returns the photos of a folder, and the files beside them. A file or folder that an argument
+    names is used instead of the one in `folder`.
 
     Raises: CaptureError (one line) if there is no such folder, if it has no photo, if it is a
     capture already, or if a named file does not exist.
@@ -344,19 +344,20 @@ def held_out_psnr(
     number: int = 0,
     watch: Callable[[Avatar, PreparedCapture], None] | None = None,
 ) -> HeldOut | None:
-    """Holds one photo out, makes an avatar of the others, and measures how well it reproduces the
-    photo over the person, in a crop of `SIZE` pixels. Returns None for fewer than four photos or
-    without masks.
+    """Holds one photo out, makes an avatar from the other photos, and measures how well the avatar
+    reproduces the photo over the person, in a crop of `SIZE` pixels. Returns None for fewer than
+    four photos or without masks.
 
-    Body and cameras are those of all photos. A second copy of the nearest photo takes the place of
-    the photo that is held out, because the programs for that number of photos are compiled already.
+    Body and cameras stay as they were fitted to all photos. A second copy of the nearest photo
+    takes the place of the photo that is held out, because the programs for that number of photos
+    are compiled already.
 
     Arguments:
         variables, config: of the network.
         refinement: how the avatar is refined; None: not at all.
         number: which photo is held out. 0 is the photo with the nearest neighbour, 1 the next in
             this order.
-        watch: called with the avatar of the other photos, before refinement, and these photos.
+        watch: is called before refinement, with the avatar and the photos from which it was made.
     """
     photos = _photos_to_hold_out(capture)
     capture = photos.capture
@@ -441,8 +442,8 @@ def better_body(
 
     A body that fills the clothes covers more of the masks, but the avatar is not better for it, so
     photos decide. Several photos vote, see `photos_agree`. The second capture has to be better by
-    0.1 dB. Photos judge avatars without refinement, because the better body shows already there,
-    and refinement takes most of the time. Without masks or with fewer than four photos, the first
+    0.1 dB. The avatars are compared without refinement: the better body is already better then, and
+    refinement takes most of the time. Without masks or with fewer than four photos, the first
     capture and None are returned.
 
     Arguments: refinement: as for `held_out_psnr`. ahead: compiles the programs of the refinement in

@@ -116,11 +116,12 @@ def motion_from_video(
         video: the file.
         person: number of the person, from 0. People are counted from the largest to the smallest,
             in the first frame that shows more people than this number. None: the largest.
-        height: height of the person, metres. It gives the motion its scale. None: that of an
+        height: height of the person, metres. It gives the motion its scale. None: the height of an
             average person.
         avatar: an avatar to which the motion is fitted. Its body takes the place of a body with the
             person's shape, and its size gives the scale.
-        focal_mm: focal length of the camera, millimetres on 35-mm film. None: that of a telephone.
+        focal_mm: focal length of the camera, millimetres on 35-mm film. None: the focal length of a
+            usual telephone.
 
     Returns:
         Poses in a world with y up and the floor at 0, at the rate of the video.

@@ -82,7 +82,7 @@ def photos_of_video(video: Path, folder: Path) -> str:
     """Writes the chosen frames into `folder / "images"`, and returns a line that describes them. If
     an earlier run has made the folder from this video, the folder stays as it is.
 
-    Raises: CaptureError that names the video, or the folder if it is something else.
+    Raises: CaptureError that names the video, or that names the folder if it holds something else.
     """
     with reading(video, "video", CaptureError):
         status = video.stat()

@@ -404,8 +404,8 @@ def open_archive(file: BinaryIO | io.BytesIO, size: int) -> zipfile.ZipFile:
 
 
 def read_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Returns the shape of an npy array, whether columns come first, and its type. The file is then
-    at the first byte of the numbers.
+    """Returns the shape of an npy array, whether it is in Fortran order, and its type. The file is
+    then at the first byte of the numbers.
 
     Raises: InvalidFileError, and what numpy raises for damaged headers.
     """

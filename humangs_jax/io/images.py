@@ -247,8 +247,8 @@ def cropped_from(path: str | Path) -> tuple[int, int] | None:
 
 
 def _exif(image: Any, data: bytes, folder: int | None = None) -> dict[int, Any]:
-    """Returns the EXIF tags of a photo, or of the table `folder` in them. Damaged tags count as
-    none.
+    """Returns the EXIF tags of a photo, by number. folder: number of the tag that points to the
+    table of the wanted tags. None: the main table. Damaged tags count as none.
     """
     if any(mark in data for mark in EXIF_MARKS):
         with warnings.catch_warnings(), contextlib.suppress(Exception):

@@ -397,8 +397,8 @@ def inside(folder: str | os.PathLike[str], name: str, photo: bool = False) -> Pa
     """Returns the path `folder / name`, after checking that it lies in the folder when symbolic
     links are followed.
 
-    Arguments: name: a path that comes from a file in the folder. photo: whether the path is that of
-    a photo or mask. The limit `photos_outside` lets these lie elsewhere.
+    Arguments: name: a path that comes from a file in the folder. photo: whether the path leads to a
+    photo or mask. The limit `photos_outside` lets photos and masks lie elsewhere.
     Raises: InvalidFileError, also for a name with control characters.
     """
     path = Path(folder) / name

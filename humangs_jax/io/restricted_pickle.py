@@ -1,8 +1,8 @@
 """Reads pickles of arrays without running anything that they contain.
 
 A pickle is a program: it names functions and classes, and calls them. `RestrictedUnpickler` is
-Python's own unpickler, but the only names that it finds are those of a table, and they stand for
-inert stand-ins. `_Looked` looks at each instruction before the unpickler gets it. It refuses an
+Python's own unpickler, but it finds only the names in a table. Each of these names gives it a
+harmless stand-in. `_Looked` looks at each instruction before the unpickler gets it. It refuses an
 instruction that no pickle of arrays has, a number or an index larger than files need, and a dict
 whose key is made of tuples within tuples. So a small file cannot take much memory.
 
@@ -345,8 +345,8 @@ def _made_array(shape: Any, dtype: Any, columns_first: Any, data: Any) -> "_Arra
 
 
 def _scalar(dtype: Any, data: Any = b"") -> Any:
-    """Returns one number: an int for an integer, because it may be the key of a dict, else an
-    `_Array`.
+    """Returns one number. An integer becomes an int, because it may be the key of a dict. Any other
+    number becomes an `_Array`.
     """
     array = _made_array((), dtype, False, data)
     plain = dtype.dtype if isinstance(dtype, _Dtype) else None

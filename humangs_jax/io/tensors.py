@@ -268,7 +268,7 @@ def everything(key: str) -> bool:
 def read_torch_file(
     path: str | os.PathLike[str], wanted: Wanted = everything
 ) -> tuple[Tensors, int]:
-    """Returns the wanted tensors of a state dict by name, and the number of the others.
+    """Returns the wanted tensors of a state dict by name, and the number of its other entries.
 
     bfloat16 becomes float32; other types stay as stored.
     Raises: FileNotFoundError; FileError if the file is no checkpoint or a damaged one, if its
@@ -352,8 +352,8 @@ def _state_dict(
 
 
 def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> tuple[Tensors, int]:
-    """Returns the wanted tensors of a file by name, and the number of the others. Nothing in the
-    file is run.
+    """Returns the wanted tensors of a file by name, and the number of its other entries. Nothing in
+    the file is run.
 
     Raises: FileNotFoundError; FileError if the file has neither format, is damaged, or asks for
     more than tensors.
@@ -375,7 +375,7 @@ def is_safetensors(path: str | os.PathLike[str]) -> bool:
 def read_safetensors(
     path: str | os.PathLike[str], wanted: Wanted = everything
 ) -> tuple[Tensors, int, dict[str, str]]:
-    """Returns the wanted tensors by name, the number of the others, and the texts of the file's
+    """Returns the wanted tensors by name, the number of other tensors, and the texts of the file's
     metadata.
 
     Raises: FileNotFoundError; FileError.

@@ -59,7 +59,7 @@ function.
 def composite(
     splats: Float[Array, "g width"], lists: TileLists, grid: TileGrid, config: SplatConfig
 ) -> Composited:
-    """Draws lists of splats, which must be in depth order, into tiles.
+    """Returns tiles into which lists of splats are drawn. Each list must be in depth order.
 
     Features and transmittance are differentiable with respect to `splats`, in reverse mode only.
     """

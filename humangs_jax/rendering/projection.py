@@ -56,7 +56,7 @@ from humangs_jax.rendering.splat_config import (
 )
 
 Planes = list[Array]
-"""Arrays of (g,) numbers."""
+"""List of arrays of (g,) numbers."""
 
 
 class ProjectedGaussians(NamedTuple):

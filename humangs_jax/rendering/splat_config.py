@@ -3,10 +3,10 @@ pytree without leaves.
 
 Two rasterizers set the conventions: INRIA's diff-gaussian-rasterization
 (https://github.com/graphdeco-inria/diff-gaussian-rasterization) and gsplat
-(https://github.com/nerfstudio-project/gsplat). Where they differ, ours are those of gsplat. Two
-points differ from both. Alphas are clamped at `ALPHA_MAX`, and nothing is cut at three standard
-deviations: a footprint ends where its alpha falls below `ALPHA_MIN`, so the image follows from the
-formula and not from a bounding box.
+(https://github.com/nerfstudio-project/gsplat). Where the two differ, this renderer does as gsplat.
+It differs from both in two points. Alphas are clamped at `ALPHA_MAX`. Nothing is cut at three
+standard deviations: a footprint ends where its alpha falls below `ALPHA_MIN`, so the image follows
+from the formula and not from a bounding box.
 """
 
 import dataclasses
@@ -157,7 +157,7 @@ class SplatConfig:
         None, cost="as max_pairs", gain="a little time", measured="performance.md"
     )
     """Room for (splat, row of tiles) pairs. None: as many as `max_pairs`, which is enough in
-    practice. An eager call that measures pairs measures these, too.
+    practice. An eager call that measures the pairs also measures the rows.
     """
     warn_overflow: bool = False
     """Whether traced calls log a warning when something did not fit. It adds a callback to the

@@ -170,9 +170,10 @@ def monomials(grid: TileGrid, dtype: np.dtype | type) -> np.ndarray:
 def moments_about_splat(
     moments: Float[Array, "*b 6"], x: Float[Array, "*b"], y: Float[Array, "*b"]
 ) -> Float[Array, "*b 6"]:
-    """Returns the moments of (pixel - splat), given those of (pixel - centre of the tile).
+    """Returns moments about the centre of a splat, from moments about the centre of a tile. Moments
+    are the sums with 1, x, y, x^2, xy and y^2 in this order.
 
-    x, y: (splat - centre of the tile), pixels.
+    x, y: offset of the splat's centre from the tile's centre, pixels.
     """
     m, mx, my, mxx, mxy, myy = (moments[..., i] for i in range(6))
     about = [

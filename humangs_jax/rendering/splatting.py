@@ -132,8 +132,8 @@ def render(
     features: Float[Array, "g n"] | None = None,
     shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
-    """Draw Gaussians as one camera sees them. Only first derivatives in reverse mode are supported:
-    no `jvp`, no Hessian.
+    """Draws Gaussians as one camera sees them. Only first derivatives in reverse mode are
+    supported: no `jvp`, no Hessian.
 
     After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079).
 
@@ -188,7 +188,7 @@ def render_views(
     config: SplatConfig | str = DEFAULT_CONFIG,
     background: Background = None,
 ) -> Rendering:
-    """Draw every camera of a batch (leading axis v), one after the other. Working memory does not
+    """Draws every camera of a batch (leading axis v), one after the other. Working memory does not
     grow with v. The memory for values that a gradient needs later grows with v. `jax.vmap` of
     `render` draws all views at once, and holds the buffers of all views. On CPUs, `jax.vmap` is as
     fast as `render_views`, but slower if gradients of many views are taken.

@@ -17,8 +17,8 @@ Capacity = Annotated[int, Range(1, 100_000_000)]
 
 @configuration
 class SceneRates:
-    """How far a step of Adam moves each parameter. The rates are those of Kheradmand et al. except
-    for colors and harmonics.
+    """How far a step of Adam moves each parameter. The rates are the ones of Kheradmand et al.,
+    except for colors and harmonics.
     """
 
     means: Spread = 1.6e-4

@@ -80,7 +80,7 @@ def fit_scene(
     progress: bool = False,
     watch: Callable[[int, Gaussians], None] | None = None,
 ) -> SceneFit:
-    """Fit Gaussians to posed photos of a scene that stands still (Kheradmand et al. 2024,
+    """Fits Gaussians to posed photos of a scene that stands still (Kheradmand et al. 2024,
     https://arxiv.org/abs/2404.09591).
 
     Args:

@@ -90,9 +90,9 @@ def mcmc_relocate(
     used: Bool[Array, " g"],
     count: Int[Array, ""] | int | None = None,
 ) -> Relocated:
-    """Move dead Gaussians onto others, which are drawn at random by opacity, and use more slots, up
-    to `count`. The scene looks about the same afterwards. If all Gaussians are dead, nothing
-    changes.
+    """Moves dead Gaussians onto other Gaussians, which are drawn at random by opacity, and uses
+    more slots, up to `count`. The scene looks about the same afterwards. If all Gaussians are dead,
+    nothing changes.
 
     Args:
         key: of `jax.random`.
@@ -148,7 +148,7 @@ def mcmc_noise(
     used: Bool[Array, " g"],
     rate: Float[Array, ""] | float,
 ) -> UnconstrainedGaussians:
-    """Move the means at random, by `rate` times the covariance times normal numbers. The noise
+    """Moves the means at random, by `rate` times the covariance times normal numbers. The noise
     fades out around an opacity of 0.005.
 
     Args:

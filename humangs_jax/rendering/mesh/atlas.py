@@ -168,8 +168,9 @@ def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
 
 
 def _connected(count: int, pairs: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Returns the number of the connected set that each face belongs to, (f,). All faces of a set
-    have one label. count: number of faces. pairs: faces that share an edge.
+    """Returns the number of the connected set that each face belongs to, (f,). Faces are connected
+    if they share an edge and have the same label. count: number of faces. pairs: faces that share
+    an edge, (p, 2). labels: label of each face, (f,).
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -273,8 +274,8 @@ def _hidden(flat: _Flat, size: int) -> np.ndarray:
 
 
 def _shelves(flat: _Flat, size: int) -> tuple[np.ndarray, float]:
-    """Returns rough places of the charts, (charts, 2), texels, and the scale in texels per metre.
-    The charts lie in rows, and the highest come first.
+    """Returns the lower left corners of the charts in a simple arrangement, (charts, 2), texels,
+    and the scale in texels per metre. The charts lie in rows, and the highest come first.
     """
     width, height = _sizes(flat)
     order = np.argsort(-height)

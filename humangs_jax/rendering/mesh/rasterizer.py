@@ -272,8 +272,9 @@ def _weights_by_pixel(corners: Array, face_ids: Array, width: int, pixels_per_st
 
 
 def _window(first: Array, end: Array, start: Array, size: int) -> tuple[Array, Array, Array]:
-    """Returns the item, the place within the item, and whether it is used, for each of the slots
-    start .. start + size - 1, (size,) each. Item i owns the slots from first[i] up to end[i].
+    """Returns three arrays for the slots start .. start + size - 1, (size,) each: the item that
+    owns the slot, the place of the slot within the item, and whether the slot is used. Item i owns
+    the slots first[i] .. end[i] - 1.
     """
     item = owners(first, size, start)
     slot = start + jnp.arange(size, dtype=jnp.int32)
