@@ -78,7 +78,7 @@ def import_photos(
     Arguments:
         person: number of the person on people.png, needed if photos show several large people. With
             `keypoints`, it is the number in their file.
-        height: height of the person, metres; None: that of an average person.
+        height: height of the person, metres. None: the height of an average person.
         keypoints: keypoints of another program. They choose the person in each photo.
         masks: folder of masks of another program. They choose the person if neither keypoints nor a
             number is given.
@@ -87,8 +87,9 @@ def import_photos(
         own_masks: whether to write the masks of our detector.
         reduce: whether large photos may be reduced.
         also: names and contents of JSON files that are written with the capture.
-    Raises: ValueError (one line) if no camera is found, or if photos show several large people and
-    none is chosen. Also as `import_cameras`.
+        Raises: ValueError (one line) if no camera is found, or if photos show several large people
+            and
+        none is chosen. Also as `import_cameras`.
     """
     images, files = photo_files(folder)
     choice = _Choice(person, keypoints, masks, out, others)

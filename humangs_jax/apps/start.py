@@ -393,8 +393,8 @@ def _psnr_of_person(
     photo: Float[np.ndarray, "h w 3"],
     mask: Float[np.ndarray, "h w"],
 ) -> float:
-    """Computes the same as `psnr_fg` of `evaluation.scores`, dB, but without compiling the programs
-    of the other scores. mask: (h, w), 0 to 1.
+    """Returns the score `psnr_fg` of `evaluation.scores`, dB, without compiling the programs of the
+    other scores. mask: (h, w), 0 to 1.
     """
     errors = np.mean(np.square(image - photo), axis=-1)
     mean = float(np.sum(errors * mask) / max(np.sum(mask), 1e-6))

@@ -212,8 +212,8 @@ def file_checksum(file: Path) -> str:
 
 
 def check_checksum(recorded: Any, found: str) -> None:
-    """Checks that the recorded checksum of a file is the one that was found. A recorded None is
-    accepted, because earlier versions recorded none.
+    """Checks that the recorded checksum of a file equals `found`, the computed checksum. A recorded
+    None is accepted, because earlier versions recorded none.
 
     Raises: InvalidFileError.
     """
@@ -323,8 +323,8 @@ class ArrayFile:
 
 _ONE_AT_A_TIME = threading.Lock()
 """Lock around reading the header of an array. numpy reads headers through Python's syntax trees,
-and CPython 3.11 counts the depth of these for all threads together. Two threads that read at once
-sometimes fail with "AST constructor recursion depth mismatch" (python/cpython#106905).
+and CPython 3.11 counts the depth of these trees for all threads together. Two threads that read at
+once sometimes fail with "AST constructor recursion depth mismatch" (python/cpython#106905).
 """
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,

@@ -119,8 +119,8 @@ _current: Limits | None = None
 
 
 def limits() -> Limits:
-    """Returns the limits in force: those of `set_limits`, or else the default limits as changed by
-    the environment variable HUMANGS_LIMITS.
+    """Returns the limits in force. They are the limits that `set_limits` has set. If none were set,
+    they are the default limits as changed by the environment variable HUMANGS_LIMITS.
 
     Raises: ValueError if the variable cannot be parsed.
     """

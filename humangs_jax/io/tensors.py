@@ -290,8 +290,8 @@ def tensors_in(data: bytes, keys: tuple[str, ...]) -> Tensors:
 
 
 def _tensors_of(file: Any, size: int, wanted: Wanted, keys: tuple[str, ...]) -> tuple[Tensors, int]:
-    """Returns the wanted tensors of an open file, and the number of the others. Raises:
-    InvalidFileError.
+    """Returns the wanted tensors of the state dict in an open file, and the number of its other
+    entries. Raises: InvalidFileError.
     """
     start = file.read(15)
     file.seek(0)
@@ -306,8 +306,8 @@ def _tensors_of(file: Any, size: int, wanted: Wanted, keys: tuple[str, ...]) -> 
 def _state_dict(
     content: Any, size: int, wanted: Wanted, keys: tuple[str, ...]
 ) -> tuple[Tensors, int]:
-    """Returns the wanted tensors of the state dict in unpickled content, and the number of the
-    others.
+    """Returns the wanted tensors of the state dict in unpickled content, and the number of its
+    other entries.
 
     The state dict lies under one of the keys, or is the content itself. The size of the file bounds
     the size of the tensors together. Raises: InvalidFileError.

@@ -15,8 +15,8 @@ A pixel ends before the first splat whose T_k+1 <= transmittance_stop. Apart fro
 exponent is minus a sum of squares. Hence it is never positive, and it is accurate for needles, for
 which the quadratic form of the conic loses digits.
 
-The gradient runs front to back as well. With g the cotangent of C, g_T that of the final T, and Q =
-g . C + g_T T_end,
+The gradient runs front to back as well. With g the cotangent of C, g_T the cotangent of the final
+T, and Q = g . C + g_T T_end,
 
     dL/dalpha_k = (g . f_k) T_k - (Q - sum_{i <= k} w_i g . f_i) / (1 - alpha_k)
 

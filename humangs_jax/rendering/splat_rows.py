@@ -1,7 +1,7 @@
 """Stores splats as rows of numbers: packs them, takes them in chunks from their lists, and computes
 their moments. Both schedules of compositing use these functions.
 
-Formulas and symbols are those of `rendering.compositing`.
+For formulas and symbols see `rendering.compositing`.
 """
 
 import functools
