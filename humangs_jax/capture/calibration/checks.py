@@ -27,30 +27,32 @@ one.
 DISTANCES = (0.3, 30.0)
 """Least and largest distance of cameras from a person, metres."""
 UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres"}
-"""Units in which people calibrate, by the number of metres in them."""
+"""Names of the units in which people calibrate. The key is the number of metres in the unit."""
 USUAL_DISTANCE = 2.5
-"""Usual distance of a camera from a person, metres. Of several units, the one that comes nearest is
-likely.
+"""Usual distance of a camera from a person, metres. If several units are possible, the unit that
+brings the cameras nearest to this distance is chosen.
 """
 NEARLY_PARALLEL = np.sin(np.radians(2.0)) ** 2
-"""Least eigenvalue of the mean projection across the axes. Axes within about 2 degrees of each
-other have less, and do not define a point where they meet.
+"""If all optical axes lie within about 2 degrees of each other, there is no reliable point where
+they meet. The smallest eigenvalue of the mean of I - a a^T over the axes a is then below this
+number.
 """
 MISS = 0.5
-"""Distance at which axes of cameras around a person may pass the point where they meet, a share of
-its distance from the cameras. Some look at the feet, others at the face.
+"""Largest root mean square distance of the optical axes from the point where they meet, divided by
+the point's median depth. It is large because some cameras look at the person's feet and others at
+the face.
 """
 TILT_LIMIT = 45.0
 """Largest angle between the mean upward direction of the photos and +y without a warning,
 degrees.
 """
 OFF_CENTER = 0.25
-"""Distance of a principal point from the middle, a share of the image. From this one on it belongs
-to an image of another size.
+"""If the principal point is at least this far from the middle of the image, there is a warning: the
+intrinsics may belong to an image of another size. As a share of the image's width or height.
 """
 COINCIDENT = 1e-3
-"""Share of the largest distance of a camera from the world's origin. If the point where the axes
-meet is nearer to the cameras, all cameras stand in one place.
+"""All cameras count as standing in one place if the median depth of the point where the axes meet
+is less than this share of the largest distance of a camera from the world's origin.
 """
 
 
@@ -71,7 +73,7 @@ class Checks:
 
 
 def check_calibration(source: Calibration, converted: Calibration, up: str) -> Checks:
-    """Checks the cameras of a calibration.
+    """Returns measured properties of a calibration, and warnings if it looks wrong.
 
     source: cameras as their source has them. converted: the same cameras in the convention of
     captures. up: axis of the source that points up, such as "+y".
@@ -116,11 +118,13 @@ def check_calibration(source: Calibration, converted: Calibration, up: str) -> C
 
 
 def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
-    """Returns the metres in a unit of a calibration, and a line about the unit, or None if no line
-    is needed.
+    """Returns how many metres one unit of a calibration is, and a line about this choice. The line
+    is None if nothing has to be reported.
 
-    The unit is that of the format, or metres if the format has no unit. If the cameras then stand
-    too near to a person or too far, the unit of `UNITS` that fits best is taken, if one fits.
+    The unit is the one that the format states, or the metre if the format states none. If the
+    cameras would then stand too near to the person or too far away, another unit of `UNITS` is
+    chosen. It is the one that brings the cameras nearest to `USUAL_DISTANCE`. If no unit brings
+    them within `DISTANCES`, the first unit is kept.
     """
     known = calibration.unit or 1.0
     matrices = np.stack([camera.cam_from_world for camera in calibration.cameras])
@@ -149,8 +153,8 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
 
 
 def _mean_reprojection_error(calibration: Calibration) -> float | None:
-    """Returns the mean distance of the pixels where points were seen from those where the cameras
-    see them, pixels. None without points.
+    """Returns the mean reprojection error over all observations, pixels. None if there are no
+    observations.
 
     It is infinite if a point lies behind a camera that saw it.
     """
@@ -174,10 +178,10 @@ def _mean_reprojection_error(calibration: Calibration) -> float | None:
 def _axes_meeting(
     poses: Float[np.ndarray, "v 4 4"],
 ) -> tuple[Float[np.ndarray, " v"] | None, Float[np.ndarray, " v"] | None]:
-    """Returns the depth in each camera, (v,), of the point that is nearest to all optical axes, and
-    its distance from each axis, (v,). Depths are negative behind a camera.
+    """Returns two values about the point that is nearest to all optical axes: its depth in each
+    camera, (v,), and its distance from each axis, (v,). Depths are negative behind a camera.
 
-    If the axes are nearly parallel, and so meet nowhere, it returns (None, None). poses:
+    If the axes are nearly parallel, they do not meet, and the result is (None, None). poses:
     cam_from_world, (v, 4, 4), in any unit.
     """
     rotations, axes = poses[:, :3, :3], poses[:, 2, :3]
@@ -193,9 +197,11 @@ def _axes_meeting(
 
 
 def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:
-    """Returns the root mean square distance of the axes from the point where they meet, over the
-    median depth of the point. It is infinite if they meet nowhere, or behind a camera, or if the
-    ratio is `MISS` or more, or if all cameras stand in one place.
+    """Returns how far the optical axes pass the point where they meet: the root mean square of
+    their distances from the point, divided by the median depth of the point.
+
+    The result is infinite if the axes are nearly parallel, if the point is behind a camera, if all
+    cameras stand in one place, or if the ratio is `MISS` or more.
     """
     depths, misses = _axes_meeting(poses)
     farthest = np.linalg.norm(poses[:, :3, 3], axis=-1).max()
@@ -211,11 +217,12 @@ def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:
 
 
 def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> list[str]:
-    """Returns a warning if the cameras do not look at one place before them. If they would with
-    another meaning of the matrices in the file, it names this meaning.
+    """Returns a warning if the cameras do not all look at one place in front of them, or else an
+    empty list. If they would do so with another convention for the matrices in the file, the
+    warning names this convention.
 
-    poses: cam_from_world as the source has them, (v, 4, 4). convention: meaning of the matrices in
-    the file.
+    poses: cam_from_world as the source has them, (v, 4, 4). convention: the convention in which the
+    matrices were read.
     """
     if _axes_meeting(poses)[0] is None or np.isfinite(_miss(poses)):
         return []
@@ -234,9 +241,10 @@ def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> 
 
 
 def _up_warnings(poses: Float[np.ndarray, "v 4 4"], up: str) -> list[str]:
-    """Returns a warning if the mean upward direction of the photos is far from +y. Most photos are
-    upright, so this direction shows which axis is up. poses: cam_from_world, (v, 4, 4). up: axis of
-    the source that was turned to y.
+    """Returns a warning if the mean upward direction of the photos is more than `TILT_LIMIT` from
+    +y, or else an empty list. Most photos are upright, so this direction shows which axis is up.
+
+    poses: cam_from_world, (v, 4, 4). up: axis of the source that was turned to y.
     """
     direction = -poses[:, 1, :3].mean(axis=0)
     length = np.linalg.norm(direction)

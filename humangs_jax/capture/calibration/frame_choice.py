@@ -2,10 +2,13 @@
 person from all sides.
 
 The frames that show something are cut into windows of equal length. Each window offers its sharpest
-frame. If the person was found in these frames and turns, the circle of directions is cut into equal
-parts. Each part gives the frame that is worth most, which is sharp, has the usual pose, and is near
-the middle of the part. Otherwise the next frame is always the one that differs most from all chosen
-ones, until no frame differs enough.
+frame.
+
+If the person was found in these frames and turns, the circle of directions is cut into equal parts.
+Each part gives its best frame: a sharp one, in the usual pose, and near the middle of the part.
+
+Otherwise frames are chosen one after the other. Each is the frame that differs most from all frames
+chosen before, until no frame differs enough.
 """
 
 from collections.abc import Iterable
@@ -16,20 +19,21 @@ from humangs_jax.core.array_types import Float, Int, UInt
 from humangs_jax.io.reading import InvalidFileError
 
 PHOTOS = 8
-"""Largest number of photos of a video for which `choose_frames` chooses."""
+"""Largest number of frames that `choose_frames` takes from a video."""
 LONGER_SIDE = 480
-"""Longer side of the frames that are looked at, pixels. Blur that does not show there does no
-harm.
+"""Longer side to which frames are shrunk before their sharpness is measured, pixels. Blur that
+cannot be seen at this size does no harm.
 """
 _CELLS = 24
 """Number of rows and of columns of the thumbnails that are compared."""
 _NOTHING_SHOWN = 3.0
-"""Least standard deviation of a frame that shows something, levels of 255. A frame of one color has
-less, which is noise.
+"""Least standard deviation of the grey values (0 to 255) of a frame that shows something. A frame
+of one color has noise alone, which stays below.
 """
 NOTHING_NEW = 0.05
-"""Least root mean square difference of a frame's thumbnail from those of the chosen frames, in
-standard deviations of a thumbnail, times the frame's worth. A frame with less shows nothing new.
+"""Frames are chosen until the best remaining frame has less novelty than this. Novelty is the root
+mean square difference between the frame's thumbnail and the most similar chosen thumbnail, times
+the frame's worth. Thumbnails have a standard deviation of at most 1.
 """
 
 
@@ -37,10 +41,10 @@ def looked_at(
     frames: Iterable[UInt[np.ndarray, "h w"]],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n p"]]:
     """Returns the sharpness, (n,), and the thumbnail, (n, p), of each grey frame. A thumbnail has
-    mean 0, and variance 1 or less. Sharpness and thumbnail of a frame that shows nothing are 0.
+    mean 0, and variance 1 or less. If a frame shows nothing, its sharpness and its thumbnail are 0.
 
-    Sharpness is the mean square of the Laplacian over the variance of the frame, so that exposure
-    does not change it.
+    Sharpness is the mean square of the Laplacian, divided by the variance of the frame, so that
+    exposure does not change it.
     """
     sharpness, thumbnails = [], []
     for frame in frames:
@@ -64,8 +68,11 @@ def looked_at(
 def offered_frames(
     sharpness: Float[np.ndarray, " n"],
 ) -> tuple[Int[np.ndarray, " o"], Float[np.ndarray, " o"]]:
-    """Returns the number of the sharpest frame of each window, in order, (o,), and what each frame
-    is worth, (o,), in (0, 1]. Frames that are less sharp than the median of these are worth less.
+    """Returns the index of the sharpest frame of each window, ascending, (o,), and the worth of
+    each of these frames, (o,), in (0, 1].
+
+    The worth is the frame's sharpness divided by the median sharpness of all returned frames, but 1
+    at most.
 
     Raises: InvalidFileError if no frame shows anything.
     """
@@ -83,8 +90,8 @@ def offered_frames(
 def choose_frames(
     sharpness: Float[np.ndarray, " n"], thumbnails: Float[np.ndarray, "n p"], most: int
 ) -> list[int]:
-    """Returns the numbers of at most `most` frames that look different, in order. It is used if the
-    person's directions are not known, or do not differ.
+    """Returns the indices of at most `most` frames that look different, ascending. It is used if
+    the person's directions are not known, or do not differ.
 
     sharpness and thumbnails: see `looked_at`.
     Raises: InvalidFileError if no frame shows anything.
@@ -106,11 +113,11 @@ FRAMES = 16
 The others help poses and refinement.
 """
 USUAL = 0.15
-"""Difference of a pose from the usual one at which a frame's worth is halved, a share of the
-person's size.
+"""A frame's worth is halved if its pose differs by this much from the usual pose. As a share of the
+person's size, see `unusual`.
 """
 WORTHLESS = 0.1
-"""Least factor on the worth of a frame for an unusual pose."""
+"""Smallest factor by which a frame's worth is multiplied because of an unusual pose."""
 
 
 def directions_of(
@@ -135,8 +142,8 @@ def unusual(
     directions: Float[np.ndarray, " n"],
     seen: Float[np.ndarray, "n k"],
 ) -> Float[np.ndarray, " n"]:
-    """Returns how much the pose of each frame differs from the median pose, (n,), a share of the
-    person's size.
+    """Returns how much the pose of each frame differs from the median pose of all frames, (n,). It
+    is the mean distance of the landmarks, weighted by `seen`, as a share of the person's size.
 
     world: landmarks in the camera's axes, (n, k, 3). directions: see `directions_of`. seen: weights
     of the landmarks, (n, k).
@@ -159,11 +166,12 @@ def unusual(
 def choose_by_direction(
     directions: Float[np.ndarray, " n"], worth: Float[np.ndarray, " n"], most: int
 ) -> list[int]:
-    """Returns the indices of at most `most` frames, in order, evenly spread over the directions
-    that there are. The result is empty if these cover less than a quarter turn.
+    """Returns the ascending indices of at most `most` frames, evenly spread over the directions in
+    which the person was filmed. The result is empty if these directions cover less than a quarter
+    turn.
 
     Arguments: directions: direction of each frame, (n,), radians. worth: worth of each frame, (n,).
-    0 for a frame that must not be taken.
+    Frames of worth 0 are not taken.
     """
     rows = np.flatnonzero(worth > 0)
     # somebody who is filmed from one side moves, but does not turn: directions have to cover a
@@ -183,7 +191,9 @@ def choose_by_direction(
 
 
 def _covered(directions: Float[np.ndarray, " n"]) -> float:
-    """Returns the size of the circle without its largest gap between directions, radians."""
+    """Returns the angle that the directions cover, radians: a full turn minus the largest gap
+    between neighbouring directions.
+    """
     sorted_ = np.sort(np.mod(directions, 2 * np.pi))
     gaps = np.diff(np.append(sorted_, sorted_[0] + 2 * np.pi))
     return float(2 * np.pi - gaps.max())

@@ -88,9 +88,11 @@ class ImportReport:
     undistorted: int
     """Number of photos of which lens distortion was removed."""
     turned: int
-    """Number of photos that were turned upright by their EXIF orientation, or their masks were."""
+    """Number of photos that were turned upright, or have a mask that was turned, because of EXIF
+    orientations.
+    """
     heic: int
-    """Number of photos that are HEIC or have a HEIC mask."""
+    """Number of photos that are HEIC files or have a HEIC mask."""
     masks: bool
     """Whether the import had mask files."""
     checks: Checks
@@ -326,8 +328,8 @@ def _no_common_frame(calibration: Calibration) -> str:
 def _mask_line(
     calibration: Calibration, masks: Path | None, photos: Sequence[Photo]
 ) -> tuple[str | None, bool]:
-    """Returns a line about the masks that a calibration names, or None if it names none, and
-    whether these masks are used.
+    """Returns a line about the masks that a calibration names, and whether these masks are used. If
+    the calibration names no masks, it returns None and False.
     """
     if calibration.mask_key is None:
         return None, False
@@ -359,11 +361,11 @@ def _check_options(
 
 
 def _canvas(images: Path, photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[int, int]:
-    """Returns width and height of all photos that are written, pixels. They are the largest width
-    and the largest height of all upright photos.
+    """Returns the width and height, in pixels, that all written photos get. They are the largest
+    width and the largest height of all upright photos.
 
-    Raises: CaptureError if the photos of one camera have different sizes, or if photos that would
-    be padded exceed the limits of pixels.
+    Raises: CaptureError if the photos of one camera have different sizes, or if photos have to be
+    padded and would then exceed a limit of pixels.
     """
     first = {}
     for photo, turn in zip(photos, turns, strict=True):
@@ -423,8 +425,9 @@ def _write(
 ) -> list[str]:
     """Writes photos, masks, masks of unknown pixels, and capture.json.
 
-    Arguments: in_front: the masks of other people and things, by photo.
-    Returns: the names of photos in which the person reaches the border of what the camera has seen.
+    Arguments: in_front: for a photo, its mask of other people and of things in front.
+    Returns: the names of the photos in which the person touches the edge of the area that the
+    camera has seen.
     """
     (folder / "images").mkdir(parents=True)
     if photos[0].mask is not None:
@@ -465,8 +468,8 @@ def _write(
 
 
 def _of_phones(photo: Photo) -> bool:
-    """Returns whether the photo or its mask is HEIC. Captures have no HEIC files, because other
-    programs cannot read them.
+    """Returns whether the photo or its mask is a HEIC file. Captures contain no HEIC files, because
+    many programs cannot read them.
     """
     return any(
         file is not None and read_checked(is_heic, file) for file in (photo.image, photo.mask)
@@ -491,11 +494,12 @@ def _rewrite(
     transparent: bool,
     canvas: tuple[int, int],
 ) -> tuple[dict[str, str], Float[np.ndarray, "h w"] | None]:
-    """Writes a photo and its mask (or alpha channel) upright, undistorted to a pinhole camera, and
-    padded. Added pixels are white, and background in the mask.
+    """Writes a photo and its mask (or its alpha channel as the mask). Both are turned upright,
+    undistorted to a pinhole camera, and padded to the canvas. Added pixels are white in the photo
+    and 0 in the mask.
 
-    A photo that has alpha besides its mask keeps it. An opaque alpha channel is left out if no
-    photo is `transparent`.
+    If `transparent` is set, alpha channels count. A photo with a mask file then keeps its alpha
+    channel in addition. Otherwise alpha channels are dropped.
     Returns: the paths for capture.json, and the mask as it was written, or None if there is none.
     """
     # upright, and as a pinhole sees them
@@ -527,8 +531,8 @@ def _rewrite(
 def _padded(
     pixels: Float[np.ndarray, "h w *c"], canvas: tuple[int, int], fill: float
 ) -> Float[np.ndarray, "height width *c"]:
-    """Pads pixels (h, w, ...) on the right and below to the size of the canvas. fill: value of the
-    added pixels, whose alpha is 1 if the fill is 1.
+    """Returns pixels padded on the right and below to the canvas (width, height). fill: value of
+    all channels of the added pixels.
     """
     (height, width), (right, below) = pixels.shape[:2], canvas
     if (height, width) == (below, right):

@@ -26,8 +26,8 @@ from humangs_jax.io.reading import check_limit, reading
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class SceneCameras(Mapping[str, Camera]):
-    """A mapping from names to the cameras of a calibration, in the order of its file, and the
-    points that the calibration found.
+    """The cameras of a calibration as a mapping from their names, in the order of the file. It also
+    has the points that the calibration found.
     """
 
     cameras: dict[str, Camera]
@@ -132,7 +132,9 @@ def _size(source: Path, folder: Path | None, name: str) -> tuple[int, int]:
 
 
 def _points(found: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """Returns each point once, (n, 3), and its color, (n, 3), RGB in [0, 1]."""
+    """Returns the distinct points of a calibration, (n, 3), and their colors, (n, 3), RGB in [0,
+    1].
+    """
     seen = found.observations
     if seen is None:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)

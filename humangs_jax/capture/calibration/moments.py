@@ -15,24 +15,32 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import counted
 
 NEAR = 0.6
-"""Largest distance in time of a frame from its moment, in steps of its camera. It is half a step,
-and a little more because the clocks of phones are not steady.
+"""Largest distance in time between a frame and its moment, as a share of the median time between
+the camera's frames. It is a little more than one half, because the clocks of phones are not steady.
 """
 _GAP = 1.5
-"""If two frames are farther apart than this many steps, frames are missing between them."""
+"""Frames are missing between two frames if the time between them exceeds this many times the usual
+time.
+"""
 _SAME_RATE = 0.01
-"""Cameras have one rate if their steps differ by no more than this share."""
+"""Cameras count as having the same frame rate if the times between their frames differ by less than
+this share.
+"""
 _USUAL_STEP = 1 / 30
-"""Step between two frames of videos that do not state their times, seconds."""
+"""Time between two frames that is assumed if no video states its times, or if a video has one
+frame, seconds.
+"""
 
 
 class Moments(NamedTuple):
     """The frames of several cameras that show each of m moments."""
 
     times: Float[np.ndarray, " m"]
-    """Times of the moments after the first frames, (m,), seconds."""
+    """Times of the moments, (m,), seconds from the start of the videos."""
     frames: dict[str, list[int | None]]
-    """For each camera the number of its frame at each moment, from 0. None if it has no frame."""
+    """For each camera, the index of its frame at each moment, counted from 0. None if the camera
+    has no frame there.
+    """
     counts: dict[str, int]
     """Number of frames of each camera."""
     notes: tuple[str, ...]
@@ -61,8 +69,8 @@ def find_moments(times: Mapping[str, Float[np.ndarray, " _n"]]) -> Moments:
 
 
 def _step(times: Float[np.ndarray, " n"]) -> float | None:
-    """Returns the mean step between two frames without gaps, seconds. None if the times do not show
-    it.
+    """Returns the mean time between neighbouring frames, gaps left out, seconds. None if there are
+    fewer than two frames, or if a time is not known or times do not rise.
     """
     apart = np.diff(times)
     if not len(apart) or not np.isfinite(apart).all() or not (apart > 0).all():
@@ -73,11 +81,11 @@ def _step(times: Float[np.ndarray, " n"]) -> float | None:
 def _clock(
     times: Float[np.ndarray, " n"], step: float | None, slowest: float, first: float
 ) -> Float[np.ndarray, " n"]:
-    """Returns the time of each frame, in seconds.
+    """Returns the time of each frame, (n,), seconds from the start of the videos.
 
-    Times count from the first frame of the video, or from `first` (the first frame of all videos)
-    if the video begins a little later. A video without times is taken to be as fast as the slowest
-    one.
+    The first frame of a video is at 0. If the video begins 0.1 to 3 seconds after `first`, which is
+    the first time in any video, its first frame is that much later. step: the video's time between
+    frames. None: the video's times are not known, and its frames are `slowest` seconds apart.
     """
     if step is None:
         return np.arange(len(times)) * slowest
@@ -91,10 +99,11 @@ def _clock(
 def _all_moments(
     clocks: Mapping[str, Float[np.ndarray, " _n"]], steps: Mapping[str, float]
 ) -> Float[np.ndarray, " m"]:
-    """Returns the times of the moments, (m,), seconds. They are those of the slowest camera's
-    frames. Moments before its start, in its gaps and after its end are added.
+    """Returns the times of the moments, (m,), seconds. The moments are the times at which the
+    slowest camera has frames. Further moments fill the time before its first frame, gaps between
+    its frames, and the time after its last frame.
 
-    clocks: times of each camera's frames, seconds. steps: step between each camera's frames,
+    clocks: times of each camera's frames, seconds. steps: time between each camera's frames,
     seconds.
     """
     slowest = max(steps.values())
@@ -111,10 +120,10 @@ def _all_moments(
 
 
 def nearest(times: Float[np.ndarray, " n"], moments: Float[np.ndarray, " m"]) -> list[int | None]:
-    """Returns the number of the camera's frame that is nearest to each moment.
+    """Returns for each moment the index of the camera's nearest frame.
 
-    It is None if the frame is too far from the moment, or nearer to another moment. Times of frames
-    and moments are in seconds.
+    It is None if this frame is too far away in time, or if it is nearer to another moment. Times of
+    frames and moments are in seconds.
     """
     step = float(np.median(np.diff(times))) if len(times) > 1 else _USUAL_STEP
     found = np.searchsorted((times[1:] + times[:-1]) / 2, moments)
@@ -159,10 +168,11 @@ def _warnings(
     frames: Mapping[str, Sequence[int | None]],
     moments: Float[np.ndarray, " m"],
 ) -> tuple[str, ...]:
-    """Warns of each camera that lacks frames.
+    """Returns warnings about cameras that lack frames.
 
-    A camera gets a line if it has no frame at a moment before its video ends, and a line if its
-    video ends two or more moments before the last one. Clocks and moments are in seconds.
+    A camera gets a line if it has no frame at some moment before its video ends. It gets another
+    line if its video ends two or more moments before the last moment. Clocks and moments are in
+    seconds.
     """
     found = []
     for camera, numbers in frames.items():

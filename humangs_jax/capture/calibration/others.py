@@ -1,7 +1,8 @@
-"""Finds pixels of photos that do not show whether the person is there: masks of other people and of
-things in front, and pixels of an imported photo that the camera has not seen.
+"""Finds the pixels of photos in which the person may be hidden or was not photographed. In some of
+them other people or things are in front of the person. Others were added by the import, beyond what
+the camera has seen.
 
-A capture calls both unknown (docs/capture_format.md).
+A capture calls both kinds unknown (docs/capture_format.md).
 """
 
 from collections.abc import Sequence
@@ -28,8 +29,8 @@ from humangs_jax.io.images import PHOTO_SUFFIXES, orientation, read_grey
 
 
 def find_others(folder: Path | None, images: Path, photos: Sequence[Path]) -> dict[Path, Path]:
-    """Returns the masks of others in a folder, by photo. A photo without such a mask is not in the
-    result. Without a folder the result is empty.
+    """Returns for each photo its mask of others (other people, or things in front of the person).
+    Photos without such a mask are not in the result. If `folder` is None, the result is empty.
 
     Raises: CaptureError if no picture in the folder is named like a photo.
     """
@@ -51,10 +52,11 @@ def find_others(folder: Path | None, images: Path, photos: Sequence[Path]) -> di
 def others_as_shown(
     folder: Path | None, images: Path, photos: Sequence[Path]
 ) -> list[Bool[np.ndarray, "_h _w"] | None]:
-    """Returns for each photo which pixels show others in front, (h, w), as the photo is shown. None
-    for a photo without a mask of others.
+    """Returns for each photo which pixels show others in front of the person, (h, w), oriented as
+    the photo is shown. None for a photo without a mask of others.
 
-    Raises: CaptureError as in `find_others`, and for a mask of another size.
+    Raises: CaptureError if no picture in the folder is named like a photo, or if a mask has another
+    size than its photo.
     """
     found = find_others(folder, images, photos)
     return [
@@ -66,10 +68,11 @@ def others_as_shown(
 def others_imported(
     mask: Path, photo: Photo, turn: Turn, camera: CalibratedCamera, canvas: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns which pixels of an imported photo show others in front, (h, w). The mask is turned,
-    undistorted and padded as the photo was. canvas: width and height of the imported photo.
+    """Returns which pixels of an imported photo show others in front of the person, (h, w). The
+    mask file is turned, undistorted and padded in the same way as the photo. canvas: width and
+    height of the imported photo, pixels.
 
-    Raises: CaptureError for a mask of another size.
+    Raises: CaptureError if the mask has another size than the photo.
     """
     stored = photo_size(photo.image)
     shown = stored if read_checked(orientation, photo.image) < 5 else stored[::-1]
@@ -80,8 +83,9 @@ def others_imported(
 def not_photographed(
     size: tuple[int, int], camera: CalibratedCamera, canvas: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns which pixels of an imported photo the camera has not seen, (h, w). They are beyond
-    the border of the distorted photo, or were added to bring all photos to one size.
+    """Returns which pixels of an imported photo the camera has not seen, (h, w). Undistortion shows
+    some of them, beyond the border of the original photo. Padding to the common size adds the
+    others.
 
     Arguments: size: width and height of the upright photo. canvas: width and height of the imported
     photo.
@@ -91,8 +95,8 @@ def not_photographed(
 
 
 def is_cut_off(person: Bool[np.ndarray, "h w"], unseen: Bool[np.ndarray, "h w"]) -> bool:
-    """Returns whether the person reaches within three pixels of what the camera has not seen. The
-    person may then go on there.
+    """Returns whether the person comes within three pixels of the unseen area. If so, more of the
+    person may lie in that area.
     """
     # three pixels: a mask that ends so near to what the camera has not seen is cut off there
     near = ndimage.binary_dilation(unseen, iterations=3)
@@ -102,10 +106,10 @@ def is_cut_off(person: Bool[np.ndarray, "h w"], unseen: Bool[np.ndarray, "h w"])
 def _as_imported(
     share: Float[np.ndarray, "h w"], camera: CalibratedCamera, canvas: tuple[int, int]
 ) -> Float[np.ndarray, "height width"]:
-    """Returns an upright mask, undistorted and padded as the import does with its photo. The mask
-    is 0 where the camera has not seen anything.
+    """Returns an upright mask undistorted and padded in the same way as its photo, (height, width).
+    It is 0 where the camera has not seen anything.
 
-    Arguments: canvas: width and height of the imported photo.
+    Arguments: share: the mask, 0 to 1. canvas: width and height of the imported photo.
     """
     if camera.distortion is not None:
         share = undistort(share, camera.K, camera.distortion, fill=0.0)

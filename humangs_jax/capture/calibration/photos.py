@@ -1,11 +1,14 @@
-"""Finds the camera, the frame and the mask of each photo by file names, and which way up the photo
-is by its EXIF orientation.
+"""Finds the camera, the frame and the mask of each photo by file names, and finds by EXIF
+orientation which way up the photo is.
 
-Phones store a portrait photo on its side, with a flag that says so, and about half of the other
-programs obey the flag. An import writes photos without a flag: it turns the pixels upright. If the
-camera was calibrated for the pixels as stored (COLMAP), the import turns the camera too. If it was
-calibrated for the turned photo (OpenCV), the sizes show it. No camera sees a mirrored photo. If the
-flag asks for mirroring, and the calibration is of the pixels as stored, the photo is only turned.
+Phones store a portrait photo on its side, with an EXIF flag that says so. About half of all other
+programs obey the flag. An import turns the pixels upright and writes photos without a flag.
+
+If the camera was calibrated for the pixels as stored (COLMAP), the import turns the camera too. If
+the camera was calibrated for the turned photo (OpenCV), its image size shows this.
+
+No camera sees a mirrored photo. If the flag asks for mirroring, and the calibration is of the
+pixels as stored, the photo is only turned.
 """
 
 import dataclasses
@@ -71,11 +74,12 @@ NO_CAMERA = "without a camera in"
 
 
 def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, str | None]:
-    """Leaves out the cameras without a photo. Returns the calibration with the other cameras, and a
-    line about the cameras left out, or None if every camera has a photo.
+    """Returns the calibration without the cameras that have no photo, and a line about these
+    cameras. The line is None if every camera has a photo.
 
-    Raises: CaptureError if no camera has a photo, or if a calibration that names its images names a
-    missing one while the folder has photos that no camera names.
+    Raises: CaptureError if no camera has a photo. It is also raised for a calibration with a camera
+    for each image if images are missing while the folder has photos that no camera names: their
+    names do not match.
     """
     if calibration.per_image:
         there = [_photo_at(images, camera.name) is not None for camera in calibration.cameras]
@@ -105,10 +109,7 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
 
 
 def _refuse_missing(calibration: Calibration, images: Path, name: str) -> None:
-    """Raises the error about a camera that has no photo. name: name of the camera.
-
-    Raises: CaptureError.
-    """
+    """Always raises CaptureError for a camera that has no photo. name: name of the camera."""
     if calibration.per_image:
         photo_of(images, name, calibration.file)
     raise CaptureError(
@@ -119,10 +120,10 @@ def _refuse_missing(calibration: Calibration, images: Path, name: str) -> None:
 def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> tuple[Photo, ...]:
     """Returns the photos of a calibration, ordered by frame and then by camera.
 
-    masks: a folder of masks. None: use the masks that the calibration names, if they are there.
-    Raises: CaptureError if an image that the calibration names, a camera's photos or a mask is
-    missing, if two images have one photo, or if only some of the masks that the calibration names
-    are there.
+    masks: a folder of masks. None: use the masks that the calibration names, if these files exist.
+    Raises: CaptureError if an image that the calibration names is missing, if a camera has no
+    photo, if two cameras name the same photo, or if a photo lacks its mask in `masks`. Without
+    `masks`, it is raised if some masks that the calibration names exist and others do not.
     """
     if calibration.per_image:
         owners: dict[Path, str] = {}
@@ -166,11 +167,11 @@ def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibratio
 
 
 def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
-    """Returns the masks that a calibration names, by number of the camera. They may be in the
-    calibration's folder, in the folder of photos or in its parent. If no mask is there, the result
-    is empty.
+    """Returns the masks that a calibration names, by index of the camera. Masks are looked for in
+    the calibration's folder, in the folder of photos, and in the parent of that folder. If no mask
+    exists, the result is empty.
 
-    Raises: CaptureError if some masks are there and others are missing.
+    Raises: CaptureError if some masks exist and others are missing.
     """
     found: dict[int, Path] = {}
     for i, camera in enumerate(calibration.cameras):
@@ -218,8 +219,9 @@ def _photo_at(folder: Path, name: str) -> Path | None:
 
 
 def _any_suffix(path: Path) -> Path | None:
-    """Returns the photo at a path. If there is none, it returns the file whose name has another
-    suffix of photos in place of the path's, or after it. None if there is no such file.
+    """Returns the path if it is a photo that exists. If not, it returns an existing file with
+    another photo suffix, which replaces the path's suffix or is appended to it. None if there is no
+    such file.
     """
     stems, candidates = [path.name], []
     if is_photo(path):
@@ -265,8 +267,8 @@ def masks_named_like(masks: Path, images: Path) -> Callable[[Path], Path | None]
 
     The mask has the photo's name, perhaps with another suffix, with one more suffix (COLMAP) or
     with a word for masks (RealityScan's IMG.jpg.mask.png, Metashape's IMG_mask.png). AvatarReX has
-    the mask in mask/pha beside the photo. Photos and masks may be in one folder, so the photo
-    itself can be found first: it is skipped.
+    the mask in mask/pha beside the photo. Photos and masks may lie in one folder. The photo itself
+    is never returned as its mask.
     """
     # each folder is listed once: names with a word for masks, by the photo they are of
     listed: dict[Path, dict[str, Path]] = {}
@@ -297,8 +299,10 @@ def masks_named_like(masks: Path, images: Path) -> Callable[[Path], Path | None]
 
 
 def _frames_of(calibration: Calibration, images: Path) -> list[dict[str, Path]]:
-    """Returns for each camera its photos by the name of the frame. All cameras use the first layout
-    of folders in which some camera has photos.
+    """Returns for each camera a mapping from names of frames to its photos.
+
+    There are three layouts: CAMERA/FRAME.jpg, FRAME/CAMERA.jpg and CAMERA.jpg. All cameras use the
+    first of them in which any camera has photos.
     """
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
@@ -349,9 +353,9 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
 # --------------------------------------------------------------------------------------------------
 
 MIRRORED = {2: 1, 4: 3, 5: 6, 7: 8}
-"""For each EXIF flag that mirrors and turns, the flag that only turns in the same way."""
+"""For each EXIF flag that mirrors, the flag with the same turn but without mirroring."""
 MIRROR = 2
-"""The EXIF flag that only mirrors."""
+"""The EXIF flag that mirrors and does not turn."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -363,13 +367,15 @@ class Turn:
     mask: int
     """EXIF flag by which the mask is turned."""
     quarters: int
-    """Number of clockwise quarter turns of the camera. 0 if the calibration is of the turned
-    photo.
+    """Number of clockwise quarter turns of the camera. 0 if the camera was calibrated for the
+    turned photo.
     """
     size: tuple[int, int]
     """Width and height of the turned photo, pixels."""
     certain: bool
-    """Whether the sizes show if the stored or the turned photo was calibrated."""
+    """Whether it is known which photo was calibrated, the stored or the turned one. It is not known
+    if the photo has a flag other than 1, both have the same size, and the format does not say.
+    """
     mirrored: bool
     """Whether pixels are mirrored back. This is so if the flag mirrors and the calibration is of
     the pixels as stored.
@@ -378,8 +384,8 @@ class Turn:
     def upright(
         self, pixels: Float[np.ndarray, "h w *c"], flag: int
     ) -> Float[np.ndarray, "height width *c"]:
-        """Returns pixels turned and mirrored as a flag asks, and then mirrored back if
-        `mirrored`.
+        """Returns pixels turned and mirrored as an EXIF flag asks. If `mirrored` is set, they are
+        then mirrored once more.
         """
         return oriented(oriented(pixels, flag), MIRROR if self.mirrored else 1)
 
@@ -392,9 +398,9 @@ class Turn:
 def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn, ...]:
     """Returns the turn of each photo.
 
-    Raises: CaptureError if a photo has another size than the calibrated one, or a mask another size
-    than its photo, or if a camera was calibrated for pixels as stored, and its photos ask for
-    different turns.
+    Raises: CaptureError if a photo has another size than its calibrated camera, or a mask has
+    another size than its photo. It is also raised if a camera was calibrated for the pixels as
+    stored, and the flags of its photos ask for different turns.
     """
     turns = tuple(
         _find_turn(calibration.cameras[photo.camera], photo, calibration.upright)
@@ -436,12 +442,12 @@ def _find_turn(camera: CalibratedCamera, photo: Photo, upright: bool) -> Turn:
 
 
 def mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, int]) -> int:
-    """Returns the EXIF flag by which a mask is turned. If its own flag gives it the size of the
-    turned photo, this is its own flag. If it has no flag and the size of the stored photo, this is
-    the photo's flag.
+    """Returns the EXIF flag by which a mask is turned.
 
-    If stored and turned photo have the same size, a mask without a flag is taken to be turned,
-    because most tools that make masks obey the flag.
+    If the mask's own flag brings it to the size of the turned photo, this flag is returned. If the
+    mask has no flag, and the size of the stored photo, the photo's flag is returned. If the stored
+    and the turned photo have the same size, a mask without a flag counts as turned already, because
+    most tools that make masks obey the photo's flag.
 
     flag: EXIF flag of the photo. stored and shown: width and height of the photo before and after
     it is turned, pixels.
@@ -481,8 +487,9 @@ def mask_as_shown(mask: Path, image: Path) -> Float[np.ndarray, "h w"]:
 def turned_cameras(
     calibration: Calibration, photos: Sequence[Photo], turns: Sequence[Turn]
 ) -> Calibration:
-    """Returns the calibration for the photos as they are imported: cameras and observations turned,
-    with the sizes of the turned photos. The calibration has to be in the convention of captures.
+    """Returns the calibration of the imported photos. Cameras and observed pixels are turned, and
+    cameras have the sizes of the turned photos. The calibration has to be in the convention of
+    captures.
     """
     cameras, seen = list(calibration.cameras), calibration.observations
     pixels = None if seen is None else seen.pixels.copy()
@@ -525,8 +532,11 @@ def _quarter_turned(camera: CalibratedCamera) -> CalibratedCamera:
 
 
 def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str], list[str]]:
-    """Returns notes on the photos that were turned, and warnings where their sizes do not show if
-    the calibration is of the turned photos, or where a photo is not mirrored.
+    """Returns notes and warnings about EXIF orientations.
+
+    A note counts the photos that were turned. A warning names photos whose size does not show
+    whether the calibration is of the stored or of the turned photo. Another names a photo that the
+    flag wants mirrored and that was only turned.
     """
     flagged = [(photo, turn) for photo, turn in zip(photos, turns, strict=True) if turn.photo != 1]
     if not flagged:
@@ -597,7 +607,9 @@ def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
 
 
 def _mask_problem(person: Bool[np.ndarray, "h w"]) -> str | None:
-    """Returns what is wrong with a mask, or None. person: pixels of the person, (h, w)."""
+    """Returns a sentence about what is wrong with a mask, or None. person: whether each pixel shows
+    the person, (h, w).
+    """
     if not person.any():
         return _EMPTY
     if person.all():
@@ -618,7 +630,7 @@ def has_alpha(photo: Path) -> bool:
 
 
 def is_transparent(photo: Path) -> bool:
-    """Returns whether a photo has transparent pixels. An opaque alpha channel is no mask.
+    """Returns whether any pixel of a photo is transparent. It is False for an opaque alpha channel.
 
     Raises: CaptureError if the file cannot be read.
     """

@@ -50,17 +50,19 @@ from humangs_jax.io.reading import (
 )
 
 _FISHEYE = ("fisheye", "is_fisheye", "equidistant")
-"""Words for fisheye lenses. They are values of `model` and similar keys, or keys whose value is
-true.
+"""Words that mark a fisheye lens. A file has such a word as a value (of `model`, for example), or
+as a key with a true value.
 """
 
 
 Where = Callable[[str], tuple[Path, str]]
-"""Function that returns file and field of a camera's key, for errors."""
+"""Type of a function that takes a camera's key. It returns the file and the name of the field, for
+error messages.
+"""
 
 
 def _in_map(file: Path, name: str) -> Where:
-    """Returns the function that finds file and field of keys in a map of this name."""
+    """Returns a `Where` for the keys of the map with this name."""
     return lambda key: (file, f"{name}.{key}")
 
 
@@ -121,9 +123,10 @@ def read_easymocap(source: CalibrationFile, format: CameraFormat) -> Calibration
 def _flat_cameras(
     values: Mapping[str, Any], file_of: Callable[[str], Path]
 ) -> list[CalibratedCamera]:
-    """Reads cameras whose names are at the end of their keys. The list `names` has their names.
-    Without this list, the cameras that have a K are read. file_of: returns the file of a key, for
-    errors.
+    """Reads cameras from a map of all cameras' values, in which each key ends with a camera's name.
+    The list `names` in the map gives the names. Without this list, each key K_NAME gives a name.
+
+    file_of: returns the file that has a key, for errors.
     """
     names = list(values.get("names") or (key[2:] for key in values if key.startswith("K_")))
     if not names:
@@ -182,8 +185,8 @@ def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> Calibrate
 
 
 def _lens(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
-    """Returns the fields of `CalibratedCamera` for the lens. For a fisheye lens they include the
-    error for commands that need photos without distortion.
+    """Returns the fields of `CalibratedCamera` that describe the lens. A fisheye lens gets an error
+    among them, which is raised by commands that need photos without distortion.
     """
     coefficients, at, refusal = None, "", None
     for key, value in values.items():
@@ -204,8 +207,10 @@ def _lens(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
 
 
 def _of_shelf(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
-    """Converts a camera of Shelf and Campus (VoxelPose) to OpenCV's values. Shelf has focal lengths
-    and principal point under their names, the lens as k and p, and T is the position of the camera.
+    """Returns OpenCV's values of a camera in the format of Shelf and Campus (VoxelPose).
+
+    In this format fx, fy, cx and cy stand alone. The distortion is in k (k1, k2, k3) and p (p1,
+    p2). T is the position of the camera in the world.
     """
 
     def numbers(key: str, *shape: int) -> Float[np.ndarray, "..."]:
@@ -261,10 +266,10 @@ class _Loader(yaml.SafeLoader):
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Returns the next node.
+        """Returns the next node of the YAML file.
 
-        Raises: MarkedYAMLError for an alias, because a small file can nest aliases to billions of
-        values. InvalidFileError if nodes are nested too deeply.
+        Raises: MarkedYAMLError for an alias, because a small file can expand to billions of values
+        through nested aliases. InvalidFileError if nodes are nested too deeply.
         """
         if self.check_event(yaml.AliasEvent):
             where = self.get_event().start_mark
@@ -278,8 +283,8 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(node: yaml.Node, file: Path) -> Any:
-    """Returns the value of a node. Numbers are read here, because YAML would read the camera's name
-    01 as a number.
+    """Returns the Python value of a YAML node. Numbers are parsed here, and not by the YAML
+    library, so that the name 01 of a camera stays text.
     """
     if isinstance(node, yaml.ScalarNode):
         value = _scalar(node.value) if node.style is None else node.value
@@ -317,7 +322,9 @@ def _matrix(value: Any, tag: str, file: Path, where: str) -> Float[np.ndarray, "
 
 
 def _matrices(value: Any, file: Path, field: str) -> Any:
-    """Returns JSON values in which maps that describe matrices are replaced by arrays."""
+    """Returns JSON values. Each map in them that describes a matrix is replaced by an array, (rows,
+    columns).
+    """
     if isinstance(value, list):
         return [_matrices(item, file, field) for item in value]
     if not isinstance(value, dict):
@@ -341,7 +348,7 @@ def recognizes_panoptic(source: CalibrationFile) -> bool:
 
 
 def read_panoptic(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """Reads the cameras of the list.
+    """Reads the cameras in the file's list "cameras".
 
     Raises: CaptureError with the name of the key.
     """
@@ -367,8 +374,8 @@ def read_panoptic(source: CalibrationFile, format: CameraFormat) -> Calibration:
 # -------------------------------------------
 
 _RELATIVE = "_to_"
-"""Separator of the names of two cameras in a key: "a_to_b" has the pose of a relative to b, with
-X_a = R X_b + T.
+"""Text between the names of two cameras in a key. The key "a_to_b" has the pose (R, T) of camera a
+relative to b, with X_a = R X_b + T.
 """
 
 
@@ -380,9 +387,10 @@ def recognizes_multical(source: CalibrationFile) -> bool:
 
 
 def read_multical(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """Reads lenses and poses of the cameras. A pose that is not relative to another camera is in
-    the world. If other poses are relative to a camera that has no pose, this camera's axes are
-    those of the world.
+    """Reads the lenses and the poses of the cameras.
+
+    A pose that is not relative to another camera is relative to the world. If poses are relative to
+    a camera that has no pose, the axes of this camera are the world's.
 
     Raises: CaptureError with the name of the key.
     """
@@ -423,8 +431,9 @@ def read_multical(source: CalibrationFile, format: CameraFormat) -> Calibration:
 
 
 def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
-    """Splits a key of `camera_poses`. Returns the camera that it places, and the camera that the
-    pose is relative to, or None if the pose is in the world. names: names of all cameras.
+    """Splits a key of `camera_poses` into the name of the camera whose pose it has, and the name of
+    the camera to which the pose is relative. The second is None if the pose is relative to the
+    world. names: names of all cameras.
     """
     parts = key.split(_RELATIVE)
     for i in range(1, len(parts)):
@@ -489,9 +498,9 @@ def _tables(source: CalibrationFile) -> dict[str, Mapping[str, Any]]:
 # ------------------------------------------------------------------------------------------
 
 _SUBPIXELS = 64.0
-"""Number of units of intrinsics in a pixel."""
+"""Focal lengths and principal points in the file are in units of 1/64 pixel."""
 _LENS = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
-"""Attributes of Brown and Conrady's coefficients, in the order k1, k2, p1, p2."""
+"""XML attributes of the Brown-Conrady coefficients, in the order k1, k2, p1, p2."""
 
 
 def recognizes_qualisys(source: CalibrationFile) -> bool:
@@ -501,7 +510,7 @@ def recognizes_qualisys(source: CalibrationFile) -> bool:
 
 
 def read_qualisys(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """Reads the cameras of a file.
+    """Reads the cameras of the file that have a transform.
 
     Raises: CaptureError with the name of the camera and what is missing. InvalidFileError if the
     XML declares entities.

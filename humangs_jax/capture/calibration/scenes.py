@@ -42,8 +42,9 @@ from humangs_jax.data.formats import CameraFormat
 from humangs_jax.io.reading import InvalidFileError, read_bytes, reading, shown
 
 Registered = tuple[str, str, str, Sequence[float], np.ndarray]
-"""An image of a COLMAP model: its position in the file for errors, its name, the id of its camera,
-quaternion and translation (7 numbers), and its points (n, 3) as x, y and id.
+"""An image of a COLMAP model. The five entries are its position in the file (for errors), its name,
+the id of its camera, seven numbers (quaternion w, x, y, z and translation), and its points, (n, 3),
+each as x and y in pixels and the id of the 3D point.
 """
 _PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -62,9 +63,10 @@ NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9), _PARAMETERS, strict=True))
 
 
 def read_colmap(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """Reads the images of a COLMAP model that are registered, in the order of its file.
+    """Reads a COLMAP model. There is one camera for each registered image, in the order of the
+    images file.
 
-    Raises: CaptureError with the name of the file, and the line if the model is text.
+    Raises: CaptureError with the name of the file, and with the line if the model is text.
     """
     # a model is text or binary; both are read into the same values
     text = any((source.path / name).is_file() for name in ("images.txt", "cameras.txt"))
@@ -146,7 +148,7 @@ def _pose(values: Sequence[float], file: Path, where: str) -> Float[np.ndarray, 
 
 
 def _lines(file: Path) -> Iterator[tuple[str, str]]:
-    """Yields where each line is ("line 3") and its text, without comments."""
+    """Yields the position of each line, such as "line 3", and the line. Comments are left out."""
     lines = enumerate(checked_text(file).splitlines(), 1)
     return ((f"line {number}", line) for number, line in lines if not line.startswith("#"))
 
@@ -349,10 +351,11 @@ def _frame_camera(
 def _frame_intrinsics(
     values: Mapping[str, Any], size: tuple[int, int] | None, file: Path, prefix: str
 ) -> Float[np.ndarray, "3 3"]:
-    """Returns K from a whole matrix, or from focal lengths and a principal point. Where the file
-    does not say otherwise, pixels are square and the principal point is the middle.
+    """Returns K, from a complete matrix or from focal lengths and a principal point. If the file
+    has one focal length, it holds for both axes. If the file has no principal point, it is the
+    middle of the image.
 
-    Raises: CaptureError if there is neither.
+    Raises: CaptureError if the file has neither a matrix nor a focal length.
     """
     for key in _MATRICES:
         if key in values and "fl_x" not in values:
@@ -375,10 +378,11 @@ def _frame_intrinsics(
 
 
 def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str, Any]:
-    """Returns the fields of a `CalibratedCamera` that describe the lens. For a lens that cannot be
-    undistorted, they include the error for commands that need photos without distortion.
+    """Returns the fields of `CalibratedCamera` that describe the lens. A lens that cannot be
+    undistorted gets an error among them, which is raised by commands that need photos without
+    distortion.
 
-    Raises: CaptureError if the model of the camera is not supported.
+    Raises: CaptureError if the camera model is not supported.
     """
     model, refusal = values.get("camera_model", "OPENCV"), None
     if model not in _CAMERA_MODELS:
@@ -414,12 +418,12 @@ def _number(values: Mapping[str, Any], key: str, file: Path, prefix: str) -> flo
 def _find_moments(
     frames: Sequence[Mapping[str, Any]], cameras: Sequence[CalibratedCamera], file: Path
 ) -> tuple[list[int], int]:
-    """Returns the number of each image's moment, from 0 in the order of time, and the number of
-    cameras.
+    """Returns the number of each image's moment, counted from 0 in the order of time, and the
+    number of cameras.
 
-    Raises: CaptureError with the name of the key, if some images lack the value, if a value is no
-    time, if two images with one name of a camera are of one moment, or if a camera has several
-    images and nothing shows which images were taken together.
+    Raises: CaptureError with the name of the key. It is raised if only some images have the key, if
+    a value is not a time, if two images have the same camera name and the same time, or if one of
+    several cameras has several images and the file has no times.
     """
     # which moment and which camera an image is of, by the first of these keys that is there
     of_time = (
@@ -473,10 +477,11 @@ def _find_moments(
 def _values(
     frames: Sequence[Mapping[str, Any]], keys: Sequence[str], file: Path
 ) -> tuple[str, list[Any]]:
-    """Returns the first of the keys that an image has, and its values in all images, which are
-    numbers or names. If no image has any of the keys, it returns "" and no values.
+    """Returns the first of `keys` that any image has, and its value in each image, which is a
+    number or text. If no image has any of the keys, it returns "" and an empty list.
 
-    Raises: CaptureError if only some images have the key.
+    Raises: CaptureError if only some images have the key, or if a value is neither a finite number
+    nor text.
     """
     key = next((key for key in keys if any(key in frame for frame in frames)), "")
     values = []

@@ -1,5 +1,5 @@
-"""Takes photos out of videos with ffmpeg (imageio-ffmpeg): a folder for each camera if they are
-synchronised, or the best frames of one camera.
+"""Takes photos out of videos with ffmpeg (imageio-ffmpeg). Synchronised videos of several cameras
+give a folder of frames for each camera. One video of one camera gives its best frames.
 
     CAMERA.mp4 (.m4v, .mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0,
                                                  every, 2 every ...
@@ -35,7 +35,7 @@ from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import InvalidFileError, check_limit, limits, open_file, reading
 
 _LONGEST_SECONDS = 3600
-"""Time after which ffmpeg is stopped, seconds."""
+"""Longest run of one ffmpeg command, seconds. It is then stopped."""
 
 
 def find_videos(folder: Path) -> dict[str, Path]:
@@ -60,17 +60,19 @@ class _Shown(NamedTuple):
     """How frames have to be converted so that they look as a player shows them."""
 
     shape: str = ""
-    """ffmpeg's filter that makes pixels square. Empty if they are."""
+    """ffmpeg filter that makes pixels square. Empty if they are square already."""
     matrix: str = "auto"
-    """ffmpeg's name of the matrix from YCbCr to RGB."""
+    """ffmpeg's name for the matrix from YCbCr to RGB."""
     encoding: Encoding | None = None
-    """Encoding of colors that are not sRGB's, or None."""
+    """How the video encodes colors. None if its colors are sRGB."""
     about: str = ""
     """Description of the colors, for a note."""
     rate: float | None = None
     """Mean number of frames per second, or None if unknown."""
     from_zero: bool = False
-    """Whether the times that ffmpeg prints have to be those of the file (-copyts)."""
+    """Whether ffmpeg has to print times as they are in the file, with -copyts. It is False for MPEG
+    transport streams.
+    """
 
 
 class VideoPhotos(NamedTuple):
@@ -91,10 +93,10 @@ def photos_of_videos(
     images: Path, masks: Path | None, place: Path, every: int = 1, most: int | None = None
 ) -> Generator[VideoPhotos]:
     """Yields folders of photos and masks. If a folder holds videos, their frames are written to a
-    temporary folder beside `place`, which is removed at the end. Folders of photos are yielded as
-    they are.
+    temporary folder beside `place`, which is removed at the end. Folders of photos are yielded
+    unchanged.
 
-    Phones store photos and the clips of Live Photos in one folder. Where a folder holds both, the
+    Phones store photos and the clips of Live Photos in one folder. If a folder holds both, the
     photos count, unless `every` or `most` is given.
 
     Args:
@@ -104,8 +106,9 @@ def photos_of_videos(
         every: step between frames, or between moments of several videos. The first frame or moment
             is 0.
         most: largest number of photos of a camera. None: all.
-    Raises: CaptureError with the name of the video, if a camera lacks the video of its photos or of
-    its masks, or if `every` or `most` is given and there are no videos.
+    Raises: CaptureError. With `masks`, it is raised for a camera that has a video of only one kind,
+    of photos or of masks. It is raised without videos if `every` or `most` is given. It is raised
+    with the name of a video that cannot be read.
     """
     # videos of photos, and those of masks, where there are any
     asked = every != 1 or most is not None
@@ -155,8 +158,9 @@ def photos_of_videos(
 
 
 def _meant_videos(folder: Path, asked: bool) -> dict[str, Path]:
-    """Returns the videos of a folder by the name of their camera. If the folder also holds photos,
-    and no frames are asked for, the result is empty.
+    """Returns the videos of a folder, by the name of their camera. The result is empty if the
+    folder also holds photos and `asked` is False. asked: whether the user asked for frames of
+    videos.
     """
     if not asked and scan_folder(folder).photos:
         return {}
@@ -165,8 +169,9 @@ def _meant_videos(folder: Path, asked: bool) -> dict[str, Path]:
 
 @contextlib.contextmanager
 def named_after(temporary: Path, folder: Path) -> Generator[None]:
-    """Replaces the path of a temporary folder in ValueErrors by the path of the folder that it was
-    made of, because the temporary folder is gone when the errors are read.
+    """Context manager that corrects the path in errors. If a ValueError is raised inside and its
+    message names the temporary folder, the message gets the path of `folder`. The temporary folder
+    no longer exists when the user reads the message.
 
     Raises: CaptureError with the replaced path.
     """
@@ -182,9 +187,9 @@ def named_after(temporary: Path, folder: Path) -> Generator[None]:
 def _moments(
     videos: Mapping[str, Path], every: int, most: int | None
 ) -> tuple[Moments | None, float | None]:
-    """Returns the moments of several videos, and how many seconds of the videos were looked at. The
-    moments are None for a single video, or if only the first frames are taken. The seconds are None
-    if whole videos were looked at.
+    """Returns the moments of several videos, and how many seconds at the start of each video were
+    read. The moments are None for a single video, or if only the first frames are taken. The
+    seconds are None if whole videos were read.
     """
     if len(videos) < 2 or most == 1:
         return None, None
@@ -200,9 +205,11 @@ def _moments(
 def _mask_frames(
     path: Path, camera: str, moments: Moments, seconds: float | None
 ) -> list[int | None]:
-    """Returns the number of a camera's mask at each moment, or None at moments without a photo or
-    mask. If there are as many masks as photos, or if the masks' times are not known, the numbers
-    are those of the photos. Otherwise masks are found by their times.
+    """Returns for each moment the index of the frame in a video of masks. None if the moment has no
+    photo or no mask.
+
+    If the videos of masks and of photos have the same number of frames, or if the masks' times are
+    not known, a mask has the index of its photo. Otherwise masks are found by their times.
     """
     times = frame_times(path, seconds)
     if len(times) == moments.counts[camera] or not np.isfinite(times).all():
@@ -215,8 +222,9 @@ def _mask_frames(
 
 
 def frame_times(path: Path, seconds: float | None = None) -> Float[np.ndarray, " n"]:
-    """Returns the times at which the frames of a video are shown, (n,), seconds, in order. NaN
-    where the video does not say. seconds: how much of the video is read. None: all.
+    """Returns the time at which each frame of a video is shown, (n,), seconds, in the order of the
+    video. NaN if the video does not state the time. seconds: how much of the video is read. None:
+    all.
 
     Raises: CaptureError with the name of the video.
     """
@@ -243,17 +251,18 @@ def split_video(
     chosen: Sequence[int | None] | None = None,
     mask_of: Path | None = None,
 ) -> int:
-    """Writes frames of a video as 00000000.png, ... into a new folder. Returns the number of pixels
-    in all frames so far.
+    """Writes frames of a video as 00000000.png, ... into a new folder. Returns `before` plus the
+    number of pixels in the written frames.
 
     Args:
         every: step between frames.
         most: largest number of frames. None: all.
-        before: pixels of the frames of other videos, which count towards the limit `video_pixels`.
-        chosen: number of the frame for each file, ascending, in place of `every` and `most`. There
-            is no file for None.
-        mask_of: the video whose masks these are. Masks get the pixel shape of its frames, and their
-            values are not converted as colors.
+        before: number of pixels in frames of other videos. They count towards the limit
+            `video_pixels`.
+        chosen: index of the frame for each file, ascending, in place of `every` and `most`. None in
+            this list: the file is not written.
+        mask_of: the video of photos, if `path` is a video of its masks. Masks are scaled to the
+            pixel shape of that video, and their values are not converted as colors.
     Raises: CaptureError with the name of the video.
     """
     with reading(path, "video", CaptureError):
@@ -290,9 +299,10 @@ def _write_chosen(path: Path, folder: Path, chosen: Sequence[int | None], shown:
 
 
 def _expression(numbers: Sequence[int]) -> str:
-    """Returns ffmpeg's condition that selects the frames with these numbers.
+    """Returns the ffmpeg expression that selects the frames with these numbers.
 
-    Raises: InvalidFileError if the numbers follow no rule and are too many for a command.
+    Raises: InvalidFileError if the numbers consist of more than 2000 arithmetic progressions, which
+    is too long for a command line.
     """
     terms = []
     for first, step, last in progressions(numbers):
@@ -324,36 +334,38 @@ def _frame_size(path: Path, shown: _Shown) -> tuple[int, int]:
 # ---------------------------------------------------------------------------------------
 
 _STREAM = re.compile(r"^ *Stream #0:\d+.*?: Video: (.*)$", re.MULTILINE)
-"""Pattern of ffmpeg's line about the stream of pictures."""
+"""Regular expression of the line that ffmpeg prints about the video stream."""
 COLORS = re.compile(r"\b\w+\((?:\w+, )?([\w-]+)/([\w-]+)/([\w-]+)[,)]")
-"""Pattern of matrix, primaries and curve, which follow the format of pixels: yuv420p10le(tv,
-bt2020nc/bt2020/arib-std-b67, progressive).
+"""Regular expression of matrix, primaries and transfer curve in that line. They follow the pixel
+format: yuv420p10le(tv, bt2020nc/bt2020/arib-std-b67, progressive).
 """
 _PIXEL_SHAPE = re.compile(r"\[SAR (\d+):(\d+) ")
-"""Pattern of the ratio of a pixel's width to its height."""
+"""Regular expression of the sample aspect ratio, a pixel's width to its height."""
 RATE = re.compile(r", ([\d.]+)(k?) fps\b")
-"""Pattern of frames per second, perhaps in thousands."""
+"""Regular expression of the number of frames per second. A "k" after the number stands for
+thousands.
+"""
 PRIMARIES = {"bt2020": 9, "smpte432": 12}
-"""ffmpeg's names of primaries -> numbers of H.273. Other primaries count as sRGB's, and unknown
-primaries of a video of high dynamic range as bt2020.
+"""Code points of H.273 for ffmpeg's names of color primaries. All other primaries are taken for
+sRGB's. Unknown primaries of a video of high dynamic range are taken for bt2020.
 """
 _TRANSFERS = {"smpte2084": 16, "arib-std-b67": 18}
-"""ffmpeg's names of the transfer curves of high dynamic range -> numbers of H.273. Other curves
-count as sRGB's.
+"""Code points of H.273 for ffmpeg's names of transfer curves of high dynamic range. All other
+curves are taken for sRGB's.
 """
 _WIDEST_PIXEL = 4
-"""Largest ratio of the sides of a pixel. The largest in use is 2."""
+"""Largest ratio of a pixel's longer side to its shorter side. The largest in use is 2."""
 _SQUARE = "scale=w=round(iw*max(sar\\,1)):h=round(ih*max(1/sar\\,1)),setsar=1"
 """Filter that makes pixels square. It only enlarges frames, so that nothing is lost."""
 _TABLE = "colors.cube"
-"""Name of the temporary file with the table of colors."""
+"""Name of the temporary file with the color lookup table."""
 
 
 def _shown(path: Path) -> _Shown:
-    """Returns what ffmpeg prints about how a video is shown.
+    """Returns how the frames of a video have to be converted, from what ffmpeg prints about it.
 
-    Raises: OSError if the file cannot be read. InvalidFileError for pixels that are too far from
-    square.
+    Raises: OSError if the file cannot be read. InvalidFileError if a pixel is longer than
+    `_WIDEST_PIXEL` times its other side.
     """
     open_file(path).close()
     # without an output ffmpeg fails, after it has printed what is there
@@ -396,9 +408,11 @@ def _with_colors(shown: _Shown, matrix: str, primaries: str, transfer: str) -> _
 
 
 def _shown_as_mask(path: Path, photos: Path) -> _Shown:
-    """Returns how a video of masks is shown. Its values are not converted as colors. If it states
-    no pixel shape, and its frames have the stored size of the video of photos, it gets the pixel
-    shape of that video.
+    """Returns how the frames of a video of masks have to be converted. Their values are not
+    converted as colors.
+
+    If the video of masks states no pixel shape, and its stored frames are as large as those in the
+    video of photos, it is scaled to the size that the photos have with square pixels.
     """
     own, theirs = _shown(path), _shown(photos)
     as_stored = _Shown()
@@ -466,7 +480,9 @@ def color_frames(
 def _small_frames(
     path: Path, longer_side: int, pixels: str, chosen: Sequence[int] | None
 ) -> Iterator[UInt[np.ndarray, "h w c"]]:
-    """Yields frames in ffmpeg's pixel format `pixels`, see `grey_frames` and `color_frames`."""
+    """Yields frames in ffmpeg's pixel format `pixels`, (h, w, c), see `grey_frames` and
+    `color_frames`.
+    """
     with reading(path, "video", CaptureError):
         width, height = _frame_size(path, _shown(path))
         # frames of the size that is wanted, raw, through a pipe
@@ -511,7 +527,9 @@ def frame_rate(path: Path) -> float | None:
 
 
 def _opened(path: Path, verbosity: str = "error") -> list[str]:
-    """Returns the beginning of a command of ffmpeg: the program, and the video that it reads."""
+    """Returns the beginning of an ffmpeg command: the program, its general options, and the input
+    video.
+    """
     import imageio_ffmpeg
 
     command = [
@@ -535,8 +553,8 @@ def _ffmpeg(path: Path, filters: str) -> list[str]:
 
 
 def _run(path: Path, folder: Path, select: str, most: int, shown: _Shown) -> int:
-    """Writes at most `most` frames for which ffmpeg's expression `select` is not 0. Returns how
-    many were written.
+    """Writes the frames for which the ffmpeg expression `select` is not 0, at most `most` of them.
+    Returns how many were written.
     """
     table, filters = folder / _TABLE, [f"select={select}", *filter(None, [shown.shape])]
     if shown.encoding is not None:
