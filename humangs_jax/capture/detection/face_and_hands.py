@@ -1,9 +1,10 @@
-"""Finds face and hands of a person that BlazePose has found: scores of ARKit's shapes, and 21
-landmarks of each hand, by mediapipe's networks in LiteRT.
+"""Finds the face and the hands of a person that BlazePose has found. For a face it returns scores
+of ARKit's shapes, and for each hand 21 landmarks. The networks are mediapipe's, run by LiteRT.
 
-The networks look twice at a face or a hand. The first region follows from BlazePose's landmarks,
-and the second from the first look, as mediapipe does from one frame of a video to the next. The
-regions are those of mediapipe's graphs of faces and hands: squares that are turned upright.
+The networks look twice at a face or a hand. The first region is computed from BlazePose's
+landmarks, and the second from the landmarks that the first look found. Mediapipe does this from one
+frame of a video to the next. Regions are squares, turned so that the face or the hand is upright,
+as in mediapipe's graphs.
 """
 
 from typing import NamedTuple
@@ -21,22 +22,24 @@ _HAND_SIZE = 224
 _HAND_POINTS = 21
 """Number of landmarks of a hand."""
 _LEAST_PRESENCE = 0.5
-"""Least probability of a face or a hand that is believed."""
+"""A face or a hand counts as found if the network gives it at least this probability."""
 _ENLARGED = {"face": 1.5, "palm": 2.0}
-"""Side of a region over that of the box around the landmarks."""
+"""Factor by which the bounding square of the landmarks is enlarged to the region."""
 _HAND_REGIONS = (1.9, 2.7)
-"""Sides of the regions in which a hand is looked for, one after the other, over twice the length
-from the wrist to the knuckles. Mediapipe uses 2.7. Of 54 hands of synthetic people that are in view
-it finds 35, 1.9 finds 47, and both find 51. A hand that points at the camera needs the larger one.
+"""Sides of the two regions in which a hand is looked for, one after the other. The unit is twice
+the length from the wrist to the knuckles.
+
+Mediapipe uses 2.7. Of 54 visible hands of synthetic people, 2.7 finds 35, 1.9 finds 47, and both
+together find 51. A hand that points at the camera needs the larger region.
 """
 PALM = (0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18)
-"""Indices of the landmarks of a hand that the region of the next look follows from. They are those
-of the palm and near it, because fingers move more.
+"""Indices of the hand landmarks from which the region of the next look is computed. They lie on the
+palm and near it, because fingers move more.
 """
 SMALLEST = 24.0
 """Least side of a region in which faces and hands are looked for, pixels."""
 SHAPE_NAMES = ARKIT[:-1]
-"""Names of the scores. They are ARKit's shapes except for that of the tongue."""
+"""Names of the scores: all of ARKit's shapes except the tongue."""
 SHAPE_POINTS = (
     0, 1, 4, 5, 6, 7, 8, 10, 13, 14, 17, 21, 33, 37, 39, 40, 46, 52, 53, 54, 55, 58, 61, 63,
     65, 66, 67, 70, 78, 80, 81, 82, 84, 87, 88, 91, 93, 95, 103, 105, 107, 109, 127, 132, 133,
@@ -47,14 +50,14 @@ SHAPE_POINTS = (
     380, 381, 382, 384, 385, 386, 387, 388, 389, 390, 397, 398, 400, 402, 405, 409, 415, 454,
     466, 468, 469, 470, 471, 472, 473, 474, 475, 476, 477,
 )  # fmt: skip
-"""Indices of the face's landmarks that the network of the scores reads."""
+"""Indices of the face landmarks that are the input of the network for the scores."""
 _EYES, _MOUTH, _WRISTS = (2, 5), (9, 10), (15, 16)
-"""Indices of BlazePose's landmarks of the eyes, the corners of the mouth, and the wrists, each with
-the left one first.
+"""Indices of BlazePose's landmarks of the eyes, the corners of the mouth, and the wrists. In each
+pair the left one comes first.
 """
 _EYE_CORNERS, _WRIST, _ROOTS = (33, 263), 0, (5, 9, 13)
-"""Indices of landmarks: of the face, the outer corners of the right and the left eye; of a hand,
-the wrist, and the roots of index, middle and ring finger.
+"""Indices of landmarks. `_EYE_CORNERS` are the outer corners of the right and the left eye in the
+face. `_WRIST` and `_ROOTS` (index, middle and ring finger) are in the hand.
 """
 
 
@@ -74,7 +77,7 @@ class Hand(NamedTuple):
 
 
 class FaceAndHands:
-    """Mediapipe's networks of faces, of their shapes, and of hands.
+    """Runs mediapipe's networks for face landmarks, scores of face shapes, and hand landmarks.
 
     Raises: ImportError if LiteRT is missing. It says what to install.
     """
@@ -112,8 +115,8 @@ class FaceAndHands:
         body: Float[np.ndarray, "33 2"],
         visibility: Float[np.ndarray, " 33"],
     ) -> tuple[Hand | None, Hand | None]:
-        """Returns the left and the right hand of a person. A hand that is not found, or whose wrist
-        is hidden, is None.
+        """Returns the left and the right hand of a person. None stands for a hand that is not
+        found, or that has a hidden wrist.
 
         photo: values in [0, 1]. body and visibility: BlazePose's landmarks of the person, (33, 2),
         pixels, and their visibilities, (33,).
@@ -130,7 +133,9 @@ class FaceAndHands:
     def _found_hand(
         self, photo: Float[np.ndarray, "h w 3"], body: Float[np.ndarray, "33 2"], side: int
     ) -> Hand | None:
-        """Returns the hand of a side from the first region that shows one, or None."""
+        """Returns the left (side 0) or the right (side 1) hand, from the first region in which a
+        hand is found. None if there is none.
+        """
         for enlarged in _HAND_REGIONS:
             region = hand_region(body, side, enlarged)
             hand = self._hand_in(photo, region, body[_WRISTS[side]])
@@ -162,10 +167,12 @@ class FaceAndHands:
 def hand_columns(
     hands: tuple[Hand | None, Hand | None], body: Float[np.ndarray, "33 3"]
 ) -> Float[np.ndarray, "42 6"] | None:
-    """Returns pixels, presence and positions of the landmarks of the left and then of the right
-    hand, (42, 6). A hand that was not seen has zeros. None if neither was seen.
+    """Returns the landmarks of both hands, (42, 6), first of the left and then of the right hand.
+    The columns are x and y in pixels, the presence, and x, y and z in metres. The rows of a hand
+    that was not found are 0. None if neither was found.
 
-    body: BlazePose's landmarks in space, (33, 3), metres. The hands begin at its wrists.
+    body: BlazePose's landmarks in space, (33, 3), metres. The positions of a hand begin at its
+    wrist.
     """
     if hands == (None, None):
         return None
@@ -181,7 +188,9 @@ def _probability(logit: np.ndarray) -> float:
 
 
 def _angle(across: Float[np.ndarray, "2"]) -> float:
-    """Returns the angle of a region whose x axis points along `across`, clockwise, radians."""
+    """Returns the angle of a region, clockwise, radians. across: direction of its x axis in the
+    photo.
+    """
     return float(np.arctan2(across[1], across[0]))
 
 
@@ -215,8 +224,8 @@ def hand_region(body: Float[np.ndarray, "33 2"], side: int, enlarged: float) -> 
 
 
 def _palm_region(points: Float[np.ndarray, "21 2"]) -> Crop:
-    """Returns the region of the next look. points: landmarks of the hand in this look, (21, 2),
-    pixels.
+    """Returns the square in which the network looks at a hand the second time. points: landmarks
+    that it found in the first look, (21, 2), pixels.
     """
     index, middle, ring = points[list(_ROOTS)]
     x, y = ((index + ring) / 2 + middle) / 2 - points[_WRIST]
@@ -227,8 +236,8 @@ def _palm_region(points: Float[np.ndarray, "21 2"]) -> Crop:
 
 
 def _around(points: Float[np.ndarray, "n 2"], angle: float, enlarged: float) -> Crop:
-    """Returns the square around points, (n, 2), turned by an angle, radians. enlarged: factor on
-    its side.
+    """Returns the smallest square with a given angle (radians) that contains points, (n, 2),
+    pixels, with its side multiplied by `enlarged`.
     """
     turned = Crop(np.zeros(2), 1.0, angle)
     own = points @ turned.turn

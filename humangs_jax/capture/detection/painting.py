@@ -7,19 +7,21 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.io.images import resized
 
 _LEAST_NEAR = 1e-3
-"""Weight of the colors far away. They count where the colors nearby have less weight."""
+"""Weight of the mean color of the wider surroundings. It matters only where almost no kept pixel is
+near.
+"""
 
 
 def painted_over(
     photo: Float[np.ndarray, "h w 3"], covered: Bool[np.ndarray, "h w"], margin: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Returns the photo with covered pixels replaced by the colors around them, and which pixels
-    were painted, (h, w). These are a little more than the covered ones.
+    were replaced, (h, w). `margin` makes the replaced area a little larger than the covered one.
 
     A plain color would have an outline, which the detector takes for the outline of a person.
 
-    Arguments: margin: how far the painting reaches beyond the covered pixels, whose rim may show
-    the person, a share of the photo's longest side.
+    Arguments: margin: how far the replaced area reaches beyond the covered pixels, as a share of
+    the photo's longer side. The pixels just outside may still show the person.
     """
     height, width = photo.shape[:2]
     # the detector sees no more than 512 pixels

@@ -1,24 +1,27 @@
-"""Finds all people of a photo with BlazePose (https://arxiv.org/abs/2006.10204): small people too,
+"""Finds all people in a photo with BlazePose (https://arxiv.org/abs/2006.10204), even small people,
 and whichever way up the photo is.
 
 The result for each person is 33 landmarks in the image, 33 landmarks in metres, and a mask.
 
-LiteRT runs two networks. The detector looks at a square window of the photo and finds, for each
-person, the middle of the hips and a point whose distance from it is the size of the body. The
-landmark network looks at the square around the person, turned so that the person stands upright.
-Pre- and postprocessing are those of mediapipe's pose graph, in numpy. Samples are bilinear, begin
-at the crop's corner, and have no antialiasing, because the networks depend on this.
+LiteRT runs two networks. The detector looks at a square window of the photo. For each person it
+finds the middle of the hips, and a second point whose distance from the hips is the body's size.
+The landmark network looks at the square around the person, turned so that the person stands
+upright.
 
-Pixels of the networks are mediapipe's: (x, y), with the centre of the first pixel at 0.
-`apps.detect` adds half a pixel for our convention.
+Pre- and postprocessing are the same as in mediapipe's pose graph, in numpy. Samples are bilinear,
+begin at the crop's corner, and have no antialiasing, because the networks depend on this.
 
-The detector finds people that are at least a third of its window's side. So it looks at the whole
-photo and at windows of half the photo's longer side, which overlap by half. Where these show nobody
-large, it also looks at windows of a quarter. Detections in several windows are one person if their
-landmarks agree.
+Pixels are mediapipe's: (x, y), with the centre of the first pixel at 0. `apps.detect` adds half a
+pixel for our convention.
 
-Of people who stand close together the detector finds only some. So the people it found are painted
-over with the colors around them, and it looks again, until it finds nobody more: see `find_people`.
+The detector finds people who are at least a third as large as its window. So it looks at the whole
+photo and at windows of half the photo's longer side, which overlap by half. If nobody large is
+found there, it also looks at windows of a quarter. Detections in several windows count as one
+person if hips and size agree.
+
+If people stand close together, the detector finds only some of them. So the people who were found
+are painted over with the colors around them, and the detector looks again, until it finds nobody
+more. See `find_people`.
 """
 
 import contextlib
@@ -50,16 +53,14 @@ LANDMARK_SIZE = 256
 _LANDMARK_COUNT = 33
 """Number of landmarks of a person."""
 _ALIGNMENT = 6
-"""Number of further points that the landmark network finds. The first two are the points of the
-detector, found again.
+"""Number of further points that the landmark network returns. The first two are the same points as
+the detector's: the middle of the hips, and the point that shows the body's size.
 """
 ENLARGED = 1.25
-"""Side of the crop over the diameter of the circle around the hips through the detector's second
-point.
-"""
+"""Side of a crop, divided by twice the distance between the detector's two points."""
 _PEAK = 0.5
-"""Least peak of a landmark's heatmap. Where the heatmap around a landmark is this high, the
-landmark moves to its centroid.
+"""A landmark moves to the centroid of the heatmap around it if the heatmap reaches this value
+there. If not, the landmark stays.
 """
 WINDOW = 7
 """Side of the window in which the centroid of a heatmap is computed, pixels of the heatmap."""
@@ -77,17 +78,19 @@ class Crop(NamedTuple):
 
     @property
     def turn(self) -> Float[np.ndarray, "2 2"]:
-        """The rotation from the crop's axes to those of the photo, (2, 2)."""
+        """Rotation from the crop's axes to the photo's axes, (2, 2)."""
         c, s = np.cos(self.angle), np.sin(self.angle)
         return np.asarray([[c, -s], [s, c]])
 
     def to_photo(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Converts points of the crop, (..., 2), in [0, 1], to pixels of the photo."""
+        """Converts points of the crop to pixels of the photo, (..., 2). The crop reaches from 0 to
+        1 in both axes.
+        """
         return self.center + (points - 0.5) * self.side @ self.turn.T
 
     def from_photo(self, pixels: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Converts pixels of the photo, (..., 2), to points of the crop, which is [0, 1] x [0,
-        1].
+        """Converts pixels of the photo to points of the crop, (..., 2). The crop reaches from 0 to
+        1 in both axes.
         """
         return (pixels - self.center) @ self.turn / self.side + 0.5
 
@@ -119,8 +122,8 @@ class Landmarks(NamedTuple):
     """Probability that a landmark is seen and not hidden, (33,)."""
     world: Float[np.ndarray, "33 3"]
     """Landmarks relative to the middle of the hips, (33, 3), metres. Axes are the camera's (x
-    right, y down, z away), as if the camera looked straight at the person, who is taken to be of
-    average size.
+    right, y down, z away). They are as if the camera looked straight at the person, and the person
+    had average size.
     """
     presence: float
     """Probability that the crop shows a person."""
@@ -129,7 +132,9 @@ class Landmarks(NamedTuple):
     crop: Crop
     """The square of the photo that the network looked at."""
     again: Detection
-    """The points of the detector, as the landmark network finds them again."""
+    """The detector's two points, as the landmark network finds them. They give the crop of the next
+    look.
+    """
     covered: bool = False
     """Whether other people were painted over before this person was found. They may stand in front
     of this person.
@@ -266,8 +271,8 @@ def bilinear(
 def refined(
     points: Float[np.ndarray, "n 2"], heatmaps: Float[np.ndarray, "m m n"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Moves points in [0, 1], (n, 2), to the centroid of the heatmap around them. Points whose
-    heatmap has no peak there stay.
+    """Returns points, (n, 2), in [0, 1]. Each is moved to the centroid of its heatmap in a window
+    around the point. A point stays if its heatmap has no peak in this window.
     """
     size, half, moved = len(heatmaps), WINDOW // 2, points.copy()
     for i, (column, row) in enumerate(np.trunc(points * size).astype(int)):
@@ -284,15 +289,13 @@ def refined(
 
 
 def mask_at(found: Landmarks, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Returns the mask of a crop at pixels of the photo, (n,), 0 to 1. It is 0 outside of the
-    crop.
-    """
+    """Returns a person's mask at pixels of the photo, (n,), 0 to 1. It is 0 outside of the crop."""
     return bilinear(found.mask, found.crop.from_photo(pixels)[None] * LANDMARK_SIZE, outside=0.0)[0]
 
 
 def mask_in_photo(found: Landmarks, width: int, height: int) -> Float[np.ndarray, "height width"]:
-    """Returns the mask of a crop at the size of the photo, (height, width), 0 to 1. It is 0 outside
-    of the crop.
+    """Returns a person's mask at the size of the photo, (height, width), 0 to 1. It is 0 outside of
+    the crop.
     """
     mask = np.zeros((height, width), np.float32)
     window = mask_window(found, width, height)
@@ -305,8 +308,8 @@ Window = tuple[slice, slice]
 
 
 def mask_window(found: Landmarks, width: int, height: int, margin: int = 0) -> Window:
-    """Returns the part of a photo that a crop reaches, and `margin` pixels around it. The part may
-    be empty.
+    """Returns the part of a photo that contains a person's crop, with a margin of `margin` pixels.
+    The part may be empty.
     """
     corners = found.crop.to_photo(np.asarray([[0.0, 0], [0, 1], [1, 0], [1, 1]]))
     left, top = (np.floor(corners.min(0)).astype(int) - margin).clip(0, [width, height]).tolist()
@@ -317,8 +320,8 @@ def mask_window(found: Landmarks, width: int, height: int, margin: int = 0) -> W
 
 
 def mask_in_window(found: Landmarks, window: Window) -> Float[np.ndarray, "h w"]:
-    """Returns the mask of a crop at the pixels of a part of the photo, (h, w), 0 to 1. It is 0
-    outside of the crop.
+    """Returns a person's mask in a part of the photo, (h, w), 0 to 1. It is 0 outside of the
+    crop.
     """
     from PIL import Image
 
@@ -356,9 +359,9 @@ def _anchors() -> Float[np.ndarray, "a 2"]:
 def _merged(
     scores: Float[np.ndarray, " n"], boxes: Float[np.ndarray, "n 12"]
 ) -> list[tuple[float, np.ndarray]]:
-    """Merges detections of one window that are the same person (weighted non-maximum suppression).
-    Detections that overlap with the best one are averaged, weighted by score. Returns the best
-    score and the mean box, (12,), of each person, best first.
+    """Merges detections in one window that show the same person (weighted non-maximum suppression).
+    Detections that overlap with the best one are averaged, weighted by score. Returns for each
+    person the best score and the mean box, (12,). The best person comes first.
     """
     left, merged = np.argsort(-scores), []
     while len(left):
@@ -388,7 +391,9 @@ def _sigmoid(x: np.ndarray) -> np.ndarray:
 
 @contextlib.contextmanager
 def _silent() -> Generator[None]:
-    """Silences the line that LiteRT's C++ prints on standard error when it starts."""
+    """Context manager that suppresses standard error, because LiteRT's C++ code prints a line there
+    when it starts.
+    """
     sys.stderr.flush()
     try:
         kept = os.dup(2)
@@ -410,38 +415,46 @@ def _silent() -> Generator[None]:
 
 @dataclasses.dataclass(frozen=True)
 class _SearchConfig:
-    """Constants by which people are looked for in a photo."""
+    """Constants for the search for people in a photo."""
 
     shares: tuple[float, float] = (1.0, 0.5)
-    """Sides of the windows that are always looked at, shares of the photo's longer side."""
-    small_shares: tuple[float, ...] = (0.25,)
-    """Sides of the further windows where nobody is large, shares of the photo's longer side. Most
-    windows are of this kind.
-    """
-    large: float = 0.4
-    """Side of a large person's crop, share of the photo's longer side. Windows of a half find
-    people from a sixth of the photo's longer side on, whose crops are a fifth of it. So a person
-    who needs smaller windows has at most a quarter of the pixels of a person with a crop of two
-    fifths, and is not the main person of the photo.
-    """
-    smallest: float = 0.06
-    """Least side of a crop, share of the photo's longer side. Smaller ones are people in the
-    background, or nobody.
-    """
-    most_crops: int = 16
-    """Most crops that the landmark network looks at. The best detections come first."""
-    same_hips: float = 0.15
-    """Two detections are one person if their hips are nearer than this share of the larger crop's
+    """Sides of the windows in which people are always looked for, as shares of the photo's longer
     side.
     """
+    small_shares: tuple[float, ...] = (0.25,)
+    """Sides of further windows, as shares of the photo's longer side. They are used if nobody large
+    is found in the others. Most windows are of this kind.
+    """
+    large: float = 0.4
+    """If somebody's crop has at least this side, the smaller windows are not used. As a share of
+    the photo's longer side.
+
+    Windows of half the longer side find people from a sixth of that side on, and their crops are a
+    fifth of it. So a person who is found only in smaller windows has at most a quarter of the
+    pixels of a large person, and is not the main person of the photo.
+    """
+    smallest: float = 0.06
+    """Smallest side of a crop, as a share of the photo's longer side. Smaller detections are people
+    in the background, or nobody.
+    """
+    most_crops: int = 16
+    """Largest number of detections in one search that the landmark network looks at. The best ones
+    come first.
+    """
+    same_hips: float = 0.15
+    """Two detections can be one person if their hips are nearer than this share of the larger
+    crop's side.
+    """
     same_size: float = 1.6
-    """Largest ratio of the sides of two crops that are one person."""
+    """Two detections can be one person if the ratio of their crops' sides is below this number."""
     most_looks: int = 4
-    """Most looks of the landmark network at one person."""
+    """Largest number of times that the landmark network looks at one person."""
     settled: float = 0.05
-    """Drift of the crop below which the crop has found the person, see `_settled`."""
+    """Largest drift of a crop that counts as settled on the person, as a share of the crop's side.
+    See `_settled`.
+    """
     larger: float = 1.25
-    """Largest ratio of the side of the next crop to that of the one before. A larger crop makes the
+    """Largest factor by which a crop may grow from one look to the next. A larger crop makes the
     mask coarser, because the mask always has 256 pixels a side.
     """
 
@@ -451,28 +464,30 @@ SEARCH = _SearchConfig()
 
 @dataclasses.dataclass(frozen=True)
 class _Believed:
-    """Limits from which on a find of the landmark network counts as a person.
+    """Limits that decide whether what the landmark network found counts as a person.
 
-    Measured on 8 photos of a laboratory with 2 to 3 people each. False finds there are legs, lamps
-    and chairs that the detector takes for people.
+    They were measured on 8 photos of a laboratory with 2 to 3 people each. False detections there
+    are legs, lamps and chairs.
     """
 
     presence: float = 0.95
-    """Least presence of a person. False finds had 0.69 to 0.88, people 0.999 at the worst."""
+    """Smallest presence of a person. False detections had 0.69 to 0.88, people at least 0.999."""
     on_mask: float = 0.8
-    """Least share of the landmarks in the photo that lie on the mask. False finds had 0.33 to 0.76,
-    people 0.94.
+    """Smallest share of the landmarks inside the photo that lie on the person's mask. False
+    detections had 0.33 to 0.76, people 0.94.
     """
     on_rest: float = 0.6
-    """Least share like `on_mask`, for photos with people painted over, where masks have holes."""
+    """Replaces `on_mask` if other people are painted over. It is smaller, because masks then have
+    holes.
+    """
     shared: float = 0.5
-    """Largest share of one person's mask that another person's mask may cover. False finds had 0.77
-    to 0.94, people 0.02.
+    """Largest share of one person's mask that another person's mask may cover. False detections had
+    0.77 to 0.94, people 0.02.
     """
     size: float = 0.4
-    """Least side of the crop of a person who was found after painting over others, as a share of
-    the largest person's. Smaller ones, in photos of two to six people, were the remains of a person
-    whose mask ends too early.
+    """Smallest side of a crop if the person was found after others were painted over, as a share of
+    the largest crop's side. In photos of two to six people, smaller crops showed the remains of a
+    person whose mask ends too early.
     """
 
 
@@ -480,19 +495,20 @@ BELIEVED = _Believed()
 
 
 MARGINS = (1 / 150, 1 / 100)
-"""How far painting reaches beyond a mask, shares of the longest side. The second is tried where the
-first shows nobody more. Too little leaves a rim that looks like a person, and too much hides people
-who stand behind.
+"""How far the painted area reaches beyond a mask, as shares of the photo's longer side. The second
+value is tried if the first one shows nobody more. If the area is too small, a rim remains that
+looks like a person. If it is too large, it hides people who stand behind.
 """
 SEEN = 0.5
-"""Least probability at which a pixel of a mask belongs to the person."""
+"""A pixel belongs to the person if the mask exceeds this probability."""
 
 
 def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[Landmarks]:
-    """Returns the people of a photo, the largest first. photo: values in [0, 1].
+    """Returns the people in a photo. The person with the largest crop comes first. photo: values in
+    [0, 1].
 
-    People who were found are painted over, and the detector looks at the photo again, until it
-    finds nobody more, or up to eight times.
+    People who were found are painted over, and the detector looks at the photo again. This ends
+    when both `MARGINS` have shown nobody more, or after eight paintings.
     """
     longest = max(photo.shape[:2])
     detections = window_detections(networks, photo, SEARCH.shares)
@@ -515,8 +531,8 @@ def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[L
 def _hidden_people(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], found: list[Landmarks], margin: float
 ) -> list[Landmarks]:
-    """Returns the people that the detector finds after the people in `found` are painted over. The
-    masks of the new people leave out those of the people found before.
+    """Returns the people that the detector finds when the people in `found` are painted over. The
+    new people's masks are 0 where the masks of the people in `found` are 1.
     """
     height, width = photo.shape[:2]
     painted, covered = _painted_over(photo, found, margin)
@@ -534,9 +550,8 @@ def _hidden_people(
 def _painted_over(
     photo: Float[np.ndarray, "h w 3"], found: list[Landmarks], margin: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Replaces people in a photo by the colors around them.
-
-    Also returns which pixels were replaced, (h, w).
+    """Returns a photo in which people are replaced by the colors around them, and which pixels were
+    replaced, (h, w).
     """
     height, width = photo.shape[:2]
     covered = np.zeros((height, width), bool)
@@ -548,7 +563,7 @@ def _painted_over(
 
 
 def _without(person: Landmarks, found: list[Landmarks]) -> Float[np.ndarray, "256 256"]:
-    """Returns the mask of a person without the pixels that other people cover."""
+    """Returns a person's mask, (256, 256). It is 0 where the masks of other people are 1."""
     steps = np.arange(LANDMARK_SIZE) / LANDMARK_SIZE
     pixels = person.crop.to_photo(np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2))
     mask = person.mask.ravel().copy()
@@ -563,7 +578,8 @@ def _people(
     detections: list[Detection],
     covered: Bool[np.ndarray, "h w"] | None = None,
 ) -> list[Landmarks]:
-    """Returns the landmarks of the detections that are people, the largest first.
+    """Returns the landmarks of the detections that are people. The person with the largest crop
+    comes first.
 
     covered: where the photo was painted over, (h, w). Landmarks there do not count when landmarks
     are compared with the mask. A person with more than half of the landmarks there is discarded.
@@ -595,12 +611,13 @@ def _people(
 def _settled(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], crop: Crop
 ) -> tuple[Landmarks, float]:
-    """Follows a person with the landmark network. Returns the landmarks, and how far they would
-    still move the crop, as a share of the crop's side.
+    """Looks at a person several times with the landmark network. Returns the landmarks of the last
+    look, and the drift: how far the next crop would be from the last one in position and size, as a
+    share of the crop's side.
 
-    The crop is moved to the points that were found, and the network looks again, until the crop
-    hardly moves, or up to `SEARCH.most_looks` times. It looks at least twice, unless the presence
-    is low, because it knows hips and size better than the detector does.
+    Each look gives the crop of the next one. This ends when the crop hardly moves, when the
+    presence is low, or after `SEARCH.most_looks` looks. There are at least two looks if the
+    presence is not low, because the network knows hips and size better than the detector does.
     """
     look, drift = networks.landmarks(photo, crop), np.inf
     for _ in range(SEARCH.most_looks - 1):
@@ -617,8 +634,8 @@ def _settled(
 def window_detections(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], shares: Sequence[float]
 ) -> list[Detection]:
-    """Returns what the detector finds in all windows. shares: sides of the windows over the longer
-    side of the photo.
+    """Returns what the detector finds in all windows of a photo. shares: sides of the windows, as
+    shares of the photo's longer side.
     """
     height, width = photo.shape[:2]
     return [
@@ -631,8 +648,9 @@ def windows(
 ) -> list[Crop]:
     """Returns the upright squares of a photo in which the detector looks, in pixels of the photo.
 
-    shares: sides of the squares over the longer side of the photo. A square of share 1 contains the
-    whole photo. Smaller ones cover it together, and neighbours overlap by half or more.
+    shares: sides of the squares, as shares of the photo's longer side. A square of share 1 contains
+    the whole photo. Smaller squares cover the photo together, and neighbours overlap by half or
+    more.
     """
     longest, found = max(width, height), []
     for share in shares:
@@ -643,11 +661,11 @@ def windows(
 
 
 def _starts(size: int, side: float) -> Float[np.ndarray, " n"]:
-    """Returns where windows begin along one side of a photo, (n,), pixels. size: length of the
-    photo's side, pixels. side: side of the windows, pixels.
+    """Returns the positions where windows begin along one axis of a photo, (n,), pixels. size:
+    length of the photo along this axis, pixels. side: side of the windows, pixels.
 
-    One window lies in the middle if it covers the photo. Otherwise windows are spread evenly and
-    overlap by half or more.
+    If one window is at least as long as the photo, there is only this one, in the middle. Otherwise
+    windows are spread evenly and overlap by half or more.
     """
     if size <= side:
         return np.asarray([(size - side) / 2])
@@ -656,8 +674,8 @@ def _starts(size: int, side: float) -> Float[np.ndarray, " n"]:
 
 
 def distinct(detections: list[Detection], longest: int) -> list[Detection]:
-    """Keeps one detection of each person. detections: the best first. longest: longer side of the
-    photo, pixels. Detections smaller than `SEARCH.smallest` are left out.
+    """Returns the best detection of each person. Detections smaller than `SEARCH.smallest` are left
+    out. detections: ordered, the best first. longest: longer side of the photo, pixels.
     """
     kept: list[Detection] = []
     for detection in detections:
@@ -680,9 +698,9 @@ def _same_detection(a: Detection, b: Detection) -> bool:
 def _on_mask(
     person: Landmarks, width: int, height: int, covered: Bool[np.ndarray, "h w"] | None = None
 ) -> float:
-    """Returns the share of the landmarks in the photo that lie on the person's mask. Landmarks
-    where the photo is covered do not count. 0 if no landmark is left, or if more than half of them
-    are covered.
+    """Returns the share of the landmarks inside the photo that lie on the person's mask. Landmarks
+    where the photo is painted over do not count. The result is 0 if no landmark is left, or if more
+    than half of the landmarks are painted over.
     """
     points = person.pixels[_inside(person.pixels, width, height)]
     if covered is not None:
@@ -704,5 +722,5 @@ def _shared(person: Landmarks, other: Landmarks, width: int, height: int) -> flo
 
 
 def _inside(pixels: Float[np.ndarray, "n 2"], width: int, height: int) -> Bool[np.ndarray, " n"]:
-    """Returns which pixels lie in the photo, (n,)."""
+    """Returns which of the positions lie inside the photo, (n,)."""
     return np.all((pixels > -0.5) & (pixels < np.asarray([width, height]) - 0.5), axis=-1)

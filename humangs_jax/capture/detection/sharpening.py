@@ -18,10 +18,10 @@ _RADIUS = 2.0
 def sharpened(
     mask: Float[np.ndarray, "h w"], photo: Float[np.ndarray, "h w 3"], pixel: float
 ) -> Float[np.ndarray, "h w"]:
-    """Returns a mask whose edges are at edges of the photo, (h, w), 0 to 1.
+    """Returns a mask whose edges follow the edges of the photo, (h, w), 0 to 1.
 
     mask: the detector's mask at the size of the photo, (h, w), 0 to 1. photo: values in [0, 1].
-    pixel: number of the photo's pixels that one pixel of the detector's mask is wide.
+    pixel: width of one pixel of the detector's mask, in pixels of the photo.
     """
     rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
     if not len(rows):
@@ -59,20 +59,23 @@ def sharpened(
 
 
 def filter_margin(pixel: float) -> int:
-    """Returns how many pixels around a mask `sharpened` looks at. pixel: see `sharpened`."""
+    """Returns how far beyond the mask `sharpened` reads the photo, pixels of the photo. pixel: see
+    `sharpened`.
+    """
     return int(np.ceil(2 * _RADIUS * pixel))
 
 
 def _affine(
     guide: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], radius: int
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """Returns slopes, (h, w, 3), and offsets, (h, w), of the mask as a function of the colors. They
-    are means over all windows that contain a pixel. radius: half side of the windows, pixels.
+    """Returns slopes, (h, w, 3), and offsets, (h, w), such that the mask is about slopes * colors +
+    offset at each pixel. They are the means of the coefficients of all windows that contain the
+    pixel. radius: half side of the windows, pixels.
     """
     side = 2 * radius + 1
 
     def mean(x):
-        """Returns the means over the window of each pixel."""
+        """Returns the mean of x over the window around each pixel."""
         return ndimage.uniform_filter(x, (side, side) + (0,) * (x.ndim - 2), mode="nearest")
 
     # least squares in each window: covariance of colors and mask over that of the colors

@@ -1,12 +1,13 @@
-"""Checks a calibration: finds cameras that are turned, because they see all landmarks beside where
-the other cameras see them.
+"""Checks a calibration: finds cameras with a wrong rotation. Such a camera sees all landmarks
+shifted from where the other cameras see them.
 
-The rotations that would correct them come from linearised bundle adjustment, in which every
-landmark of every moment is a free point (Triggs et al. 2000, "Bundle Adjustment"). A detector's
-landmarks err too, but not together. So a camera is only named if its rotation exceeds several times
-the standard error that the scatter over landmarks gives (a sandwich estimate, clustered by
-landmark). As few cameras are turned as explain the residuals, because turning all of them explains
-no more.
+The corrections come from linearised bundle adjustment, in which every landmark of every moment is a
+free point (Triggs et al. 2000, "Bundle Adjustment").
+
+A detector's landmarks have errors too, but these differ from landmark to landmark. So a camera is
+only reported if its correction exceeds several standard errors. The standard errors come from the
+scatter over landmarks (a sandwich estimate, clustered by landmark). The smallest number of cameras
+is turned that explains the residuals.
 """
 
 import dataclasses
@@ -32,41 +33,42 @@ from humangs_jax.geometry import quaternion, transform
 
 P = TypeVar("P", Photos, Capture)
 _PRIOR = np.radians(1.0)
-"""Expected size of rotations, radians. It holds movements of cameras and points together that
-change no residual.
+"""Prior standard deviation of the rotations, radians. Without it, movements of all cameras and
+points together would be undetermined, because they change no residual.
 """
 _ITERATIONS = 8
-"""Number of iterations that reweight the residuals. As many iterations follow that move the points
-with fixed weights.
+"""Number of iterations that reweight the residuals. After them, as many iterations move only the
+points, with fixed weights and cameras.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class _Decision:
-    """Limits that decide if a camera counts as turned."""
+    """Limits that decide whether a camera counts as turned."""
 
     clear: float = 5.0
-    """Least size of a rotation that is not chance, standard errors."""
+    """A rotation has to have at least this size to count, in standard errors."""
     least_gain: float = 25.0
-    """Least fall of the cost through a rotation that is not chance. A detector with the same error
-    in all landmarks of a view looks like a rotation: for five synthetic people in rooms with exact
-    cameras the cost fell by 5 to 16, for five photos of a man whose calibration is off by 32 to
-    121.
+    """A rotation has to lower the cost by at least this much to count.
+
+    A detector with the same error in all landmarks of a view looks like a rotation. For five
+    synthetic people in rooms with exact cameras, rotations lowered the cost by 5 to 16. For five
+    photos of a man with a wrong calibration they lowered it by 32 to 121.
     """
     least_degrees: float = 0.3
-    """Least rotation that is reported, degrees. Smaller errors hardly matter: a third of a degree
-    is 1.5 cm at 3 m.
+    """Rotations up to this angle are not reported, degrees. They hardly matter: a third of a degree
+    moves a point by 1.5 cm at a distance of 3 m.
     """
     most_degrees: float = 8.0
-    """Largest rotation, degrees. If one is larger, the calibration has another error, and nothing
-    is reported.
+    """If any rotation exceeds this angle, the calibration has another error, and nothing is
+    reported. Degrees.
     """
     alike: float = 0.9
-    """If another camera, turned in place of the reported one, lowers the cost by more than this
-    share of what the reported one does, it is named as a possible cause, too.
+    """Another camera is named as a possible cause, too, if turning it in place of the reported
+    camera lowers the cost by more than this share of what turning the reported camera does.
     """
     most_cameras: int = 64
-    """Largest number of cameras. With more, errors are not looked for."""
+    """Largest number of cameras. If there are more, no errors are looked for."""
 
 
 _DECISION = _Decision()
@@ -74,16 +76,16 @@ _DECISION = _Decision()
 
 @dataclasses.dataclass(frozen=True)
 class CameraError:
-    """A camera that is turned, with the rotation that turns it back."""
+    """A camera with a wrong rotation, and the rotation that corrects it."""
 
     views: tuple[int, ...]
     """Indices of the camera's views."""
     names: tuple[str, ...]
-    """Names of the camera's first view, and of the first views of other cameras that would explain
-    as much.
+    """Names of the cameras that may be the cause: first this camera, then other cameras that would
+    explain the residuals almost as well. The name is the one of the camera's first view.
     """
     rotation: tuple[float, float, float]
-    """Rotation that turns the camera back, as axis-angle in the camera's axes, radians."""
+    """Rotation that corrects the camera, as axis-angle in the camera's axes, radians."""
 
     @property
     def degrees(self) -> float:
@@ -96,7 +98,8 @@ class CameraError:
 
 
 def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[CameraError, ...]:
-    """Returns the cameras that keypoints show to be turned. Cameras that explain most come first.
+    """Returns the cameras that are turned according to the keypoints. The camera that explains most
+    of the residuals comes first.
 
     The result is empty for fewer than three or more than `most_cameras` cameras, or if too few
     landmarks are seen. It is also empty if a rotation exceeds `most_degrees`.
@@ -140,7 +143,9 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
 
 
 def mended(photos: P, errors: tuple[CameraError, ...]) -> P:
-    """Returns the photos with cameras turned about their centres as the errors say."""
+    """Returns the photos with corrected cameras. The camera of each error is turned about its
+    centre by the error's rotation.
+    """
     rotations = np.zeros((len(photos.names), 3), np.float32)
     for error in errors:
         rotations[list(error.views)] = error.rotation
@@ -162,13 +167,13 @@ class _Seen:
     points: Float[np.ndarray, "m c k 2"]
     """Detections, (m, c, k, 2), pixels."""
     weights: Float[np.ndarray, "m c k"]
-    """Confidences, (m, c, k). 0 for landmarks that fewer than two views see."""
+    """Confidences, (m, c, k). 0 for landmarks that fewer than two views see at the moment."""
     K: Float[np.ndarray, "m c 3 3"]
     """Intrinsics, (m, c, 3, 3), pixels."""
     matrices: Float[np.ndarray, "m c 4 4"]
     """Camera poses from the world to the camera, (m, c, 4, 4), metres."""
     camera: Int[np.ndarray, "m c"]
-    """Number of each view's camera, (m, c), from 0 to below `count`."""
+    """Index of each view's camera, (m, c), from 0 to `count` - 1."""
     count: int
     """Number of cameras."""
 
@@ -179,9 +184,12 @@ class _Seen:
         keypoints: Keypoints,
         camera_of: Int[np.ndarray, " v"],
     ) -> "_Seen | None":
-        """Returns the landmarks that err independently, in at most 24 moments. Returns None if
-        fewer than 8 landmarks are seen in two views of a moment. camera_of: number of each view's
-        camera, (v,).
+        """Returns the keypoints of at most 24 moments, evenly chosen. Only the main landmarks of
+        the body are taken. Landmarks within a face or a hand are left out, because their errors are
+        alike.
+
+        The result is None if fewer than 8 landmarks are seen by two views at a moment. camera_of:
+        index of each view's camera, (v,).
         """
         # landmarks that err independently: those of a face or a hand err together
         parts = (
@@ -197,7 +205,7 @@ class _Seen:
         some = np.unique(np.linspace(0, len(views) - 1, 24).round().astype(int))
 
         def as_double(name: str) -> Float[np.ndarray, "..."]:
-            """Returns a field of the observations for the chosen moments."""
+            """Returns a field of the observations at the chosen moments, in float64."""
             return np.asarray(getattr(observations, name), np.float64)[some]
 
         weights = as_double("confidences")[..., kinds]
@@ -214,8 +222,8 @@ class _Seen:
         )
 
     def equations(self) -> "_Equations":
-        """Returns the equations of rotations about the given cameras, weighted so that outliers
-        count little.
+        """Returns the least squares equations for small rotations of the cameras, linearised at the
+        given cameras. Keypoints that are outliers have small weights.
         """
         turned, points, weights = np.zeros((self.count, 3)), self._middle(), self.weights
         # outliers are found with all cameras free to turn: else a turned camera's landmarks are
@@ -234,8 +242,8 @@ class _Seen:
         return step.equations
 
     def _middle(self) -> Float[np.ndarray, "m k 3"]:
-        """Returns the point nearest to the axes of all cameras, repeated for every landmark, (m, k,
-        3), metres. It is where the points begin.
+        """Returns the start of the points, (m, k, 3), metres. All of them start at the point that
+        is nearest to the optical axes of all cameras.
         """
         axes = self.matrices[..., 2, :3]
         centers = -np.einsum("mcba,mcb->mca", self.matrices[..., :3, :3], self.matrices[..., :3, 3])
@@ -247,8 +255,8 @@ class _Seen:
     def _projected(
         self, turned: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m k 3"]
     ) -> "_Projected":
-        """Returns the points as turned cameras see them. turned: rotation of each camera, (n, 3),
-        axis-angle in radians. points: (m, k, 3), metres.
+        """Returns the points as the turned cameras see them. turned: rotation of each camera, (n,
+        3), axis-angle in radians. points: (m, k, 3), metres.
         """
         turn = Rotation.from_rotvec(turned).as_matrix()[self.camera]
         rotation = turn @ self.matrices[..., :3, :3]
@@ -266,8 +274,8 @@ class _Seen:
         points: Float[np.ndarray, "m k 3"],
         weights: Float[np.ndarray, "m c k"],
     ) -> "_Linearized":
-        """Returns the equations of the cameras about these rotations and points, with the points
-        eliminated.
+        """Returns the equations for the rotations of the cameras, linearised at `turned` and
+        `points`. The points are eliminated by the Schur complement.
         """
         seen = self._projected(turned, points)
         by_point, by_turn = seen.derivatives()
@@ -291,8 +299,8 @@ class _Seen:
     def _by_camera(
         self, of_views: Float[np.ndarray, "m c k 3"], of_pairs: Float[np.ndarray, "m c c k 3 3"]
     ) -> "_Equations":
-        """Adds up gradients of views and Hessians of pairs of views for the cameras that the views
-        belong to.
+        """Returns the equations for the cameras. Gradients of views and Hessians of pairs of views
+        are summed over the views of each camera.
         """
         k, n = of_views.shape[2], self.count
         gradients, matrices = np.zeros((n, k, 3)), np.zeros((n, n, k, 3, 3))
@@ -318,13 +326,13 @@ class _Projected(NamedTuple):
     focal: Float[np.ndarray, "m c 1 2"]
     """Focal lengths, (m, c, 1, 2), pixels."""
     errors: Float[np.ndarray, "m c k 2"]
-    """Pixels of the points minus detections, (m, c, k, 2)."""
+    """Projected points minus detections, (m, c, k, 2), pixels."""
 
     def derivatives(
         self,
     ) -> tuple[Float[np.ndarray, "m c k 2 3"], Float[np.ndarray, "m c k 2 3"]]:
-        """Returns the derivatives of the pixels by the points in the world, (m, c, k, 2, 3), and by
-        small turns of the cameras, (m, c, k, 2, 3).
+        """Returns two derivatives of the projected pixels, each (m, c, k, 2, 3): by the points in
+        the world (pixels per metre), and by small rotations of the cameras (pixels per radian).
         """
         by_local = np.zeros((*self.depth.shape, 2, 3))
         by_local[..., [0, 1], [0, 1]] = self.focal / self.depth[..., None]
@@ -336,23 +344,23 @@ class _Projected(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Least squares equations about rotations of n cameras, one for each landmark, in standard
-    deviations.
+    """Least squares equations for the rotations of n cameras. There is one system for each
+    landmark. The residuals are in standard deviations.
     """
 
     gradients: Float[np.ndarray, "k u"]
     """Gradient of the cost of each landmark, (k, 3 n)."""
     matrices: Float[np.ndarray, "k u u"]
-    """Gauss and Newton's Hessian of the cost of each landmark, (k, 3 n, 3 n)."""
+    """Gauss-Newton Hessian of the cost of each landmark, (k, 3 n, 3 n)."""
 
 
 class _Linearized(NamedTuple):
-    """The result of one iteration of the adjustment."""
+    """Result of one Gauss-Newton iteration of the bundle adjustment."""
 
     equations: _Equations
-    """Equations of the cameras."""
+    """Equations for the rotations of the cameras."""
     errors: Float[np.ndarray, "m c k 2"]
-    """Pixels of the points minus detections, (m, c, k, 2), before the step."""
+    """Projected points minus detections, before the step, (m, c, k, 2), pixels."""
     points: Float[np.ndarray, "m k 3"]
     """Points after the step, (m, k, 3), metres."""
 
@@ -364,18 +372,18 @@ def _solve(
 
 
 class _Solved(NamedTuple):
-    """The result of turning some cameras."""
+    """The best rotations of some cameras, with all other cameras fixed."""
 
     rotations: Float[np.ndarray, "s 3"]
     """Rotations of the cameras, axis-angle, (s, 3), radians."""
     gain: float
-    """Fall of the cost."""
+    """By how much these rotations lower the cost."""
     clear: float
-    """Size of the last camera's rotation in standard errors."""
+    """Size of the last camera's rotation, in standard errors."""
 
 
 def _solved(equations: _Equations, cameras: list[int]) -> _Solved:
-    """Returns the result of turning these cameras."""
+    """Returns the best rotations of these cameras, with all other cameras fixed."""
     at = (3 * np.asarray(cameras)[:, None] + np.arange(3)).ravel()
     own, curved = equations.gradients[:, at], equations.matrices[:, at[:, None], at]
     total = curved.sum(0)

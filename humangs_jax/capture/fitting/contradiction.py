@@ -1,14 +1,16 @@
 """Checks whether a calibration and the keypoints of a person can both be right.
 
 The rays of one landmark through several cameras have to meet in front of the cameras. If they do
-not meet well, the body must not be a mirror image, which the detector's depths show. Calibrations
-of other tools can fail in these ways. With matrices that go from cameras to the world instead of
-the other way round, rays do not meet. With images whose y axis points up, rays may meet and show a
-person upside down or mirrored.
+not meet well, the triangulated body is compared with the detector's depths, to see whether it is a
+mirror image.
 
-If a calibration fails, usual mistakes are undone on trial, so that the error can name a change with
-which keypoints and cameras agree. If no change helps, cameras are found from the person, as for
-photos without a calibration, and tried instead.
+Calibrations of other tools fail in typical ways. If matrices go from cameras to the world, and not
+from the world to cameras, rays do not meet. If the y axis of the images points up, rays may meet,
+but show a person upside down or mirrored.
+
+If a calibration fails, usual mistakes are corrected on trial. The error then names the correction
+with which keypoints and cameras agree. If no correction helps, the cameras are found from the
+person, as for photos without a calibration, and the agreement is tested with these cameras.
 """
 
 import dataclasses
@@ -26,27 +28,32 @@ from humangs_jax.data.photos import Photos
 
 @dataclasses.dataclass(frozen=True)
 class _Limits:
-    """Limits that decide if a calibration and keypoints contradict each other."""
+    """Limits that decide whether a calibration and keypoints contradict each other."""
 
     most_missed: float = 0.06
-    """Largest median distance of landmarks from the triangulated ones, over the person's size in
-    the photo, that is tolerated if no remedy is found. It was 0.015 for four photos of a woman, and
-    0.12 with their y axis upside down. A camera turned by a degree adds 0.02 in its photo.
+    """Up to this median distance a disagreement is tolerated if no remedy is known. It is the
+    distance between keypoints and projected triangulated landmarks, divided by the person's size in
+    the photo.
+
+    It was 0.015 for four photos of a woman, and 0.12 with their y axis upside down. A camera turned
+    by one degree adds 0.02 in its photo.
     """
     agrees: float = 0.035
-    """Largest median distance, measured as in `most_missed`, at which cameras agree."""
+    """Up to this median distance cameras and keypoints agree. It is measured as in
+    `most_missed`.
+    """
     better: float = 0.5
-    """Largest ratio of the distances with and without a remedy, for the remedy to be believed."""
+    """A remedy is accepted only if it multiplies the median distance by this number or less."""
     mirrored: float = 0.8
-    """Largest ratio of the distances from the detector's 3D landmarks if the person is mirrored in
-    depth, and if not, for the person to count as a mirror image.
+    """The person counts as a mirror image if mirroring the depth multiplies the distance from the
+    detector's 3D landmarks by less than this number.
     """
     seen: float = 0.5
-    """Least confidence of a keypoint that counts."""
+    """A keypoint counts if its confidence exceeds this number."""
     least_landmarks: int = 8
-    """Least number of triangulated landmarks. With fewer, nothing is concluded."""
+    """Smallest number of triangulated landmarks. If there are fewer, nothing is concluded."""
     least_views: int = 4
-    """Least number of views of which one may be left out because the others agree without it."""
+    """With at least this many views, one view may be left out if the others agree without it."""
 
 
 _LIMITS = _Limits()
@@ -56,9 +63,11 @@ class Agreement(NamedTuple):
     """How well cameras agree with keypoints."""
 
     missed: float
-    """Median distance of keypoints from triangulated landmarks, as a share of the person's size."""
+    """Median distance between keypoints and projected triangulated landmarks, as a share of the
+    person's size in the view.
+    """
     pixels: float
-    """Median distance of keypoints from triangulated landmarks, pixels."""
+    """Median distance between keypoints and projected triangulated landmarks, pixels."""
     mirrored: bool
     """Whether the triangulated person is a mirror image."""
     behind: bool
@@ -70,16 +79,16 @@ class Contradiction:
     """A calibration that does not agree with the keypoints of the person."""
 
     found: Agreement
-    """How well cameras and keypoints agree with the calibration as it is."""
+    """Agreement of cameras and keypoints with the calibration as given."""
     remedy: str | None
-    """Words for a change with which cameras and keypoints agree. None if no such change is
-    known.
+    """Words for a change of the calibration with which cameras and keypoints agree. None if no such
+    change is known.
     """
     after: Agreement | None
-    """How well cameras and keypoints agree with the remedy. None without a remedy."""
+    """Agreement of cameras and keypoints with the remedy. None if there is no remedy."""
 
     def __str__(self) -> str:
-        """Returns one line that says how large the disagreement is, and what remedies it."""
+        """Returns one line that says how large the disagreement is, and which change removes it."""
         off = f"landmarks miss each other by {self.found.pixels:.0f} px"
         share = f"{off}, {self.found.missed:.0%} of the person's size"
         what = "the person would be behind the cameras" if self.found.behind else share
@@ -90,12 +99,15 @@ class Contradiction:
 
 
 def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | None:
-    """Returns the contradiction between keypoints of one person and the calibration of the photos.
+    """Returns the contradiction between the keypoints of one person and the calibration of the
+    photos, or None.
 
-    The result is None if they agree, or if too few landmarks are seen in several views. It is also
-    None if they agree after `find_camera_errors` turned cameras back, or without one of several
-    photos. If no remedy is known, small contradictions are None, too, because the person may have
-    moved between the photos.
+    The result is None in these cases:
+    - Keypoints and calibration agree, or too few landmarks are seen in several views.
+    - They agree after the cameras that `find_camera_errors` finds were corrected.
+    - No usual mistake explains the contradiction, and all views except one agree.
+    - No remedy is known and the contradiction is small. The person may have moved between the
+      photos.
     """
     K = np.asarray(photos.cameras.K, np.float64)
     matrices = np.asarray(photos.cameras.cam_from_world, np.float64)
@@ -137,7 +149,7 @@ def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | 
 
 
 def _without_calibration(photos: Photos, keypoints: Keypoints) -> Agreement | None:
-    """Returns how well cameras that are found from the person agree with the keypoints.
+    """Returns how well the keypoints agree with cameras that are found from the person alone.
 
     The result is None if there are several moments or no 3D landmarks, or if no cameras are found
     that explain all photos.
@@ -176,8 +188,8 @@ def _agrees(found: Agreement) -> bool:
 def _remedies(
     K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], height: int
 ) -> dict[str, tuple[Float[np.ndarray, "v 3 3"], Float[np.ndarray, "v 4 4"]]]:
-    """Returns K and cam_from_world with one usual mistake undone, by words for the change. height:
-    height of the images, pixels.
+    """Returns K and cam_from_world after the correction of one usual mistake. The key is the
+    correction in words. height: height of the images, pixels.
     """
     other = np.diag([1.0, -1.0, 1.0, 1.0])
     upwards = K.copy()
@@ -198,8 +210,8 @@ def agreement(
     frames: Int[np.ndarray, " v"],
     keypoints: Keypoints,
 ) -> Agreement | None:
-    """Returns how well cameras and keypoints agree, or None if too few landmarks are seen in
-    several views of a frame. frames: frame of each view, (v,).
+    """Returns how well cameras and keypoints agree. None if too few landmarks are seen in several
+    views of a frame. frames: frame of each view, (v,).
     """
     errors, sizes, behind = [], [], []
     plain = mirrored = 0.0
@@ -251,8 +263,8 @@ def _triangulated(
     points: Float[np.ndarray, "v k 2"],
     seen: Bool[np.ndarray, "v k"],
 ) -> tuple[Float[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
-    """Returns the points where the rays of the views that see a landmark meet best, (k, 3), and
-    which landmarks at least two views see, (k,).
+    """Returns for each landmark the point nearest to the rays of the views that see the landmark,
+    (k, 3), and whether at least two views see the landmark, (k,).
 
     The points solve the equations of a direct linear transformation, which has the rows u P_3 - P_1
     and v P_3 - P_2 for each view. Each row is scaled so that its first three numbers have length 1.
@@ -268,8 +280,8 @@ def _triangulated(
 
 
 def _apart(places: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "k 3"]) -> float:
-    """Returns the mean distance of `places` from `others`, over the size of `places`. The others
-    are first moved, turned and scaled to fit best, but not mirrored (Umeyama 1991).
+    """Returns the mean distance of `others` from `places`, divided by the size of `places`.
+    `others` are first moved, turned and scaled to fit best, but not mirrored (Umeyama 1991).
     """
     a, b = places - places.mean(axis=0), others - others.mean(axis=0)
     u, values, v = np.linalg.svd(a.T @ b)

@@ -1,6 +1,6 @@
 """Reads and writes the files of fits: fit.npz and fit.json beside the body.npz of a capture.
 
-fit.npz, the input of a fit to keypoints and how well its result is known:
+fit.npz has the input of a fit to keypoints, and the uncertainty of its result:
 
     set, names (v,), points (v, k, 2), confidences (v, k)    the keypoints, as
                                                              `humangs_jax.capture.keypoints` stores
@@ -36,7 +36,7 @@ from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, 
 from humangs_jax.io.reading import reading, write_json
 
 FIT_FILE = "fit.npz"
-"""Name of the file with the input of a fit to keypoints, and with how well its result is known."""
+"""Name of the file with the input of a fit to keypoints and the uncertainty of its result."""
 _FOUND = ("noise", "joint_std", "determined", "shape_covariance")
 """Keys of fit.npz that are fields of `FitRecord`."""
 KEYS = ("set", "names", "points", "confidences", *_FOUND, "places", "certainty")
@@ -48,9 +48,7 @@ KEYS = ("set", "names", "points", "confidences", *_FOUND, "places", "certainty")
 
 
 class UnknownViewError(ValueError):
-    """Error for a capture with views that its fit does not know, because photos were added
-    later.
-    """
+    """Error: the capture has views that its fit does not know, because photos were added later."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -152,16 +150,14 @@ def check_place(
     overwrite: bool,
     inputs: Iterable[str | Path | None] = (),
 ) -> Path:
-    """Returns the folder that a fit of the capture `source` is written to. Checks before the work
-    begins that it can be written.
+    """Returns the folder to which a fit of the capture `source` will be written. Checks beforehand
+    that it can be written there.
 
-    Arguments: out: the folder. None: the capture folder itself, of which body and cameras are
+    Arguments: out: the folder. None: the capture folder itself, in which body and cameras are
     replaced. overwrite: whether an existing fit may be replaced. inputs: further files and folders
-    that the fit reads, or None. If `out` is another folder, neither these nor the photos may lie in
-    it.
-    Raises: ArgumentError if there is a body in the capture folder, and `overwrite` is False.
-    ValueError as in `check_replaceable` for another folder. OSError for a place that cannot be
-    written to.
+    that the fit reads, or None. If `out` is another folder, it must not contain them or the photos.
+    Raises: ArgumentError if the capture folder itself has a body, and `overwrite` is False. For
+    another folder, ValueError as in `check_replaceable`. OSError if the place cannot be written to.
     """
     source = capture_folder(source)
     target = source if out is None else Path(out)
@@ -177,8 +173,8 @@ def check_place(
 
 
 def _photo_files(description: dict[str, Any]) -> list[str]:
-    """Returns the names of a capture's images, masks and files of unknown pixels, as its
-    description has them.
+    """Returns the names of a capture's images, masks and files of unknown pixels, sorted. They are
+    as in the description, which is the content of capture.json.
     """
     kinds = ("image", "mask", "unknown")
     return sorted({view[key] for view in description["views"] for key in kinds if key in view})
@@ -191,11 +187,12 @@ def write_fitted(
     report: FitReport,
     record: FitRecord | None = None,
 ) -> None:
-    """Writes cameras, body and report of a capture. They go into the capture folder `source`
-    itself, or with copies of its photos into another folder `target`, which is replaced.
+    """Writes cameras, body and report of a capture. If `target` is the capture folder `source`,
+    they are written into it. If not, the folder `target` is replaced, and also gets copies of the
+    photos.
 
     Arguments: record: record of a fit to keypoints. If it is None, the target has no fit.npz
-    afterwards, because that of the source is of other cameras.
+    afterwards. An old fit.npz in the source belongs to other cameras.
     """
     source, target = capture_folder(source), Path(target)
     description = read_description(source / "capture.json")
@@ -227,8 +224,8 @@ def write_fitted(
 
 
 def _with_cameras(description: dict[str, Any], capture: Capture) -> dict[str, Any]:
-    """Returns the contents of capture.json with the cameras and the frames of the capture. Numbers
-    that have not changed stay as they are in the description.
+    """Returns the contents of capture.json, with the cameras and frames of `capture`. Matrices that
+    have not changed are copied from `description`, so that they keep all digits.
     """
     views = []
     for i, view in enumerate(description["views"]):

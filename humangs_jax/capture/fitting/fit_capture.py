@@ -66,16 +66,21 @@ class Uncertainty(NamedTuple):
     joint_covariances: Float[np.ndarray, "m j 3 3"]
     """Covariances of the joints' positions, (m, j, 3, 3), square metres."""
     determined: Float[np.ndarray, "m j"]
-    """Share of the prior's variance of each joint's rotation that the views remove, (m, j), a mean
-    over axes. 1 is all. 0 is nothing, as for joints that no keypoint depends on. For the root it is
-    1 minus the largest standard deviation of its orientation about an axis, in half turns.
+    """How much of each joint's rotation the views determine, (m, j). It is the share of the prior's
+    variance that the views remove, a mean over three axes. 1 is all, 0 is nothing. It is 0 for
+    joints that no keypoint depends on.
+
+    For the root it is 1 minus the standard deviation of its orientation in half turns, about the
+    least certain axis.
     """
     shape_covariance: Float[np.ndarray, "s s"]
     """Covariance of the shape coefficients, (s, s)."""
 
     @property
     def joint_std(self) -> Float[np.ndarray, "m j"]:
-        """Root mean square of the expected distance from the true joint, (m, j), metres."""
+        """Root mean square distance between the fitted and the true joint that is expected, (m, j),
+        metres.
+        """
         return np.sqrt(np.trace(self.joint_covariances, axis1=-2, axis2=-1))
 
 
@@ -118,8 +123,8 @@ def fit_uncertainty(
 def _determined(
     problem: KeypointProblem, poses: Float[np.ndarray, "m p p"]
 ) -> Float[np.ndarray, "m j"]:
-    """Returns `Uncertainty.determined`. poses: covariance of the unknowns, (m, p, p), in the order
-    global_orient, transl, body_pose.
+    """Returns `Uncertainty.determined`, (m, j). poses: covariance of a frame's unknowns, (m, p, p),
+    in the order global_orient, transl, body_pose.
     """
     joints, variances = np.asarray(problem.origin.joints), np.diagonal(poses, axis1=-2, axis2=-1)
     left = variances[:, 6:].reshape(len(poses), len(joints), 3)
@@ -134,9 +139,9 @@ def _determined(
 def _derivatives(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> tuple[Float[Array, "m r u"], Float[Array, "m j 3 u"]]:
-    """Returns the derivatives of residuals, (m, r, u), and of joints, (m, j, 3, u), of each frame
-    by its u unknowns: global_orient, transl, body_pose, and the shape. The prior of the shape is
-    not among the residuals.
+    """Returns the derivatives of each frame's residuals, (m, r, u), and of its joints in metres,
+    (m, j, 3, u). The u unknowns are global_orient, transl, body_pose and the shape, in this order.
+    The residuals are without the shape's prior.
     """
     problem, state, m = keypoint_problem(model), fit.state, len(observations.noise)
     poses = jnp.concatenate(
@@ -164,8 +169,8 @@ def _derivatives(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Examination:
-    """A report that compares a body with keypoints, and the arrays of v views and k keypoints from
-    which it was made.
+    """A report that compares a body with keypoints, and the arrays from which it was made, for v
+    views and k keypoints.
     """
 
     report: FitReport
@@ -179,15 +184,16 @@ class Examination:
 
 
 def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = None) -> Examination:
-    """Compares the body of a capture with keypoints of its views.
+    """Returns a report that compares the body of a capture with keypoints of its views.
 
     Args:
         capture: the capture with its body.
         keypoints: keypoints in the order of the capture's views.
-        record: record of the fit to these keypoints. It has the noise of the keypoints, and what
-            the views determine. None: the noise is estimated from the median error.
-    Raises: ValueError if the number of views differs, if the record has fewer frames or another
-    number of joints, or if the body has none of the landmarks.
+        record: record of the fit to these keypoints, from which noise and undetermined joints are
+            taken. None: the noise is estimated from the median error.
+    Raises: ValueError if keypoints and capture differ in the number of views, if the record has
+    fewer frames or another number of joints than the capture, or if the body has none of the
+    landmarks.
     """
     _check_same_views(capture, keypoints, record)
     # distances of the body's landmarks from the keypoints, frame by frame
@@ -237,7 +243,7 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
 
 
 def _check_same_views(capture: Capture, keypoints: Keypoints, record: FitRecord | None) -> None:
-    """Checks that keypoints and record fit to a capture.
+    """Checks that keypoints and record have the views, frames and joints of a capture.
 
     Raises: ValueError, see `examine`.
     """
@@ -293,14 +299,15 @@ def _view_report(
 
 
 def _quantile(values: Float[np.ndarray, "..."], share: float) -> float:
-    """Returns a quantile of the finite values. It is NaN if no value is finite."""
+    """Returns the quantile `share` of the finite values. It is NaN if no value is finite."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if known.size else float("nan")
 
 
 def calls_of_fit(body: BodyModel, kind: KeypointSet, views: int) -> Iterator[Call]:
-    """Yields the programs that `fit_photos` and its report run for photos of one moment, in the
-    order of their use. They depend only on the number of views. kind: set of the keypoints.
+    """Yields the compiled functions that `fit_photos` and its report call for photos of one moment,
+    each with arguments of the right shapes, in the order of their use. The shapes depend on the
+    body, the set `kind` and the number of views.
     """
     model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)
     k, one = len(kind.names), (1, views)
@@ -316,14 +323,12 @@ def calls_of_fit(body: BodyModel, kind: KeypointSet, views: int) -> Iterator[Cal
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FittedCapture:
-    """The result of a fit: the capture with its body, and the record that is stored beside it."""
+    """The result of a fit: the capture with its body, and the record for fit.npz."""
 
     capture: Capture
-    """Photos, cameras and the fitted body. Cameras that were turned in the photos are turned
-    back.
-    """
+    """Photos, cameras and the fitted body. Cameras with a wrong rotation are corrected."""
     record: FitRecord
-    """Keypoints that were fitted, and how well the result is known."""
+    """Keypoints that were fitted, and the uncertainty of the result."""
     fit: LandmarkFit
     """Result of the optimisation."""
     notes: tuple[str, ...]
@@ -331,12 +336,12 @@ class FittedCapture:
     warnings: tuple[str, ...]
     """Signs of a mistake in the fit, one line each."""
     camera_errors: tuple[CameraError, ...] = ()
-    """Cameras that were turned back."""
+    """Cameras whose rotation was corrected."""
 
     @functools.cached_property
     def report(self) -> FitReport:
-        """Report on how good the fit is. It is made only when needed, because it tries exchanges of
-        views.
+        """Report on the quality of the fit. It is made when it is first read, because it takes time
+        to try exchanges of views.
         """
         report = examine(self.capture, self.record.keypoints, self.record).report
         notes, warnings = (*report.notes, *self.notes), (*report.warnings, *self.warnings)
@@ -352,8 +357,8 @@ def fit_photos(
     smoothness: float = 0.0,
     fixed_cameras: bool = False,
 ) -> FittedCapture:
-    """Finds shape and poses of the person in photos. Cameras that are turned, as the keypoints
-    show, are turned back.
+    """Returns the capture with the fitted shape and poses of the person in photos. Cameras are
+    corrected first if their rotation is wrong according to the keypoints.
 
     Args:
         photos: photos with cameras.
@@ -363,8 +368,8 @@ def fit_photos(
         smoothness: see `fit_landmarks`.
         fixed_cameras: whether the cameras stay as they are. Cameras that were found from the person
             always stay.
-    Raises: ValueError if the numbers of views differ, if no view has a keypoint that the body has,
-    or if the body's root is not its first joint.
+    Raises: ValueError if photos and keypoints differ in the number of views, if no view has a
+    keypoint that the body has, or if the body's root is not its first joint.
     """
     if len(keypoints.points) != len(photos.names):
         raise ValueError(
@@ -415,8 +420,8 @@ def fit_photos(
 
 
 def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:
-    """Yields a line about landmarks that the detector sees elsewhere than the body has them, if the
-    fit looked for such landmarks.
+    """Yields a line if the detector sees kinds of landmarks more than 1 cm away from where the body
+    model has them. It yields nothing if the fit did not estimate such offsets.
     """
     if fit.state.places is None:
         return
@@ -436,8 +441,8 @@ def _places(model: LandmarkModel, fit: LandmarkFit) -> Iterator[str]:
 
 
 def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str]:
-    """Yields warnings about frames with few keypoints or with a single view. seen: which keypoints
-    are seen, (m, c, k). smooth: whether the motion is smooth.
+    """Yields warnings about frames with few keypoints, and about frames that are seen by one view.
+    seen: which keypoints are seen, (m, c, k). smooth: whether the motion is smooth.
     """
     taken = "interpolated between its neighbours" if smooth else "the prior's, not the photos'"
     single = []
@@ -456,8 +461,10 @@ def _blind_frames(seen: Bool[np.ndarray, "m c k"], smooth: bool) -> Iterator[str
 def _motion_warnings(
     joints: Float[np.ndarray, "m j 3"], held: float, smoothness: float
 ) -> Iterator[str]:
-    """Yields warnings about motion that was to be smooth. held: the expected acceleration that the
-    fit used in the end, 0 if none.
+    """Yields warnings about a motion for which the user asked smoothness. joints: positions, (m, j,
+    3), metres. held: the expected acceleration that the fit used in the end, 0 if the frames are
+    independent. smoothness: the expected acceleration that was asked for, 0 if none. Both in metres
+    per frame squared.
     """
     if not smoothness:
         return

@@ -64,18 +64,18 @@ from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.transform import EXACT
 
 ROBUST_SCALES = {"rigid": 30.0, "points": 15.0, "body": 15.0, "hands": 10.0, "person": 5.0}
-"""Robust scales of keypoints in each stage, standard deviations."""
+"""Robust scales of keypoints in each stage, as multiples of the keypoints' standard deviation."""
 STEPS = 150
 """Largest number of steps of the solver in a stage."""
 _TOLERANCE = 3e-4
 """Tolerance of the solver, see `state.solve`."""
 MOTION_SCALE = 5.0
-"""Robust scale of accelerations, multiples of the expected one. It is small, so that a frame that
-shows somebody else hardly pulls the others.
+"""Robust scale of accelerations, as a multiple of the expected acceleration. It is small, so that a
+frame that shows another person hardly affects the other frames.
 """
 FEW = 6
-"""Number of landmarks. The pose of a frame that shows fewer follows mostly from the prior. Smooth
-motion interpolates such a frame.
+"""A frame with fewer landmarks than this has little influence on its pose, which is then mostly the
+prior's. Smooth motion interpolates such a frame.
 """
 
 
@@ -109,8 +109,8 @@ def fit_landmarks(
 ) -> LandmarkFit:
     """Returns shape and poses of one person.
 
-    The result is finite for all finite observations. Frames without keypoints rest in the prior's
-    usual pose, or `smooth_motion` interpolates them.
+    The result is finite for all finite observations. Frames without keypoints get the prior's usual
+    pose. If the motion is smooth, `smooth_motion` interpolates them.
 
     Args:
         model: landmarks of the keypoints on the body.
@@ -127,7 +127,7 @@ def fit_landmarks(
 
 @jax.jit
 def fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit:
-    """Runs all stages but the motion. observations: a batch of m frames."""
+    """Runs all stages except motion, and returns the fit. observations: a batch of m frames."""
     problem = keypoint_problem(model)
     states = jax.vmap(lambda seen: _fit_frame(problem, seen))(observations)
     observations = replace(observations, noise=_noise_found(problem, observations, states))
@@ -166,8 +166,8 @@ def _poses(problem: KeypointProblem, state: FitState) -> BodyPose:
 
 
 def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
-    """Returns the problem in which every joint that moves a landmark is free. The other joints rest
-    in the usual pose.
+    """Returns the problem of fitting a body to keypoints. Every joint that moves a landmark is
+    free. The other joints stay in the usual pose.
     """
     prior, joints = pose_prior(model.joint_names), tuple(j for j in model.movers if j > 0)
     origin = usual_origin(prior, joints, model.joint_directions.shape[-1])
@@ -175,8 +175,8 @@ def keypoint_problem(model: LandmarkModel) -> KeypointProblem:
 
 
 def _fit_frame(problem: KeypointProblem, seen: Observations) -> FitState:
-    """Runs the stages rigid to hands for one frame from several starts. Returns the state with the
-    least cost.
+    """Returns the state of one frame after the stages rigid, points, body and hands. They run from
+    several starts, and the state with the least cost is returned.
     """
     points, counts, weights = triangulate_robustly(seen)
     # one view leaves more orientations open than several
@@ -214,11 +214,12 @@ def _rigid_starts(
     counts: Float[Array, " k"],
     kept: int,
 ) -> FitState:
-    """Returns states of a resting body with the `kept` best positions and orientations, a batch.
+    """Returns the `kept` best starts of a frame: states of a resting body with different positions
+    and orientations, a batch. The starts with the smallest keypoint errors are kept.
 
-    In one candidate the trunk of the resting body is turned onto triangulated points (Kabsch 1976).
-    The other candidates have the 24 orientations of a cube. The position for an orientation solves
-    linear equations. The candidates that follow the keypoints best are kept.
+    In one candidate the trunk of the resting body is rotated to fit the triangulated points (Kabsch
+    1976). The other candidates have the 24 rotations of a cube. The position for each orientation
+    is the solution of linear equations.
 
     Arguments: points: triangulated landmarks, (k, 3), metres. counts: number of views that agree
     with each landmark, (k,). 0 if the landmark is unknown.
@@ -272,8 +273,8 @@ def _cube_rotations() -> Float[np.ndarray, "24 3 3"]:
 def _kabsch(
     a: Float[Array, "k 3"], b: Float[Array, "k 3"], weights: Float[Array | np.ndarray, " k"]
 ) -> Float[Array, "3 3"]:
-    """Returns the rotation about the weighted means that takes points a to points b best. It is the
-    identity if all weights are 0.
+    """Returns the rotation, about the weighted means, that maps points a best onto points b. It is
+    the identity if all weights are 0.
     """
     share = weights / jnp.maximum(jnp.sum(weights), 1e-9)
     centered_a, centered_b = (x - jnp.sum(share[:, None] * x, axis=0) for x in (a, b))
@@ -293,9 +294,10 @@ def _position(
     """Returns the position at which landmarks project to their detections, (3,), metres. offsets:
     landmarks relative to the position, (k, 3), metres.
 
-    Let (x, y) be a detection relative to the principal point over the focal length, (X, Y, z) the
-    offset and t the position, all in the camera's axes. Then x (z + t_z) = X + t_x, and the same
-    for y, which is linear in t. The position solves these equations of all views by least squares.
+    In the camera's axes, let (X, Y, z) be an offset, t the position, and (x, y) the detection
+    relative to the principal point, divided by the focal length. Then x (z + t_z) = X + t_x and y
+    (z + t_z) = Y + t_y, which is linear in t. These equations of all views are solved by weighted
+    least squares.
     """
     rotation = observations.cam_from_world[:, :3, :3]
     xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
@@ -324,11 +326,11 @@ class _Stage:
     scale: Float[Array, ""]
     """Robust scale, standard deviations."""
     free: FitState
-    """A boolean for each number of the state: whether it moves."""
+    """Whether each number of the state moves, as booleans in the form of a state."""
 
 
 def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
-    """Returns the stages rigid, points, body and hands, a batch."""
+    """Returns the stages rigid, points, body and hands, in one batch."""
     model, resting = problem.model, zero_state(problem.origin)
     trunk = jnp.asarray(trunk_weights(model.names))
     # joints that move before the hands do
