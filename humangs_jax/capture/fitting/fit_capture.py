@@ -266,8 +266,8 @@ def _exchanges(
     views: Int[np.ndarray, "m c"],
     names: tuple[str, ...],
 ) -> tuple[Swap, ...]:
-    """Returns what seems to be exchanged. Exchanged hands are not reported again as exchanged sides
-    of their view.
+    """Returns the cameras, sides and hands that seem to be exchanged. If the hands of a view are
+    exchanged, its sides are not reported as exchanged in addition.
     """
     hands = find_exchanged_hands(keypoints, names)
     explained = {swap.views[0] for swap in hands}

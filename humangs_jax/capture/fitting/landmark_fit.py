@@ -383,17 +383,19 @@ def _noise_found(
 def _certainty_found(
     problem: KeypointProblem, observations: Observations, states: FitState
 ) -> Float[Array, " k"]:
-    """Returns the certainties of the landmarks, (k,): the noise of all landmarks over that of each.
+    """Returns the certainty of each landmark, (k,): the noise of all landmarks, divided by the
+    noise of this one.
 
-    The noise of a landmark follows from the median error of its keypoints and its mirror image's,
-    in frames where several views show the landmark. The fewer keypoints there are, the nearer the
-    noise is to the usual noise. It is at least half the usual noise.
+    The noise of a landmark is estimated from the median error of its keypoints and of its mirror
+    image's keypoints, in frames in which several views show the landmark. It is a mean of this
+    estimate and the usual noise. With fewer keypoints the usual noise has more weight. It is at
+    least half the usual noise.
     """
     names = problem.model.names
 
     def errors_of_frame(seen, state):
-        """Returns errors in units of the frame's noise, (c, k). NaN where fewer than two views show
-        a landmark.
+        """Returns the lengths of keypoint errors, (c, k), as multiples of the frame's noise. NaN if
+        fewer than two views show the landmark.
         """
         errors = keypoint_errors(seen, problem.landmarks_and_joints(state)[0]) / seen.noise
         known = (seen.confidences > 0) & (problem.known > 0)
@@ -419,7 +421,9 @@ def _certainty_found(
 def _person_residuals(
     problem: KeypointProblem, observations: Observations, state: FitState
 ) -> dict[str, Float[Array, "..."]]:
-    """Returns the residuals of all frames with one shape, by kind."""
+    """Returns the residuals of all frames, which share one shape. The key is the kind of
+    residual.
+    """
 
     def of_frame(seen, own):
         return frame_residuals(problem, seen, own, ROBUST_SCALES["person"])
@@ -472,8 +476,8 @@ def smooth_motion(
     limit = costs(fit.state) + jnp.minimum(6 + 3 * len(problem.origin.joints), observed)
 
     def solve_level(carry, std):
-        """Solves one level, beginning with the result of the level before. Keeps the result if it
-        follows the keypoints.
+        """Runs one solve, which starts from the result of the solve before. The result becomes the
+        kept one if it is accepted.
         """
         state, kept, held = carry
         residuals = functools.partial(_motion_residuals, problem, seen, std)
@@ -493,8 +497,8 @@ def smooth_motion(
 def _keypoint_costs(
     problem: KeypointProblem, observations: Observations, state: FitState
 ) -> Float[Array, " m"]:
-    """Returns the robust cost of the keypoints of each frame, (m,): half the square sum of
-    residuals in standard deviations.
+    """Returns the robust cost of the keypoints of each frame, (m,). It is half the sum of the
+    squared residuals, which are in standard deviations.
     """
 
     def of_frame(seen, landmarks):
@@ -510,8 +514,8 @@ def _keypoint_costs(
 def _motion_residuals(
     problem: KeypointProblem, observations: Observations, std: Float[Array, ""], state: FitState
 ) -> dict[str, Float[Array, "..."]]:
-    """Returns the residuals of all frames, and of the accelerations of their joints. std: the
-    expected acceleration, metres per frame squared.
+    """Returns the residuals of `_person_residuals`, and with the key "motion" the residuals of the
+    joints' accelerations. std: the expected acceleration, metres per frame squared.
     """
     axes = frame_axes(state)
     joints = jax.vmap(problem.landmarks_and_joints, in_axes=(axes,))(state)[1]
@@ -533,8 +537,8 @@ def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) ->
 
 def _bridged(problem: KeypointProblem, seen: Observations, state: FitState) -> FitState:
     """Returns the state with new poses in frames that show fewer than `FEW` landmarks. A new pose
-    is interpolated between the nearest other frames before and after. If one of these is missing,
-    it is the pose of the other. If both are, the frame keeps its pose.
+    is interpolated between the nearest frames before and after that show enough. If there is such a
+    frame on one side only, its pose is taken. If there is none at all, poses stay as they are.
     """
     m = len(seen.noise)
     shown = jnp.sum(jnp.any(seen.confidences * problem.known > 0, axis=1), axis=1) >= FEW

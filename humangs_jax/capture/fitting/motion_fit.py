@@ -1,17 +1,19 @@
 """Fits a motion to the keypoints of a video of one camera that stands still. One fit covers all
 frames, with one shape. Its stages are:
 
-    start    places the trunk of each frame like the detector's 3D landmarks, smoothed over time
-    shape    fits the shape, unless it is known, to frames from all over the video, without order
+    start    turns and places the trunk of each frame by the detector's 3D landmarks, smoothed over
+             time
+    shape    fits the shape, unless it is known, to frames from all over the video, whose order is
+             ignored
     motion   fits overlapping windows of `WINDOW` frames to the keypoints with their noise, the
              detector's depths, the priors of poses, and accelerations and jerk of the joints
-    feet     fits the motion once more, and holds the feet where the motion shows that they stand
+    feet     fits the motion once more, and holds feet still where the motion shows that they stand
     floor    turns the world so that the person stands along y
 
-The unknowns of a window are u, where S u is the change of its state x, S = (1 + w D^T D)^(-1/2),
-and D takes third differences over time. In u the jerk is about as stiff as the keypoints, so
-that few steps of the solver carry a correction through all frames. All stages use one compiled
-program.
+A window's state is x = x_0 + S u, where u are the unknowns of the solver. This preconditioning has
+S = (1 + w D^T D)^(-1/2), where D takes third differences over time. In u the jerk is about as stiff
+as the keypoints. So the solver carries a correction through all frames in few steps. All stages use
+one compiled program.
 
 The method follows HTD-Refine (https://arxiv.org/abs/2605.26879) and GVHMR
 (https://arxiv.org/abs/2409.06662).
@@ -56,14 +58,12 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry.transform import EXACT
 
 WINDOW, OVERLAP = 120, 24
-"""Number of frames of a window, and of frames that it shares with the next window."""
+"""Number of frames in a window, and number of frames that two successive windows share."""
 _STEPS, _STEP_LENGTH = 120, 0.1
-"""Number of steps of Adam in each stage of a window, and length of the first step in each
-unknown.
-"""
+"""Number of Adam steps in each stage of a window, and the learning rate at the first step."""
 _ACCELERATION, _JERK = 10.0, 100.0
-"""Expected standard deviations of a joint's acceleration, m/s^2, and jerk, m/s^3. They are those of
-people who dance.
+"""Expected standard deviations of a joint's acceleration, m/s^2, and of its jerk, m/s^3. They are
+typical of people who dance.
 """
 
 
@@ -72,36 +72,44 @@ class _MotionPrior:
     """Constants of the prior of motions."""
 
     keypoint: float = 0.008
-    """Noise of a keypoint as a distance at the person, metres. Only the preconditioning uses it."""
+    """Noise of a keypoint, expressed as a distance at the person, metres. Only the preconditioning
+    uses it.
+    """
     held_speed: float = 0.03
     """Standard deviation of the speed of a foot that stands still, metres a second."""
     height: float = 0.005
     """Standard deviation of a person's known height, metres."""
     anchor: float = 20.0
-    """Weight that holds a window to the frames that the window before has found, per unit of the
-    state.
+    """Weight of the residuals that hold the first frames of a window to the poses from the window
+    before. It multiplies differences of the state.
     """
     robust_scale: float = 5.0
-    """Robust scale of accelerations, jerk and speeds of feet, standard deviations."""
+    """Robust scale of accelerations, jerk and speeds of feet, as a multiple of their standard
+    deviations.
+    """
 
 
 _PRIOR = _MotionPrior()
 
 
 _LEVELS = ((30.0, 8.0), (10.0, 3.0), (5.0, 1.0))
-"""Robust scale of keypoints and factor on the expected accelerations and jerk, one row for each
-stage of a motion.
+"""One row for each fit of the motion, in order: the robust scale of keypoints (in standard
+deviations), and the factor on the expected accelerations and jerk.
 """
 _FEET = ("left_heel", "left_foot_index", "right_heel", "right_foot_index")
-"""Landmarks of the feet, which stand still while the foot stands."""
+"""Landmarks of the feet that are held still while the foot stands."""
 _HIPS = ("left_hip", "right_hip")
-"""Landmarks of the hips, which say where the person begins."""
+"""Landmarks of the hips. Their middle is the origin of the detector's 3D landmarks."""
 _LEAST_SEEN = 6
-"""Least number of visible keypoints of a frame. The start of a frame with fewer is interpolated."""
+"""Smallest number of visible keypoints for a frame to get its own start. In other frames the start
+is interpolated.
+"""
 _LEAST_VISIBLE = 0.3
-"""Confidence above which a keypoint counts as visible for `_LEAST_SEEN`."""
+"""A keypoint counts as visible if its confidence exceeds this number."""
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
-"""Matrix between the axes of the camera and those of a world with y up and z towards the camera."""
+"""Pose of the camera at the start, (4, 4). It turns a world with y up and z towards the camera into
+the camera's axes, and back.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -117,16 +125,16 @@ class MotionFit:
     joints: Float[np.ndarray, "m j 3"]
     """Joints in the world, (m, j, 3), metres."""
     cam_from_world: Float[np.ndarray, "4 4"]
-    """Matrix of the camera, which stands still, (4, 4), metres."""
+    """Pose of the camera, world to camera, (4, 4), metres. It is the same in all frames."""
     static: Float[np.ndarray, "m f"]
-    """How surely each landmark of `_FEET` stands still between the frame before and this one, (m,
-    f), 0 to 1.
+    """How certain it is that each landmark of `_FEET` stands still between the previous frame and
+    this one, (m, f), 0 to 1.
     """
 
 
 @pytree_dataclass
 class _Window:
-    """What `_solved` knows about a window besides its keypoints."""
+    """Inputs of `_solved` for one window, apart from its keypoints."""
 
     poses: BodyPose
     """Poses with which the fit begins, a batch of w frames."""
@@ -135,17 +143,21 @@ class _Window:
     smoother: Float[Array, "w w"]
     """Matrix S of the preconditioning, (w, w), see the module's docstring."""
     timed: Float[Array, " w"]
-    """1 for frames that follow each other in time, 0 for others, (w,)."""
+    """1 for frames that follow each other in time, (w,). 0 for frames whose order is ignored, and
+    for frames that only fill the window.
+    """
     held: Float[Array, "v f"]
-    """How surely the landmarks of `_FEET` stand still from a frame to the next, (w - 1, f), 0 to
-    1.
+    """How certain it is that each landmark of `_FEET` stands still from a frame to the next, (w -
+    1, f), 0 to 1.
     """
     anchored: Float[Array, " w"]
-    """1 for frames that are held to their poses, 0 for others, (w,)."""
+    """1 for frames that are held to their first poses, 0 for others, (w,)."""
     height: Float[Array, "2"]
-    """Height of the person, metres, and its weight, 0 or 1, (2,)."""
+    """Height of the person, metres, and 1 if it is known, (2,). Both are 0 if it is not known."""
     tall: Float[Array, " s1"]
-    """Height of the mean body, and what a unit of each coefficient adds to it, (1 + s,), metres."""
+    """Height of the mean body, then how much each shape coefficient of 1 adds to the height, (1 +
+    s,), metres.
+    """
     rate: Float[Array, ""]
     """Frames per second."""
     scales: Float[Array, "2"]
@@ -173,8 +185,8 @@ def fit_motion(
         betas: shape of the person, (s,). None: the shape is fitted.
         height: height of the person, metres. None: it follows from keypoints and prior. It has no
             effect if `betas` is given.
-        watch: called with the stages and the number of windows. It returns the stages, and may show
-            a bar meanwhile.
+        watch: wraps the iterable of stages, for example to show a progress bar. It is called with
+            the stages and the number of windows, and returns the stages.
     Raises: ValueError if no frame shows the person, if the keypoints have no 3D landmarks, or if
     their set lacks hips or feet.
     """
@@ -222,9 +234,10 @@ def fit_motion(
 
 
 def _observations(keypoints: Keypoints, K: Float[np.ndarray, "3 3"]) -> Observations:
-    """Returns the keypoints of m frames, a view for each frame, with the detector's depths.
+    """Returns the keypoints as observations of m frames with one view each, with the detector's 3D
+    landmarks.
 
-    Raises: ValueError if no frame shows the person, or if depths are missing.
+    Raises: ValueError if no frame shows the person, or if there are no 3D landmarks.
     """
     if keypoints.world is None:
         raise ValueError("expected keypoints of a detector that sees them in space, too")
@@ -244,7 +257,8 @@ def _observations(keypoints: Keypoints, K: Float[np.ndarray, "3 3"]) -> Observat
 def _start(
     model: LandmarkModel, seen: Observations, fps: float, betas: Float[np.ndarray, " s"]
 ) -> BodyPose:
-    """Returns the first poses: usual poses, turned and placed like the detector's 3D landmarks and
+    """Returns the poses with which the fit starts. Joints have the usual pose. Orientation and
+    position of each frame are found from the keypoints and the detector's 3D landmarks, and
     smoothed over time.
     """
     problem = keypoint_problem(model)
@@ -290,7 +304,9 @@ def _radius(points: Float[np.ndarray, "*m k 3"]) -> Float[np.ndarray, "*m"] | np
 
 
 def _steady(values: Float[np.ndarray, "m ..."], fps: float) -> Float[np.ndarray, "m ..."]:
-    """Removes outliers from values of the frames, (m, ...), and smooths them over time."""
+    """Returns values of frames, (m, ...), without outliers (median of 5 frames), and smoothed over
+    time (Gaussian of 0.1 s).
+    """
     kept = median_filter(values, size=(5, *[1] * (values.ndim - 1)), mode="nearest")
     # over a tenth of a second, or half a frame
     return gaussian_filter1d(kept, max(0.1 * fps, 0.5), axis=0, mode="nearest")
@@ -299,8 +315,8 @@ def _steady(values: Float[np.ndarray, "m ..."], fps: float) -> Float[np.ndarray,
 def _turn(
     a: Float[np.ndarray, "k 3"], b: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]
 ) -> Rotation:
-    """Returns the rotation that brings points a closest to points b, both taken relative to their
-    weighted mean.
+    """Returns the rotation that best maps points a onto points b, after the weighted means are
+    subtracted.
     """
     a, b = (x - np.average(x, axis=0, weights=weights) for x in (a, b))
     return Rotation.align_vectors(b, a, weights=weights)[0]
@@ -312,15 +328,15 @@ def _place(
     K: Float[np.ndarray, "3 3"],
     offsets: Float[np.ndarray, "k 3"],
 ) -> Float[np.ndarray, "3"]:
-    """Returns the position t at which a body is seen where its keypoints are, (3,), metres, in the
-    axes of the world.
+    """Returns the position t, (3,), metres, at which the body projects to its keypoints. t is in
+    the axes of the world.
 
     Arguments: points: keypoints, (k, 2), pixels. offsets: points of the body relative to t, (k, 3),
     metres, in the axes of the world.
 
-    Let (X, Y, Z) be a point's offset in the camera's axes, and (x, y) its keypoint relative to the
-    principal point over the focal length. Then x (Z + t_z) = X + t_x, and the same for y, which is
-    linear in t.
+    In the camera's axes, let (X, Y, Z) be a point's offset, and (x, y) its keypoint relative to the
+    principal point, divided by the focal length. Then x (Z + t_z) = X + t_x and y (Z + t_z) = Y +
+    t_y, which is linear in t.
     """
     xy = (points - K[:2, 2]) / np.diagonal(K)[:2]
     off = offsets * np.diag(FLIP)[:3]
@@ -336,8 +352,8 @@ def _place(
 
 
 def _tallness(body: BodyModel) -> Float[np.ndarray, " s1"]:
-    """Returns the height of the mean body, then what a unit of each shape coefficient adds to it,
-    (1 + s,), metres.
+    """Returns the height of the mean body, then how much each shape coefficient of 1 adds to the
+    height, (1 + s,), metres.
     """
     template = np.asarray(body.template)
     top, bottom = template[:, 1].argmax(), template[:, 1].argmin()
@@ -362,7 +378,9 @@ def _of_height(
 
 
 def _windows(m: int) -> list[np.ndarray]:
-    """Returns the numbers of the frames of each window. Windows overlap."""
+    """Returns the indices of the frames of each window. Successive windows share `OVERLAP`
+    frames.
+    """
     starts = range(0, max(m - OVERLAP, 1), WINDOW - OVERLAP)
     return [np.arange(start, min(start + WINDOW, m)) for start in starts]
 
@@ -373,10 +391,10 @@ def _joined(
     run: Callable[..., tuple[BodyPose, np.ndarray]],
     more: Callable[[np.ndarray], dict[str, Any]] = lambda window: {},
 ) -> BodyPose:
-    """Solves the windows one after the other, and returns the poses of all frames.
+    """Fits the windows one after the other, and returns the poses of all frames.
 
-    In the first half of the frames that two windows share, the second window is held to the result
-    of the first. more: returns further arguments of `run` for a window.
+    Two windows share some frames. In the first half of these, the second window is held to the
+    poses that the first one found. more: returns further arguments of `run` for a window.
     """
     for i, window in enumerate(windows):
         anchored = np.zeros(len(window))
@@ -399,15 +417,16 @@ def _run(
     static: Float[np.ndarray, "w f"] | None = None,
     anchored: Float[np.ndarray, " w"] | None = None,
 ) -> tuple[BodyPose, Float[np.ndarray, " s"]]:
-    """Fits the poses of some frames. Returns the poses of all frames, of which it replaced those of
-    `frames`, and the shape.
+    """Fits the poses of one window. Returns the poses of all frames, with new poses in `frames`,
+    and the shape.
 
     Args:
-        frames: numbers of the frames, (w,) at most `WINDOW`.
-        poses: poses of all frames, with which the fit begins.
+        frames: indices of the frames of the window, (w,), at most `WINDOW` of them.
+        poses: poses of all frames, with which the fit starts.
         scales: a row of `_LEVELS`.
-        timed: whether the frames follow each other in time. If so, the shape stays.
-        static: how surely the feet stand still, (w, f). None: they are not held.
+        timed: whether the frames follow each other in time. If so, the shape is not fitted.
+        static: how certain it is that the feet stand still, (w, f), as in `MotionFit.static`. None:
+            feet are not held.
         anchored: 1 for frames that are held to their poses, 0 for others, (w,). None: no frame is
             held.
     """
@@ -439,7 +458,7 @@ def _run(
 
 @functools.cache
 def _smoother(fps: float) -> Float[np.ndarray, "w w"]:
-    """Returns the matrix S of a window, see the module's docstring."""
+    """Returns the preconditioning matrix S, (w, w). See the module's docstring."""
     third = np.diff(np.eye(WINDOW), n=3, axis=0)
     values, vectors = np.linalg.eigh(third.T @ third)
     weight = (_PRIOR.keypoint * fps**3 / _JERK) ** 2
@@ -450,7 +469,7 @@ def _smoother(fps: float) -> Float[np.ndarray, "w w"]:
 def _solved(
     model: LandmarkModel, seen: Observations, window: _Window
 ) -> tuple[BodyPose, Float[Array, " s"]]:
-    """Fits a window, beginning with its poses and shape. Returns the new poses and the shape."""
+    """Fits a window, starting from its poses and shape. Returns the new poses and the shape."""
     problem = keypoint_problem(model)
     origin = replace(problem.origin, betas=jnp.zeros_like(window.betas))
     usual = problem.origin.pose
@@ -468,7 +487,7 @@ def _solved(
     feet = np.asarray([model.names.index(name) for name in _FEET])
 
     def smooth(state: FitState) -> FitState:
-        """Returns the state x = begun + S u of the unknowns u."""
+        """Returns the state x = x_0 + S u for the unknowns u."""
 
         def moved(old, u):
             return old + jnp.einsum("vw,w...->v...", window.smoother, u, precision=EXACT)
@@ -518,7 +537,9 @@ def _solved(
 
 
 def _descended(loss: Callable[[FitState], Float[Array, ""]], start: Any) -> FitState:
-    """Returns the unknowns after `_STEPS` steps of Adam. The step length falls to 0 (cosine)."""
+    """Returns the unknowns after `_STEPS` steps of Adam, with a cosine decay of the learning rate
+    to 0.
+    """
     optimizer = optax.adam(optax.cosine_decay_schedule(_STEP_LENGTH, _STEPS), b1=0.9, b2=0.95)
 
     def step(carry, _):
@@ -531,7 +552,7 @@ def _descended(loss: Callable[[FitState], Float[Array, ""]], start: Any) -> FitS
 
 
 def _roots_of(rotations: Float[Array, "m j 3"]) -> Float[Array, "m j 3"]:
-    """Returns the rotations with 0 for all joints but the root, (m, j, 3)."""
+    """Returns rotations, (m, j, 3), in which only the root's rotation is kept. All others are 0."""
     return jnp.zeros_like(rotations).at[:, 0].set(rotations[:, 0])
 
 
@@ -553,8 +574,8 @@ def _feet(model: LandmarkModel, landmarks: Float[Array, "m k 3"]) -> Float[np.nd
 def _static_feet(
     model: LandmarkModel, betas: Float[np.ndarray, " s"], poses: BodyPose, fps: float
 ) -> Float[np.ndarray, "m f"]:
-    """Returns how surely each point of the feet stands still between the frame before and this one,
-    (m, f), 0 to 1.
+    """Returns how certain it is that each landmark of `_FEET` stands still between the previous
+    frame and this one, (m, f), 0 to 1. It is 0 in the first frame.
     """
     points, _ = _landmarks(model, jnp.asarray(betas, jnp.float32), poses)
     moved = np.diff(_feet(model, points), axis=0, prepend=np.nan) * fps
@@ -574,8 +595,8 @@ def _standing(
     static: Float[np.ndarray, "m f"],
     fps: float,
 ) -> MotionFit:
-    """Returns the motion in a world turned so that the person stands along y, with the floor at y =
-    0.
+    """Returns the motion in a world that is turned so that the person stands along y, and moved so
+    that the floor is at y = 0.
     """
     shape = jnp.asarray(betas, jnp.float32)
     joints = np.asarray(_landmarks(model, shape, poses)[1], np.float64)

@@ -1,16 +1,17 @@
-"""A pose for each photo of a person who moved a little between photos that one pose nearly
+"""Fits a pose for each photo if the person moved a little between photos that one pose nearly
 explains.
 
-A person who turns before a camera moves head, arms and legs by centimetres. Such photos are neither
-of one moment nor of separate moments. They have one shape and one set of cameras, and each photo
-has a pose that starts at the shared pose and stays near it (`CONFIG`). Photos of a video follow
-each other. Their deviations x_i from the shared pose, in standard deviations, are a process of
-Ornstein and Uhlenbeck, where x_{i+1} - r x_i has the variance 1 - r^2, with r = exp(-t / MEMORY)
-for photos that are t seconds apart.
+A person who turns in front of a camera moves head, arms and legs by centimetres. Such photos do not
+show one moment, but their moments are not independent either. They share one shape and one set of
+cameras. Each photo has a pose that starts at the shared pose and stays near it (`CONFIG`).
 
-More numbers always fit the keypoints better. So poses are fitted to the keypoints alone, and the
-masks show whether the person moved. If nobody moved, these poses follow the detector's errors, and
-the body fills the masks less than before.
+Photos of a video follow each other in time. Their deviations x_i from the shared pose, in standard
+deviations, are an Ornstein-Uhlenbeck process: x_{i+1} - r x_i has the variance 1 - r^2, with r =
+exp(-t / MEMORY) for photos that are t seconds apart.
+
+More unknowns always fit the keypoints better. So the masks decide whether the person moved, after
+poses were fitted to the keypoints alone. If nobody moved, these poses follow the detector's errors,
+and the body agrees with the masks less than before.
 """
 
 import dataclasses
@@ -49,23 +50,28 @@ CONFIG = dataclasses.replace(
         ("wrist", 1.2),
     ),
 )
-"""Settings of poses that stay near the pose that the photos share."""
+"""Settings of a fit in which each photo has a pose that stays near the shared pose."""
 MEMORY = 2.0
-"""Time after which the correlation of a swaying body's deviations has fallen to 1 / e, seconds."""
+"""Time after which the correlation between a person's deviations from the shared pose has fallen to
+1 / e, seconds.
+"""
 LEAST_GAIN = 0.002
-"""Least rise of the silhouettes' IoU that shows a movement, if poses are fitted to keypoints alone.
-Synthetic people whose photos are of one moment lose 0.012. If their joints are bent by 2 degrees,
-they gain 0.005. A real man who turns before a camera gains 0.017.
+"""The person has moved if the mean IoU with the masks rises by more than this when poses are fitted
+to keypoints alone.
+
+For synthetic people whose photos show one moment, the IoU falls by 0.012. If their joints are bent
+by 2 degrees between photos, it rises by 0.005. For a real man who turns in front of a camera it
+rises by 0.017.
 """
 
 
 class Movement(NamedTuple):
-    """How well masks agree with a shared pose and with a pose for each photo."""
+    """How well the masks agree with one shared pose, and with a pose for each photo."""
 
     before: float
-    """Mean IoU of the masks and the body in the shared pose. NaN without masks."""
+    """Mean IoU between the masks and the body in the shared pose. NaN without masks."""
     after: float
-    """Mean IoU of the masks and the body in a pose for each photo, which was fitted to keypoints
+    """Mean IoU between the masks and the body if each photo has a pose that was fitted to keypoints
     alone. NaN without masks.
     """
 
@@ -78,8 +84,8 @@ class Movement(NamedTuple):
 def find_movement(
     capture: Capture, keypoints: Keypoints, seconds: Float[np.ndarray, " v"] | None = None
 ) -> Movement:
-    """Returns how well the body fills the masks in the shared pose, and in a pose for each photo
-    that is fitted to keypoints alone.
+    """Returns how well the body agrees with the masks in the shared pose, and in a pose for each
+    photo that is fitted to keypoints alone.
 
     Arguments:
         capture: photos with masks, and a body in poses that they share.
@@ -112,14 +118,16 @@ def fit_own_poses(
 
 
 def _memory(seconds: Float[np.ndarray, " v"] | None) -> Float[np.ndarray, " n"] | None:
-    """Returns the correlations of the deviations of successive photos, (v - 1,). None without
-    times.
+    """Returns the correlation between the deviations of each photo and the next, (v - 1,). None if
+    there are no times.
     """
     return None if seconds is None else np.exp(-np.diff(seconds) / MEMORY)
 
 
 def with_own_poses(capture: Capture) -> Capture:
-    """Returns the capture with a frame for each photo, in the pose of the frame that it had."""
+    """Returns the capture with a separate frame for each photo. The frame's pose is a copy of the
+    pose that the photo had.
+    """
     frames = np.asarray(capture.frames)
     poses = replace(
         capture.poses,
@@ -132,20 +140,20 @@ def with_own_poses(capture: Capture) -> Capture:
 
 
 def record_of_photos(record: FitRecord, frames: Int[np.ndarray, " v"]) -> FitRecord:
-    """Returns the record of a fit with a frame for each of the v photos.
+    """Returns the record of a fit with a separate frame for each of the v photos.
 
-    frames: the frame of the fit that each photo showed before, (v,).
+    frames: the frame in `record` that each photo shows, (v,).
     """
     rows = {name: getattr(record, name)[frames] for name in ("noise", "joint_std", "determined")}
     return dataclasses.replace(record, **rows)
 
 
 def movement_line(capture: Capture) -> str:
-    """Returns a line that says how far the person moved between photos that have a pose each.
+    """Returns a line that says how far the person moved between photos, if each photo has a pose.
 
-    For each photo, it measures how far the skin is from its place in the mean of all poses. This is
-    a mean over the skin, across the line of sight, because a photo does not show depths. The line
-    has the largest number of all photos.
+    In each photo the skin is compared with the skin in the mean of all poses. The movement is the
+    mean distance between them, without the component along the camera's z axis, because a photo
+    does not show depths. The line states the largest movement of all photos, in centimetres.
     """
     frames = np.asarray(capture.frames)
     poses = jax.tree.map(np.asarray, capture.poses)

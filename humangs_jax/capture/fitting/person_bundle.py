@@ -1,15 +1,15 @@
-"""Finds cameras around a person from landmarks alone: first a start from the detector's 3D
-landmarks, then bundle adjustment.
+"""Finds cameras around a person from landmarks alone. A start is computed from the detector's 3D
+landmarks, and bundle adjustment follows.
 
-A detector that sees one photo gives landmarks in metres in the axes of that photo's camera, as if
-the camera looked straight at the person. Their depths are guesses, 5 to 10 cm off, and all of them
-together are turned by up to 20 degrees. The start consists of the rotations that bring the
-landmarks of several photos together (generalised Kabsch: Gower 1975,
-https://doi.org/10.1007/BF02291478). Bundle adjustment then mainly uses the pixels. The 3D landmarks
-keep the size, and decide what pixels leave open.
+For one photo, a detector gives landmarks in metres in the axes of the photo's camera, as if the
+camera looked straight at the person. Their depths are guesses, 5 to 10 cm off, and the landmarks as
+a whole are turned by up to 20 degrees. The start consists of the rotations that bring the landmarks
+of all photos together (generalised Kabsch: Gower 1975, https://doi.org/10.1007/BF02291478). Bundle
+adjustment then mainly uses the pixels. The 3D landmarks keep the size, and decide what pixels leave
+open.
 
-The cost is half the square sum of these residuals, with X = R_v L_k, p = X + t_v, u = (p_x, p_y) /
-p_z:
+The cost is half the sum of the squares of these residuals, with X = R_v L_k, p = X + t_v, u = (p_x,
+p_y) / p_z:
 
     pixels  sqrt(w) rho((f_v u - x) / noise_v)       rho(q) = q s / sqrt(s^2 + |q|^2), Geman and
                                                      McClure
@@ -25,7 +25,7 @@ The std of world, size and bones are the fields of `STD`.
 
 A pixel depends on one landmark, one camera and one y. So the landmarks can be eliminated (Schur
 complement: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6.1), which leaves
-a small system of the cameras.
+a small system of equations for the cameras.
 
 All of this runs on the host in float64, because JAX would compile another program for every number
 of photos.
@@ -45,7 +45,7 @@ NEAR = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class _Std:
-    """Standard deviations of what is known besides the pixels."""
+    """Standard deviations of all evidence except the pixels."""
 
     world: float = 0.15
     """Standard deviation of the detector's 3D landmarks, metres. It includes errors that all
@@ -56,8 +56,8 @@ class _Std:
     partner, metres.
     """
     size: float = 0.01
-    """Standard deviation of the logarithm of the person's size against the detector's 3D landmarks.
-    This keeps the scale.
+    """Standard deviation of the logarithm of the person's size, relative to the size of the
+    detector's 3D landmarks. This keeps the scale.
     """
 
 
@@ -65,25 +65,29 @@ STD = _Std()
 
 
 ROBUST_SCALES = (40.0, 6.0)
-"""Robust scales of pixels, standard deviations. There is one search for each, in this order. The
-first is large because the start is off by tens of standard deviations.
+"""Robust scales of pixels, in standard deviations. The solver runs once with each, in this order.
+The first is large because the start is off by tens of standard deviations.
 """
 EXACT = 1e-9
-"""A search for a final result ends when a step decreases the cost by less than this share."""
-COARSE = 1e-3
-"""A search whose cost is only compared with others ends when a step decreases the cost by less than
+"""Tolerance of the solver for final results. It stops when a step decreases the cost by less than
 this share.
 """
+COARSE = 1e-3
+"""Tolerance of the solver if costs are only compared. It stops when a step decreases the cost by
+less than this share.
+"""
 _STILL = 1e-6
-"""Number that is added to the diagonal of the normal equations, so that unknowns that no residual
-moves stay where they are.
+"""Number that is added to the diagonal of the normal equations. It keeps unknowns in place on which
+no residual depends.
 """
 _FURTHEST = 5.0
-"""Largest absolute logarithm of the change of a depth in one step, and of the change of a focal
-length in all.
+"""Largest absolute change of the logarithm of a depth in one step, and of the logarithm of a focal
+length from its start.
 """
 VIEW = 9
-"""Number of unknowns of a view: turn (3), place (3), and the mean of its turned landmarks (3)."""
+"""Number of unknowns of a view: 3 for the rotation, 3 for the position, and 3 for the mean of its
+rotated landmarks.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -105,12 +109,12 @@ class Evidence:
     focal_std: Float[np.ndarray, " c"]
     """Standard deviations of the logarithms of the focal lengths, (c,)."""
     kinds: Int[np.ndarray, " c"]
-    """Kind of each camera, (c,), from 0. Cameras of one kind keep the ratio of their focal
-    lengths.
+    """Kind of each camera, (c,), from 0. The focal lengths of cameras of one kind change by a
+    common unknown.
     """
     bones: Int[np.ndarray, "b 2 2"]
-    """Landmarks at both ends of left bones and of their right partners, (b, 2, 2). Axes are bone,
-    side and end.
+    """Indices of the landmarks at the ends of bones, (b, 2, 2). Axes are the bone, its side (left,
+    right) and its end.
     """
 
 
@@ -121,7 +125,7 @@ class Rig:
     landmarks: Float[np.ndarray, "k 3"]
     """Landmarks of the person, (k, 3), metres."""
     rotations: Float[np.ndarray, "c 3 3"]
-    """Rotations from the landmarks' axes to those of the cameras, (c, 3, 3)."""
+    """Rotations from the landmarks' axes to each camera's axes, (c, 3, 3)."""
     places: Float[np.ndarray, "c 3"]
     """Position of the landmarks' origin in the axes of each camera, (c, 3), metres."""
     focal: Float[np.ndarray, " c"]
@@ -135,8 +139,9 @@ class Rig:
 def align_views(
     worlds: Float[np.ndarray, "c k 3"], weights: Float[np.ndarray, "c k"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "c 3 3"]]:
-    """Returns the mean shape, (k, 3), of the landmarks of all views turned onto each other, and the
-    rotations, (c, 3, 3), from it to each view's axes (generalised Kabsch).
+    """Returns the mean of the landmarks of all views after they were rotated onto each other, (k,
+    3), metres, and the rotations from this mean to the axes of each view, (c, 3, 3). The method is
+    generalised Kabsch.
     """
     shape = worlds[int(np.argmax(weights.sum(1)))]
     rotations = np.tile(np.eye(3), (len(worlds), 1, 1))
@@ -155,8 +160,9 @@ def _turns_onto(
     worlds: Float[np.ndarray, "c k 3"],
     weights: Float[np.ndarray, "c k"],
 ) -> Float[np.ndarray, "c 3 3"]:
-    """Returns the rotations, (c, 3, 3), that turn a shape best onto the landmarks of each view
-    (Kabsch 1976). If the points lie on a line, several rotations are best, and one is returned.
+    """Returns the rotations, (c, 3, 3), that best map a shape onto the landmarks of each view
+    (Kabsch 1976). If the points lie on a line, several rotations are best, and one of them is
+    returned.
     """
     share = weights / weights.sum(1, keepdims=True)
     source = shape - (share @ shape)[:, None]
@@ -174,12 +180,13 @@ def place_person(
 ) -> Float[np.ndarray, "3"]:
     """Returns the position at which landmarks project to their pixels, (3,), metres.
 
-    Let (x, y) be a pixel over the focal length, (X, Y, z) the landmark's offset and t the position.
-    Then x (z + t_z) = X + t_x, and the same for y, which is linear in t. If the depth t_z differs
-    by more than a factor of 3 from the depth at which the person has the size in the photo, the
-    position follows from the size.
+    Let (x, y) be a pixel divided by the focal length, (X, Y, z) the landmark's offset, and t the
+    position. Then x (z + t_z) = X + t_x and y (z + t_z) = Y + t_y, which is linear in t.
 
-    points: (k, 2) pixels from the principal point. weights: (k,). offsets: landmarks relative to
+    Another depth follows from the person's size in the photo. If the two depths differ by more than
+    a factor of 3, the position is computed with the depth from the size.
+
+    points: (k, 2), pixels from the principal point. weights: (k,). offsets: landmarks relative to
     the position, in the camera's axes, (k, 3), metres. focal: focal length, pixels.
     """
     xy = points / focal
@@ -193,7 +200,7 @@ def place_person(
     share = weights / weights.sum()
 
     def spread(p: Float[np.ndarray, "k 2"]) -> float:
-        """Returns the weighted root mean square of the points' distances from their mean."""
+        """Returns the weighted root mean square distance of points from their weighted mean."""
         return float(np.sqrt(share @ np.sum((p - share @ p) ** 2, axis=1)))
 
     # by the size: farther away the person is smaller in the photo
@@ -214,13 +221,13 @@ class Rows:
     seen: Float[np.ndarray, "c k 5"]
     """Residuals of pixels (2) and of 3D landmarks (3) for each landmark in each view, (c, k, 5)."""
     tied: Float[np.ndarray, " t"]
-    """Residuals of size and bones, (t,). They tie landmarks to each other."""
+    """Residuals of size and bones, (t,). Each depends on several landmarks."""
     focal: Float[np.ndarray, " g"]
     """Residuals of the focal lengths: y of each kind of camera, (g,)."""
 
     @property
     def cost(self) -> float:
-        """Half the square sum of all residuals."""
+        """Half the sum of the squares of all residuals."""
         return 0.5 * float(np.sum(self.seen**2) + np.sum(self.tied**2) + np.sum(self.focal**2))
 
 
@@ -234,7 +241,9 @@ class Derivatives:
     by_landmark: Float[np.ndarray, "c k 5 3"]
     """Derivatives of each row of `seen` by its landmark, (c, k, 5, 3)."""
     by_view: Float[np.ndarray, "c k 5 9"]
-    """Derivatives of each row of `seen` by turn, place and mean of its view, (c, k, 5, 9)."""
+    """Derivatives of each row of `seen` by rotation, position and mean of its view, (c, k, 5,
+    9).
+    """
     by_focal: Float[np.ndarray, "c k 5"]
     """Derivatives of each row of `seen` by the y of its camera's kind, (c, k, 5)."""
     tied: Float[np.ndarray, "t k 3"]
@@ -242,15 +251,17 @@ class Derivatives:
 
 
 def pixel_errors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "c k 2"]:
-    """Returns landmarks as the cameras see them minus the detected ones, (c, k, 2), pixels."""
+    """Returns projected minus detected landmarks, (c, k, 2), pixels."""
     seen = _turned(rig) + rig.places[:, None]
     slopes = seen[..., :2] / np.maximum(seen[..., 2:], NEAR)
     return rig.focal[:, None, None] * slopes - evidence.points
 
 
 def residuals(evidence: Evidence, rig: Rig, scale: float) -> Rows:
-    """Returns the residuals of a rig. scale: the scale of the robust loss (Geman-McClure) of pixel
-    errors, in standard deviations of the detections. Much larger errors count as about `scale`.
+    """Returns the residuals of a rig.
+
+    scale: scale of the robust loss (Geman-McClure) of pixel errors, in standard deviations of the
+    detections. No residual of a pixel exceeds it.
     """
     root, turned = np.sqrt(evidence.weights)[..., None], _turned(rig)
     errors = pixel_errors(evidence, rig) / evidence.noise[:, None, None]
@@ -358,7 +369,7 @@ def _bones(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "b 2 3"]:
 
 
 def _factors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, " g"]:
-    """Returns the y of each kind of camera, (g,). It is computed from any camera of the kind."""
+    """Returns the y of each kind of camera, (g,). It is computed from one camera of the kind."""
     factors = np.zeros(1 + int(evidence.kinds.max()))
     factors[evidence.kinds] = np.log(rig.focal / evidence.focal) / evidence.focal_std
     return factors
@@ -384,9 +395,9 @@ class Step:
     landmarks: Float[np.ndarray, "k 3"]
     """Shifts of the landmarks, (k, 3), metres."""
     views: Float[np.ndarray, "c 9"]
-    """Changes of the views, (c, 9): turn (3, radians), place (3) and the mean of the view (3),
-    which follows from the rest. A place changes by steps of x over depth, of y over depth, and of
-    the logarithm of the depth.
+    """Changes of the views, (c, 9): rotation (3, radians), position (3), and the mean of the view
+    (3), which follows from the other changes. The three numbers of the position are the changes of
+    x / depth, y / depth, and log(depth).
     """
     focal: Float[np.ndarray, " g"]
     """Changes of the y of each kind of camera, (g,)."""
@@ -413,11 +424,11 @@ def adjust(
     tolerance: float = EXACT,
     scales: Sequence[float] = ROBUST_SCALES,
 ) -> tuple[Rig, float]:
-    """Runs bundle adjustment by Levenberg and Marquardt. Returns the rig, and half the square sum
-    of its residuals with the last scale.
+    """Runs bundle adjustment (Levenberg-Marquardt). Returns the rig, and its cost with the last
+    robust scale.
 
-    Arguments: tolerance: a search ends when a step decreases the cost by less than this share.
-    scales: robust scales of pixels, standard deviations. There is one search for each, in this
+    Arguments: tolerance: the solver stops when a step decreases the cost by less than this share.
+    scales: robust scales of pixels, in standard deviations. The solver runs once with each, in this
     order.
     """
     rig, cost = start, np.inf
@@ -457,8 +468,8 @@ def _descend(evidence: Evidence, rig: Rig, scale: float, tolerance: float) -> tu
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """J^T J and J^T r of the rows `seen` and `focal`, in blocks. Rows that tie landmarks are kept
-    as rows.
+    """Blocks of the normal equations J^T J and J^T r. They contain the rows `seen` and `focal`. The
+    rows `tied`, of size and bones, are kept separately and not multiplied.
 
     The cameras have m = 9 c + g unknowns.
     """
@@ -474,9 +485,9 @@ class NormalEquations:
     by_cameras: Float[np.ndarray, " m"]
     """J^T r of the cameras, (m,)."""
     tied: Float[np.ndarray, "t k 3"]
-    """Derivatives of the rows that tie landmarks by all landmarks, (t, k, 3)."""
+    """Derivatives of the rows `tied` by all landmarks, (t, k, 3)."""
     tied_rows: Float[np.ndarray, " t"]
-    """Residuals of the rows that tie landmarks, (t,)."""
+    """Residuals of the rows `tied`, (t,), in standard deviations."""
     kinds: int
     """Number of kinds of cameras, g."""
 
@@ -524,12 +535,12 @@ def normal_equations(evidence: Evidence, rows: Rows, of: Derivatives) -> NormalE
 
 
 def solve(normal: NormalEquations, damping: float) -> tuple[Step, float]:
-    """Returns the damped step of Gauss and Newton, and the decrease of the cost that the linear
-    model expects from it.
+    """Returns the damped Gauss-Newton step, and the decrease of the cost that the linear model
+    expects from the step.
 
-    Let l be the step of the landmarks and q that of the cameras, a and b their J^T r of the rows
-    that are not tied, and D, E and C the blocks of the damped J^T J. Let U be the derivatives of
-    the tied rows, r their residuals, and t = U l + r separate unknowns:
+    l is the step of the landmarks and q the step of the cameras. a and b are the J^T r of landmarks
+    and cameras, without the rows `tied`. D, E and C are the blocks of the damped J^T J. U are the
+    derivatives of the rows `tied`, r their residuals, and t = U l + r separate unknowns:
 
         D l + E q + U^T t = -a                  D block diagonal: landmarks by landmark
         E^T l + C q       = -b

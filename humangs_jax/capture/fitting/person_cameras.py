@@ -1,9 +1,9 @@
 """Finds the cameras of photos of one moment from the person in them, without calibration or board.
 
-`person_moments` finds which photos are of that moment, and the cameras up to a similarity. This
-module takes size and axes from the person. Metres come from the detector's 3D landmarks, or from
-the person's height if it is given. The direction y up comes from the cameras, which people hold
-level, and from the body.
+`person_moments` decides which photos show one moment, and finds the cameras up to a similarity.
+This module finds the scale and the axes of the world. Metres come from the detector's 3D landmarks,
+or from the person's height if it is given. The direction y up comes from the cameras, which people
+hold level, and from the body.
 """
 
 import dataclasses
@@ -39,28 +39,32 @@ from humangs_jax.geometry.camera import Camera
 
 @dataclasses.dataclass(frozen=True)
 class _Std:
-    """Standard deviations of the observations that place the person in the world."""
+    """Standard deviations that are used to find the world's upward direction, and to scale a
+    person.
+    """
 
     level: float = 4.0
     """Standard deviation of a camera's roll, degrees."""
     upright: float = 15.0
     """Standard deviation of a body's lean, degrees."""
     bones: float = 0.01
-    """Standard deviation of joints from those of a scaled person, metres."""
+    """Standard deviation of the difference between the joints of the new shape and exactly scaled
+    joints, metres.
+    """
     stature: float = 0.001
-    """Standard deviation of the stature from that of a scaled person, metres."""
+    """Standard deviation of the difference between the new stature and the wanted one, metres."""
 
 
 _STD = _Std()
 
 
 _SHARES = {("shoulder", "hip"): 0.36, ("hip", "knee"): 0.315, ("knee", "ankle"): 0.325}
-"""Usual shares of trunk, thigh and shin in the sum of the three lengths. They stand in for parts
-that a photo does not show.
+"""Usual shares of trunk, thigh and shin in the sum of the three lengths. They are used for parts
+that no photo shows.
 """
 _LEAST_TRUNK = 2
-"""Least number of the landmarks in `_TRUNK` that a photo has to show. With fewer it says nothing
-about the pose.
+"""A photo has to show at least this many of the landmarks in `_TRUNK`. If it shows fewer, it does
+not determine the pose.
 """
 _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 
@@ -82,28 +86,28 @@ class PersonCameras:
     mirrored: Bool[np.ndarray, " c"]
     """Whether the detector exchanged left and right in each photo, (c,)."""
     moments: int
-    """Number of moments: 1, or the number of photos. In the second case each camera is in a
+    """Number of moments: either 1, or the number of photos. In the second case each camera has a
     separate world.
     """
     errors: Float[np.ndarray, " c"]
-    """Median distance of the landmarks from their pixels in each photo, (c,), pixels."""
+    """Median distance between projected and detected landmarks in each photo, (c,), pixels."""
     warnings: tuple[str, ...]
     """Warnings for the user, one line each."""
 
 
 def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> PersonCameras:
     """Returns the cameras of photos, found from the person in them. If one set of landmarks
-    explains all photos, they are of one moment. Otherwise each camera is found alone.
+    explains all photos, they show one moment. Otherwise each camera is found separately.
 
     Photos that show too little of the person are left out if other photos show more. If one photo
-    of several contradicts the others, it is left out, too.
+    contradicts all others, it is left out, too.
 
     Arguments: height: height of the person without shoes, metres. None: the person has the size of
     the detector's 3D landmarks.
-    Raises: ValueError, with the name of a photo, if all photos show too little of the person, if
-    the person is too small in a photo, if a focal length or the 3D landmarks are unusable, or if no
-    camera is found. ValueError, too, without photos, for arrays that do not fit each other, and for
-    a height that is not between 0.3 and 3 metres.
+    Raises: ValueError with the name of a photo if all photos show too little of the person, if the
+    person is too small in a photo, if a focal length or the 3D landmarks are unusable, or if no
+    camera is found. It is also raised if there are no photos, if arrays have different lengths, or
+    if the height is not between 0.3 and 3 metres.
     """
     _check(seen, height)
     # photos that show too little are left out where others show more
@@ -140,8 +144,8 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
 
 
 def _cameras(seen: PersonViews, trial: Trial, height: float | None) -> PersonCameras:
-    """Returns cameras and landmarks of a trial, in the world of the person. height: see
-    `cameras_from_person`.
+    """Returns the cameras and landmarks of a trial, in a world in which the person stands at the
+    origin. height: see `cameras_from_person`.
 
     Raises: ValueError if the trial has numbers that are not finite.
     """
@@ -187,7 +191,9 @@ def _check(seen: PersonViews, height: float | None) -> None:
 
 
 def _little_shown(seen: PersonViews) -> dict[int, str]:
-    """Returns the views that show too little of the person for a pose, each with the reason."""
+    """Returns the photos that show too little of the person to find a pose, as a mapping from their
+    indices to the reasons.
+    """
     trunk = [seen.names.index(name) for name in _TRUNK if name in seen.names]
     found = {}
     for view, known in enumerate(known_landmarks(seen)):
@@ -229,8 +235,8 @@ def _in_world(
     seen: PersonViews, rig: Rig, height: float | None
 ) -> tuple[tuple[Camera, ...], Float[np.ndarray, "k 3"]]:
     """Returns the cameras, and the landmarks, (k, 3), metres, in a world in which the person stands
-    upright at the origin. Parts that no photo shows are taken to have their usual length. height:
-    see `cameras_from_person`.
+    upright at the origin. If no photo shows a part of the legs, it is assumed to have its usual
+    length. height: see `cameras_from_person`.
     """
     points, rotations, places, focal = rig.landmarks, rig.rotations, rig.places, rig.focal
     known, names = only_known(points, seen.names, np.any(known_landmarks(seen), axis=0))
@@ -286,8 +292,8 @@ def _in_world(
 def _lengths(
     points: Float[np.ndarray, "k 3"], names: Sequence[str]
 ) -> dict[tuple[str, str], float]:
-    """Returns the lengths of trunk, thigh and shin, by the names of their ends. Parts whose ends
-    are not among the names are missing.
+    """Returns the lengths of trunk, thigh and shin, in the unit of `points`. The key is the pair of
+    joints at the ends. A part is left out if landmarks at its ends are missing.
     """
     found = {}
     for first, last in _SHARES:
@@ -326,8 +332,8 @@ def _warnings(
 
 
 def scaled_to_height(capture: Capture, height: float) -> Capture:
-    """Returns the capture scaled so that the person has this height at rest, metres. Cameras,
-    positions and shape change together, so that photos show the same.
+    """Returns the capture scaled so that the person has this height in the rest pose, metres.
+    Cameras, positions and shape are scaled together, so that the photos still fit.
     """
     betas = np.asarray(capture.betas, np.float64)
     before = shape_body(capture.body, jnp.asarray(betas, jnp.float32))

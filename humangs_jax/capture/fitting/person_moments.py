@@ -1,9 +1,9 @@
-"""Decides from a person's landmarks if photos are of one moment, and finds the cameras of that
+"""Decides from a person's landmarks whether photos show one moment, and finds the cameras of this
 moment.
 
-A detector that takes a back for a front exchanges left and right in a whole view. So each view is
-mirrored on trial, and the other views decide. Whether all views are mirrored is decided by the
-body, whose toes and nose are in front.
+A detector that takes a person's back for the front exchanges left and right in a whole view. So
+each view is mirrored on trial, and is left mirrored if it then agrees better with the other views.
+Whether all views are mirrored is decided by the body: toes and nose point to the front.
 
 A trial is an adjustment of the cameras with some views mirrored. Trials are only as exact as a
 comparison needs. The chosen trial is then made as exact as possible.
@@ -33,71 +33,71 @@ from humangs_jax.core.progress import bar, watched
 from humangs_jax.io.images import DIAGONAL_35MM
 
 USUAL_FOCAL = 29.0
-"""Focal length of a telephone's main camera, mm, as 35-mm equivalent."""
+"""Focal length of a telephone's main camera, as the equivalent for 35-mm film, mm."""
 USUAL_STD = 0.2
-"""Standard deviation of the logarithm of a focal length that is only assumed."""
+"""Standard deviation of the logarithm of a focal length that is assumed and not known."""
 _EXIF_STD = 0.03
 """Standard deviation of the logarithm of a focal length from EXIF."""
 SEEN = 0.1
-"""Least visibility of a landmark that is used."""
+"""A landmark is used if its visibility exceeds this number."""
 FEWEST = 6
-"""Least number of landmarks that are used in a photo."""
+"""Smallest number of usable landmarks that a photo has to show."""
 SMALLEST = 16.0
-"""Least size of a person in a photo, pixels. A smaller person is only a point."""
+"""Smallest size of a person in a photo, pixels. A smaller person is little more than a point."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _OneMoment:
-    """Limits that decide if photos are of one moment. Distances are shares of the person's size in
-    the photo.
+    """Limits that decide whether photos show one moment. Errors are distances between projected and
+    detected landmarks, as shares of the person's size in the photo.
     """
 
     most_error: float = 0.02
-    """Largest rms distance of the landmarks from the person's points in photos of one moment.
-    Measured on a man in a laboratory: 7 moments with four cameras each had 0.007 to 0.014, photos
-    of several moments 0.045 to 0.073, and four photos with one of another moment 0.033.
+    """Largest rms error of photos that show one moment.
+
+    It was measured on a man in a laboratory. 7 moments with four cameras each had 0.007 to 0.014.
+    Photos of several moments had 0.045 to 0.073. Four photos, one of which showed another moment,
+    had 0.033.
     """
     doubtful: float = 0.012
-    """Rms distance above which mirrorings are also tried from the other end, with all views
-    mirrored. Detections of one moment with an error of 3 pixels of 900 have 0.004 to 0.007, a
-    mirrored view 0.02 and more.
+    """If the rms error exceeds this, the search for mirrored views is repeated from another start,
+    in which all views are mirrored. Detections of one moment with an error of 3 pixels of 900 have
+    0.004 to 0.007. With one mirrored view it is at least 0.02.
     """
     without_one: float = 0.015
-    """Largest rms distance when one photo is left out, for the others to be of one moment. Three of
-    four photos of several moments have 0.021 or more.
+    """If one photo is left out, the other photos show one moment only if their rms error is below
+    this. Three photos out of four that show several moments have at least 0.021.
     """
     fewest: int = 4
-    """Least number of photos of which one may be left out because it contradicts the others."""
-    other: float = 0.03
-    """Largest rms distance of the landmarks in one further photo. A photo with more shows another
-    moment.
+    """With at least this many photos, one photo may be left out because it contradicts the
+    others.
     """
+    other: float = 0.03
+    """A further photo shows the same moment if its rms error is below this."""
     deciding: int = 8
-    """Largest number of photos that decide between one moment and several. Further photos are
-    compared with their result.
+    """Largest number of photos that decide whether there is one moment. Further photos are only
+    compared with the result.
     """
     mirrored: float = 0.7
-    """Largest ratio of the costs with and without a view mirrored, for the view to count as
-    mirrored.
-    """
+    """A view is mirrored only if this multiplies the cost by less than this number."""
     least_angle: float = 4.0
-    """Least angle between the two directions that differ most, from which photos see the person,
-    degrees. If the angle is smaller, each photo is taken alone.
+    """If all photos see the person from directions that differ by less than this angle, each photo
+    counts as a moment. Degrees.
     """
     far: float = 0.2
-    """Largest error that counts. Larger errors count as this one."""
+    """Larger errors of a landmark count as this error."""
 
 
 ONE_MOMENT = _OneMoment()
 
 
 _BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
-"""Ends of the bones that have one length on the left and on the right."""
+"""Ends of the bones that have equal lengths on the left and on the right."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PersonViews:
-    """Landmarks that a detector sees of one person in c photos."""
+    """Landmarks of one person that a detector found in c photos."""
 
     points: Float[np.ndarray, "c k 2"]
     """Detected landmarks, (c, k, 2), pixels, with the centre of the first pixel at (0.5, 0.5)."""
@@ -117,7 +117,7 @@ class PersonViews:
     """Names of the photos."""
 
     def select(self, views: Sequence[int]) -> "PersonViews":
-        """Returns some of the photos, in this order."""
+        """Returns the landmarks of some photos, in the order of `views`."""
         rows = list(views)
         return dataclasses.replace(
             self,
@@ -160,20 +160,20 @@ class Trial:
     rig: Rig
     """The cameras, and the person's landmarks."""
     cost: float
-    """Half the square sum of the adjustment's residuals."""
+    """Half the sum of the squared residuals of the adjustment."""
     evidence: Evidence
     """The landmarks of the photos, with left and right exchanged."""
 
     @property
     def error(self) -> float:
-        """Rms distance of the landmarks from their pixels, a share of the person's size, see
-        `_relative_error`.
+        """Rms distance between projected and detected landmarks in all photos, as a share of the
+        person's size. See `_relative_error`.
         """
         return _relative_error(self._shares, self.evidence.weights)
 
     def of_view(self, view: int) -> float:
-        """Returns the rms distance of the landmarks in one photo, a share of the person's size in
-        it.
+        """Returns the rms distance between projected and detected landmarks in one photo, as a
+        share of the person's size in the photo.
         """
         seen = self.evidence.weights[view] > SEEN
         return float(np.sqrt(np.mean(np.minimum(self._shares[view][seen], ONE_MOMENT.far) ** 2)))
@@ -184,25 +184,29 @@ class Trial:
 
     @property
     def pixels(self) -> Float[np.ndarray, "c k"]:
-        """Distances of landmarks from their pixels, (c, k), pixels."""
+        """Distances between projected and detected landmarks, (c, k), pixels."""
         return np.linalg.norm(pixel_errors(self.evidence, self.rig), axis=-1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Explanation:
-    """The answer of `explain`: cameras of one moment, or none."""
+    """Result of `explain`: cameras of one moment, if there are such cameras."""
 
     trial: Trial | None
     """Cameras of `views`. None: no cameras explain several photos of one moment."""
     views: tuple[int, ...]
-    """Indices of the photos that the trial explains. These are all, or all but one."""
+    """Indices of the photos that the trial explains: all photos, or all except one. Without a trial
+    they are all photos.
+    """
     warnings: tuple[str, ...] = ()
     """Warnings about this explanation, one line each."""
 
 
 def explain(seen: PersonViews) -> Explanation:
-    """Returns the cameras that explain all photos, or all but one, by one person in one pose. If
-    there are no such cameras, the explanation has no trial, and each photo counts as a moment.
+    """Returns cameras that explain all photos, or all except one, by one person in one pose.
+
+    If there are no such cameras, or if all photos are from nearly the same direction, the
+    explanation has no trial. Each photo then counts as a moment.
     """
     every = tuple(range(len(seen.photos)))
 
@@ -242,8 +246,8 @@ def explain(seen: PersonViews) -> Explanation:
 def _without_one(
     seen: PersonViews, chosen: tuple[int, ...]
 ) -> tuple[Trial, tuple[int, ...]] | None:
-    """Returns the trial of the chosen photos without the one that contradicts the others most, and
-    the photos that are left. None if these are not of one moment either.
+    """Leaves out the one of the chosen photos that contradicts the others most. Returns the trial
+    of the other photos, and these photos. None if they do not show one moment either.
     """
     rests = [tuple(v for v in chosen if v != out) for out in chosen]
     trials = [
@@ -260,9 +264,10 @@ def _without_one(
 def _with_others(
     seen: PersonViews, trial: Trial, views: tuple[int, ...], others: Sequence[int]
 ) -> tuple[Trial, tuple[int, ...]]:
-    """Adds each of the other photos that agrees with the trial, mirrored or not.
+    """Adds those of the other photos that agree with the trial, either mirrored or not.
 
-    Returns a trial of the cameras of these photos and `views`, fitted together, and the photos.
+    Returns a trial in which the cameras of `views` and of the added photos are fitted together, and
+    the indices of all these photos.
     """
     mirrored = dict(zip(views, trial.mirrored, strict=True))
     for view in under_bar(others, "cameras of further photos"):
@@ -276,9 +281,11 @@ def _with_others(
 
 
 def _different(seen: PersonViews) -> tuple[int, ...]:
-    """Chooses the photos that decide, so that they show the person from different sides.
+    """Returns the photos that decide whether there is one moment, so that they show the person from
+    different sides.
 
-    Each next photo is the one whose direction is farthest from those of all chosen before.
+    The photo that shows most of the person is chosen first. Each next photo is the one with the
+    direction that differs most from the directions of all chosen photos.
     """
     count = len(seen.photos)
     if count <= ONE_MOMENT.deciding:
@@ -294,7 +301,9 @@ def _different(seen: PersonViews) -> tuple[int, ...]:
 
 
 def under_bar(items: Sequence[Any], what: str) -> Iterator[Any]:
-    """Yields the items under a progress bar, if there are several and a program shows one."""
+    """Yields the items. A progress bar is shown if there are several items and progress is being
+    displayed.
+    """
     yield from bar(items, desc=what, leave=False, shown=watched() and len(items) > 1)
 
 
@@ -303,7 +312,7 @@ def under_bar(items: Sequence[Any], what: str) -> Iterator[Any]:
 
 
 def best_trial(seen: PersonViews) -> Trial:
-    """Returns the trial that explains the landmarks best, whichever views are mirrored."""
+    """Returns the trial that explains the landmarks best. Any views may be mirrored in it."""
     views = len(seen.points)
     found = _try(seen, np.zeros(views, bool))
     if views > 1:
@@ -318,8 +327,8 @@ def best_trial(seen: PersonViews) -> Trial:
 
 
 def _least(seen: PersonViews, start: Trial) -> Trial:
-    """Mirrors the view that decreases the cost most, again and again, as long as the cost decreases
-    clearly. Returns the last trial.
+    """Mirrors one view after the other, each time the view that decreases the cost most, as long as
+    the cost decreases clearly. Returns the last trial.
     """
     views = np.arange(len(seen.points))
     while True:
@@ -332,20 +341,23 @@ def _least(seen: PersonViews, start: Trial) -> Trial:
 
 
 def _try(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> Trial:
-    """Fits the cameras for a trial, as exactly as a comparison of trials needs."""
+    """Returns the trial with these views mirrored. Its cameras are fitted only as exactly as a
+    comparison of trials needs.
+    """
     evidence, start = evidence_of(seen, mirrored)
     return Trial(mirrored, *adjust(evidence, start, COARSE), evidence)
 
 
 def _polished(trial: Trial) -> Trial:
-    """Fits the cameras of a trial again, as exactly as possible."""
+    """Returns the trial with cameras that are fitted again, as exactly as possible."""
     rig, cost = adjust(trial.evidence, trial.rig, EXACT, ROBUST_SCALES[-1:])
     return dataclasses.replace(trial, rig=rig, cost=cost)
 
 
 def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"]) -> float:
-    """Returns the rms of the errors, (c, k), of landmarks that are seen. The divisor is the number
-    of degrees of freedom that are left after points and cameras were fitted.
+    """Returns the rms error of the landmarks that are seen, in the unit of `errors`, (c, k). The
+    sum of squares is divided by the number of observed coordinates minus the number of unknowns of
+    points and cameras, but by a quarter of the coordinates at least.
     """
     views, shown = len(errors), weights.max(0) > SEEN
     numbers = 2 * (weights > SEEN).sum()
@@ -377,11 +389,13 @@ def _focal_lengths(
     seen: PersonViews,
 ) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"], Int[np.ndarray, " c"]]:
     """Returns focal lengths, (c,), pixels, standard deviations of their logarithms, (c,), and kinds
-    of cameras, (c,). Photos without a focal length get the median of the others, relative to the
-    diagonal, or else the usual one.
+    of cameras, (c,).
 
-    All focal lengths from EXIF are of one kind. Photos of one size without EXIF are taken to be
-    from one camera, which is another kind.
+    If a photo states no focal length, it gets the median of the others, relative to the diagonal of
+    the photo. If no photo states any, the usual one is assumed.
+
+    All cameras with a focal length from EXIF are of one kind. Photos without it that have the same
+    size are assumed to be from one camera, and form another kind.
     """
     diagonals = np.hypot(*np.asarray(seen.sizes, float).T)
     known = np.isfinite(seen.focal)
@@ -397,8 +411,8 @@ def _focal_lengths(
 
 
 def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Evidence, Rig]:
-    """Returns the landmarks with left and right exchanged in some views, and cameras to start
-    from.
+    """Returns the landmarks, with left and right exchanged in the mirrored views, and cameras to
+    start from.
     """
     # the landmarks of mirrored views, in the order of their mirror images
     focal, std, kinds = _focal_lengths(seen)
@@ -457,8 +471,9 @@ def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
 def middle_of(
     points: Float[np.ndarray, "k 3"], names: Sequence[str], part: str
 ) -> Float[np.ndarray, "3"]:
-    """Returns the middle of the left and the right landmark of a part, (3,). If only one is among
-    the names, returns that one. NaN if neither is.
+    """Returns the middle between the left and the right landmark of a part, such as "hip", (3,). If
+    only one of them is among the names, it returns this landmark. NaN if neither is among the
+    names.
     """
     sides = [f"{side}_{part}" for side in ("left", "right") if f"{side}_{part}" in names]
     found = [points[names.index(name)] for name in sides]
@@ -468,16 +483,16 @@ def middle_of(
 def only_known(
     points: Float[np.ndarray, "k 3"], names: Sequence[str], known: Bool[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "n 3"], tuple[str, ...]]:
-    """Returns the known landmarks, (n, 3), and their names. Positions of the others mean
-    nothing.
+    """Returns the known landmarks, (n, 3), and their names. The positions of other landmarks are
+    meaningless.
     """
     kept = np.flatnonzero(known)
     return points[kept], tuple(names[i] for i in kept)
 
 
 def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
-    """Returns the direction to the person's front, (3,), by toes and nose. It is not a unit vector,
-    and 0 if the names do not have these.
+    """Returns a vector to the person's front, (3,). It is the sum of vectors from heels to toes and
+    from the ears to the nose, and not a unit vector. It is 0 if the landmarks for it are missing.
     """
     ends = [
         (f"{side}_{toe}", f"{side}_heel")
@@ -495,8 +510,8 @@ def _front(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.n
 
 
 def across(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.ndarray, "3"]:
-    """Returns the vector from the right side of the trunk to the left, (3,). It uses shoulders and
-    hips if both sides are among the names.
+    """Returns a vector from the right to the left side of the trunk, (3,). It is the sum for
+    shoulders and hips, as far as both of their sides are among the names.
     """
     total = np.zeros(3)
     for part in ("shoulder", "hip"):
@@ -507,8 +522,9 @@ def across(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> Float[np.n
 
 
 def handedness(points: Float[np.ndarray, "k 3"], names: Sequence[str]) -> float:
-    """Returns a number that is positive if the left side is to the left of a person who looks to
-    the front, and negative if it is to the right. 0 if the names do not tell.
+    """Returns a number that is positive if the landmarks named left are on the left side of a
+    person who looks to the front, and negative if they are on the right side. 0 if landmarks are
+    missing that show this.
     """
     up = middle_of(points, names, "shoulder") - middle_of(points, names, "hip")
     if np.isnan(up).any():

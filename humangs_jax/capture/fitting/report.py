@@ -1,4 +1,4 @@
-"""The report of every fit: what was fitted, errors by kind of evidence, limits, uncertainty and
+"""The report of a fit: what was fitted, errors by kind of evidence, limits, uncertainty and
 warnings.
 
 `str(report)` is what the command line prints. `report.to_json()` is stored beside the result.
@@ -24,28 +24,34 @@ from humangs_jax.data.capture_checks import few
 
 @dataclasses.dataclass(frozen=True)
 class _Worth:
-    """Limits that decide if something in a fit is worth a line of the report."""
+    """Limits that decide whether something in a fit gets a line in the report."""
 
     outliers: float = 0.3
-    """A view with a larger share of outliers among its keypoints gives a warning. A fit tolerates
-    more, but a detector that errs this often saw something else."""
+    """A view gives a warning if a larger share of its keypoints are outliers. A fit tolerates more
+    outliers, but a detector with so many errors probably saw something else.
+    """
     off: float = 4.0
-    """A view whose median error is more than this many times the expected noise gives a warning.
-    That is 2 % of the person's height; such a view shows another pose or camera."""
+    """A view gives a warning if its median error exceeds the expected noise by more than this
+    factor. This is an error of 2 % of the person's height. Such a view shows another pose, or its
+    camera is wrong.
+    """
     beyond_limit: float = np.rad2deg(0.05)
-    """A joint this many degrees beyond its limit is no violation yet, because limits are rough."""
+    """A joint is reported if it exceeds its limit by more than this angle, degrees. Smaller
+    violations are ignored, because limits are rough.
+    """
     far_beyond: float = 10.0
-    """A joint more than this many degrees beyond its limit gives a warning."""
+    """A joint gives a warning if it exceeds its limit by more than this angle, degrees."""
     std: float = 0.03
-    """A joint whose standard deviation exceeds this is undetermined, metres."""
+    """A joint is undetermined if the standard deviation of its position exceeds this, metres."""
     determined: float = 0.1
-    """A joint is undetermined if the determined share of its rotation is smaller than this. The
-    share is a mean over three axes; knees and fingers turn about only one."""
+    """A joint is undetermined if the views determine less than this share of its rotation. The
+    share is a mean over three axes, and knees and fingers turn about only one.
+    """
     named: int = 5
-    """Number of items that are listed by name. Further items are counted."""
+    """Largest number of items that are listed by name. Further items are only counted."""
     rows: int = 24
-    """Number of rows of the printed table. If there are more views, it shows those that fit
-    worst.
+    """Largest number of rows of the printed table. If there are more views, those with the largest
+    errors are shown.
     """
 
 
@@ -57,17 +63,17 @@ _LABELS = {
     "silhouette_iou": ("silhouette IoU", "{:.3f}"),
     "loss": ("loss", "{:.4f}"),
 }
-"""Label and format of each error."""
+"""Label and number format of each error, by the error's name."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """An error of the result, and of the start if there was one."""
+    """An error of the result, and the same error at the start of the fit."""
 
     after: float
     """Error of the result."""
     before: float | None = None
-    """Error of the start. None without a start."""
+    """Error at the start of the fit. None if there was no start."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,8 +93,8 @@ class ViewReport:
     outliers: float = 0.0
     """Share of the keypoints that are outliers."""
     iou_before: float | None = None
-    """Intersection over union of body and mask at the start. NaN without a mask, None if masks are
-    not part of the fit.
+    """Intersection over union of body and mask at the start. NaN if the view has no mask, None if
+    masks are not part of the fit.
     """
     iou_after: float | None = None
     """Intersection over union of body and mask for the result. NaN and None as in `iou_before`."""
@@ -113,19 +119,19 @@ class FitReport:
     """The report of a fit."""
 
     fitted: Literal["keypoints", "refinement"]
-    """Evidence to which the body was fitted."""
+    """What the body was fitted to: keypoints alone, or in a refinement masks and keypoints."""
     kept: bool = True
-    """Whether the result is used. False if the start was better and stays."""
+    """Whether the result is used. If it is False, the start was better and is used."""
     errors: dict[str, Change] = dataclasses.field(default_factory=dict)
     """Errors by name, see `_LABELS`."""
     views: tuple[ViewReport, ...] = ()
     """A row for each view."""
     moved: dict[str, float] = dataclasses.field(default_factory=dict)
-    """How far parameters moved, by name, see `how_far`. Empty if none moved."""
+    """How far cameras and body moved, with the keys of `how_far`. Empty if nothing moved."""
     violations: tuple[Violation, ...] = ()
     """Joints that exceed their limits."""
     swaps: tuple[Swap, ...] = ()
-    """Sides or cameras that seem exchanged."""
+    """Sides, hands or cameras that seem to be exchanged."""
     undetermined: tuple[str, ...] = ()
     """Joints, or groups of joints, that the views do not determine."""
     notes: tuple[str, ...] = ()
@@ -206,7 +212,9 @@ _GROUPS = {
     "spine": ["spine1", "spine2", "spine3"],
     "collars": ["left_collar", "right_collar"],
 }
-"""Joints that are named together if all of them are undetermined."""
+"""Name of each group of joints, and its joints. They are reported under this name if all of them
+are undetermined.
+"""
 
 
 def limit_violations(joint_names: tuple[str, ...], poses: BodyPose) -> tuple[Violation, ...]:
@@ -225,12 +233,13 @@ def undetermined_joints(
     joint_std: Float[np.ndarray, "m j"],
     determined: Float[np.ndarray, "m j"],
 ) -> tuple[str, ...]:
-    """Returns the names of the joints that the views do not determine in m frames. A group in
-    `_GROUPS` has one name if all of its joints are undetermined. The name is followed by the number
-    of frames if this is not all.
+    """Returns the names of the joints that the views do not determine in m frames.
 
-    Arguments: joint_std: standard deviation of each joint, (m, j), metres. determined: share of
-    each joint's rotation that the views determine, (m, j).
+    If all joints of a group in `_GROUPS` are undetermined, the group's name replaces theirs. If
+    joints are undetermined in some frames only, the number of frames follows the name.
+
+    Arguments: joint_std: standard deviation of each joint's position, (m, j), metres. determined:
+    share of each joint's rotation that the views determine, (m, j).
     """
     unknown = (joint_std > WORTH_A_LINE.std) | (determined < WORTH_A_LINE.determined)
     counts = {
@@ -258,7 +267,7 @@ def keypoint_warnings(
 ) -> tuple[str, ...]:
     """Returns a line for each sign of a mistake in the keypoints.
 
-    expected: noise that is expected of the keypoints of each frame, (m,), pixels.
+    expected: expected noise of the keypoints of each frame, (m,), pixels.
     """
     found = [str(swap) for swap in swaps[: WORTH_A_LINE.named]]
     if len(swaps) > WORTH_A_LINE.named:
@@ -304,8 +313,8 @@ def _names(views: Sequence[ViewReport]) -> str:
 
 
 def _span(views: Sequence[ViewReport], field: str, form: str) -> str:
-    """Returns the smallest and the largest value of a field as text, or one value if they are
-    equal.
+    """Returns the smallest and the largest value of a field as text. If both have the same text, it
+    is returned once.
     """
     ends = [form.format(of(getattr(view, field) for view in views)) for of in (min, max)]
     return ends[0] if ends[0] == ends[1] else " to ".join(ends)
@@ -314,8 +323,9 @@ def _span(views: Sequence[ViewReport], field: str, form: str) -> str:
 def how_far(start: Capture, refined: Capture) -> dict[str, float]:
     """Returns how far two captures of one person differ. Each value is a mean.
 
-    Keys: focal_factor, the ratio of the focal lengths. camera_degrees and camera_cm, the turn and
-    the move of the cameras. joint_degrees, the turn of the joints. transl_cm, the move of the root.
+    Keys: focal_factor, the refined focal length divided by the one at the start. camera_degrees and
+    camera_cm, rotation and shift of the cameras. joint_degrees, rotation of the joints. transl_cm,
+    shift of the root.
     """
     both = (start, refined)
     focal = [np.asarray(each.cameras.K, float)[:, 0, 0] for each in both]
@@ -335,7 +345,7 @@ def how_far(start: Capture, refined: Capture) -> dict[str, float]:
 
 
 def _mean_degrees(first: Rotation, second: Rotation) -> float:
-    """Returns the mean angle between rotations, degrees."""
+    """Returns the mean angle between corresponding rotations, degrees."""
     return float(np.degrees((first.inv() * second).magnitude().mean()))
 
 
