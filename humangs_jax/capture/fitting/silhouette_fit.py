@@ -1,9 +1,10 @@
 """Refines cameras, shape and poses of a capture with its silhouettes and keypoints.
 
-Each iteration matches the rendered silhouette of the body with the edge of the mask, as iterated
-closest points do, and then solves a few steps of damped least squares, or of L-BFGS if there are
-many unknowns. `StateStd` gives a Gaussian prior around the start. Without it, cameras and people
-could move together. The result is kept only if its loss is clearly less than that of the start.
+Each iteration matches the rendered silhouette of the body with the edge of the mask, as in the
+iterative closest point method. It then takes a few steps of damped least squares, or of L-BFGS if
+there are many unknowns. `StateStd` gives a Gaussian prior around the start. Without this prior,
+cameras and people could move together. The result is kept only if its loss is clearly less than the
+loss of the start.
 """
 
 import dataclasses
@@ -75,10 +76,10 @@ class CaptureRefineConfig:
     """Settings of a refinement."""
 
     std: StateStd = dataclasses.field(default_factory=StateStd)
-    """Standard deviations of what the start may be off by."""
+    """Standard deviations of the errors that the start may have."""
     coefficients: int = 10
-    """Least number of shape coefficients. A capture with fewer gets more, as far as its body has
-    them.
+    """The shape gets at least this many coefficients. A capture with fewer gets more, if its body
+    has more.
     """
     fixed_cameras: bool = False
     """Whether the cameras stay as they are, so that only shape and poses move."""
@@ -87,25 +88,29 @@ class CaptureRefineConfig:
     longest_side: int = 512
     """Longest side of the photos that the refinement works on, pixels. Larger photos are shrunk."""
     points: int = 300
-    """Number of points on the silhouette of the body in a view, and on that of the mask."""
+    """Number of points on the body's silhouette in a view, and number of points on the mask's
+    silhouette.
+    """
     reach: tuple[float, float] = (0.08, 0.015)
     """Largest distance at which points of the body and of the mask are matched, in the first and in
     the last matching. Both are shares of the person's height in the image.
     """
     independent: float = 30.0
-    """Number of independent equations that all points of a view together count as, at most."""
+    """In a view, all points of the silhouettes together weigh at most as much as this number of
+    independent equations.
+    """
     robust_scales: tuple[float, float] = (1.0, 0.5)
-    """Robust scales for points of the body outside and inside of the mask, multiples of the
-    reach.
+    """Robust scales for points of the body outside of the mask, and for points inside. Both are
+    multiples of the reach.
     """
     keypoints_worse: float = 1.3
-    """A result is discarded if its keypoint error is more than this multiple of the start's. The
-    start was fitted to the keypoints, which made its error small: right results have 0.8 to 1.07 of
-    it, wrong bodies that fill clothes 1.8.
+    """A result is discarded if its keypoint error exceeds the start's by more than this factor. The
+    start's error is small, because it was fitted to the keypoints. For right results the factor is
+    0.8 to 1.07, and for wrong bodies that fill clothes 1.8.
     """
     by_joint: tuple[tuple[str, float], ...] = ()
-    """Pairs (word, factor). A joint whose name contains the word gets `std.body_pose` times the
-    factor. If several words fit, the first counts.
+    """Pairs (word, factor). If the name of a joint contains the word, its standard deviation is
+    `std.body_pose` times the factor. If several words fit, the first counts.
     """
 
 
@@ -117,12 +122,12 @@ def usual_config(
     tight: bool = False,
     calibrated: bool = True,
 ) -> CaptureRefineConfig:
-    """Returns the settings that suit what is known about the start.
+    """Returns the settings that suit a start.
 
     Args:
         fitted: whether the start is a fit to the keypoints that the refinement gets.
         fixed_cameras: whether the cameras stay as they are.
-        bare: whether the body itself is to fill the masks, without clothes.
+        bare: whether the body itself has to fill the masks, without clothes.
         tight: whether the person wears tight clothes.
         calibrated: False for cameras that were found from the person.
     """
@@ -149,8 +154,8 @@ def usual_config(
 
 
 def cameras_are_unseen(capture: Capture) -> bool:
-    """Returns whether nothing in the capture determines how its cameras should move. This is so
-    where they were found from the person and no two photos show the same pose.
+    """Returns whether nothing in the capture determines how its cameras should move. This is so if
+    the cameras were found from the person, and no two photos show the same pose.
     """
     return not capture.calibrated and capture.frame_count >= capture.view_count
 
@@ -160,7 +165,8 @@ def cameras_are_unseen(capture: Capture) -> bool:
 
 
 def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfig) -> Origin:
-    """Returns the origin of a refinement: the start, from which the state counts its changes.
+    """Returns the origin of a refinement: the cameras, shape and poses of the start, and the units
+    of their deviations in the state.
 
     cameras: one camera for each view. Its images may have any size.
     """
@@ -181,8 +187,8 @@ def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfi
 
 
 def _body_pose_std(names: Sequence[str], config: CaptureRefineConfig) -> Float[Array, "a 3"]:
-    """Returns the standard deviations of the free joints' rotations, (a, 3), radians. names: names
-    of these a joints.
+    """Returns the standard deviations of the rotations of a free joints, (a, 3), radians. names:
+    names of these joints.
     """
     factors = [
         next((factor for word, factor in config.by_joint if word in name), 1.0) for name in names
@@ -192,7 +198,9 @@ def _body_pose_std(names: Sequence[str], config: CaptureRefineConfig) -> Float[A
 
 
 def start_state(origin: Origin, config: CaptureRefineConfig) -> FitState:
-    """Returns a state of zeros for all that a refinement moves."""
+    """Returns the state at the start, which is all zeros. Its cameras are None if they are
+    fixed.
+    """
     state = zero_state(origin)
     return replace(state, cameras=None) if config.fixed_cameras else state
 
@@ -200,8 +208,8 @@ def start_state(origin: Origin, config: CaptureRefineConfig) -> FitState:
 def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
     """Returns the capture with the cameras, shape and poses of a state.
 
-    The images of the origin may have another size than those of the capture. The result has no
-    displacement, because that was made for the shape before.
+    The images of the origin may have another size than the images of the capture. The result has no
+    displacement, because a displacement belongs to the shape for which it was made.
     """
     own = replace(origin, cameras=replace(origin.views, K=capture.cameras.K))
     (K, cam_from_world), betas, poses = _moved(own, state)
@@ -224,7 +232,9 @@ def _moved(
 
 @pytree_dataclass
 class Evidence:
-    """What v views show in one matching: points, their matches, and keypoints."""
+    """The evidence of v views in one matching: points on silhouettes, their matches, and
+    keypoints.
+    """
 
     points: SurfacePoints
     """Points on the silhouettes of the body, a batch of v."""
@@ -241,8 +251,8 @@ class Evidence:
 def _evidence_residuals(
     model: LandmarkModel, origin: Origin, state: FitState, evidence: Evidence, independent: float
 ) -> dict[str, Float[Array, "..."]]:
-    """Returns the residuals of the views by kind, in standard deviations: "silhouettes", (v, e),
-    and "keypoints", (v, 1, k, 2). Without keypoints the second is missing.
+    """Returns the residuals of the views in standard deviations: "silhouettes", (v, e), and
+    "keypoints", (v, 1, k, 2). If there are no keypoints, the second key is missing.
     """
     # all frames of the state, whose poses the views share
     K, cam_from_world = cameras_of(origin, state)
@@ -252,7 +262,7 @@ def _evidence_residuals(
 
     # silhouettes of each view: the points of the body's rim, out by the thickness of clothes
     def silhouette_errors(points, matches, frame, K, matrix):
-        """Returns the residuals of a view, (e,)."""
+        """Returns the residuals of a view's silhouette, (e,)."""
         posed = pose_points(points, betas, features[frame], transforms[frame])
         seen = jnp.matmul(posed, matrix[:3, :3].T, precision=EXACT) + matrix[:3, 3]
         focal, depth = jnp.stack([K[0, 0], K[1, 1]]), jnp.maximum(seen[:, 2:], NEAR)
@@ -275,8 +285,8 @@ def _evidence_residuals(
         return landmarks_from(model, joints, points)
 
     def keypoint_errors(seen, points):
-        """Returns the residuals of a view. Residuals beyond five standard deviations pull less and
-        less.
+        """Returns the residuals of a view's keypoints. The influence of errors beyond five standard
+        deviations decreases.
         """
         return keypoint_residuals(model, seen, points, 5.0)
 
@@ -287,15 +297,16 @@ def _evidence_residuals(
 
 
 def _counted(clothing: Float[Array, " b"]) -> Float[Array, " b"]:
-    """Returns the thicknesses of clothes as their prior counts them, (b,). A negative thickness
-    counts five times, because clothes have none.
+    """Returns the thicknesses of clothes as the prior uses them, (b,). Negative thicknesses are
+    multiplied by 5, because clothes cannot have them.
     """
     return jnp.where(clothing < 0, 5.0 * clothing, clothing)
 
 
 def _as_motion(values: Float[Array, "m ..."], memory: Float[Array, " n"]) -> Float[Array, "m ..."]:
-    """Turns m frames' numbers into independent ones of unit variance. memory: (m - 1,) correlations
-    of each frame with the one before.
+    """Returns the deviations of m frames, (m, ...), transformed so that they are independent with
+    unit variance under the prior of a motion. memory: correlation of each frame with the one
+    before, (m - 1,).
     """
     r = memory.reshape(-1, *[1] * (values.ndim - 1))
     return jnp.concatenate([values[:1], (values[1:] - r * values[:-1]) / jnp.sqrt(1 - r * r)])
@@ -310,8 +321,8 @@ def solve_round(
     independent: float,
     memory: Float[Array, " n"] | None = None,
 ) -> FitState:
-    """Returns the state after some steps of the solver with fixed matches. memory: (m - 1,)
-    correlations of m poses, see `refine_capture`.
+    """Returns the state after some steps of the solver with fixed matches. memory: correlation of
+    each of m poses with the one before, (m - 1,), see `refine_capture`.
     """
 
     def residuals(y):
@@ -344,15 +355,15 @@ class Score:
     keypoints: float | None
     """Median error of the keypoints, pixels. None without keypoints."""
     loss: float
-    """1 - iou plus the keypoints' error as a share of the person's height. Without masks or without
-    keypoints, that term is missing.
+    """1 - iou, plus the keypoint error as a share of the person's height. If there are no masks or
+    no keypoints, their term is left out.
     """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SilhouetteFit:
-    """What stays the same in all matchings of v photos: masks and keypoints at the reduced size
-    that the refinement works on, and the origin of the state.
+    """The constants of a refinement of v photos: masks and keypoints at the reduced size at which
+    the refinement works, and the origin of the state.
     """
 
     capture: Capture
@@ -360,37 +371,39 @@ class SilhouetteFit:
     config: CaptureRefineConfig
     """Settings."""
     memory: Float[Array, " n"] | None
-    """Correlations of each pose with the one before, (m - 1,). None: poses are independent."""
+    """Correlation of each pose with the one before, (m - 1,). None: poses are independent."""
     cameras: Camera
     """Cameras of the photos at the reduced size."""
     masks: Float[np.ndarray, "v h w"]
     """Masks at the reduced size, (v, h, w), 0 to 1. Zeros if the capture has no masks."""
     unknown: Bool[np.ndarray, "v h w"] | None
-    """Pixels where the masks say nothing, (v, h, w). None: there are no such pixels."""
+    """Pixels where it is unknown whether they show the person, (v, h, w). None: there are no such
+    pixels.
+    """
     hidden: list[Bool[np.ndarray, "h w"] | None]
-    """For each view, the pixels where its mask says nothing and a rim around them, (h, w). In the
-    rim the mask ends at an object in front of the person. None for a view without such pixels.
+    """For each view, the unknown pixels and a rim around them, (h, w). In the rim the mask ends at
+    an object in front of the person. None for a view without unknown pixels.
     """
     faces: Int[np.ndarray, "f 3"]
     """Faces of the body, (f, 3)."""
     edges: silhouettes.MeshEdges
     """Edges of the body's faces."""
     boundaries: list[silhouettes.Boundary]
-    """Boundaries of the masks, without the parts where something stands in front."""
+    """Silhouettes of the masks, without the parts at `hidden` pixels."""
     model: LandmarkModel
     """Places of the keypoints on the body. Without keypoints, it has no landmarks."""
     keypoints: Observations | None
-    """Keypoints in pixels of the photos at their full size, which scores are in. None without
+    """Keypoints in pixels of the photos at their full size. Scores use them. None if there are no
     keypoints.
     """
     observations: Observations | None
-    """Keypoints in pixels of the reduced size. None without keypoints."""
+    """Keypoints in pixels of the reduced size. None if there are no keypoints."""
     scale: float
-    """Ratio of the reduced size to the full size of the photos."""
+    """Reduced size of the photos, divided by their full size."""
     height: float
     """Height of the person in the image, pixels of the reduced size."""
     origin: Origin
-    """The start, from which the state counts its changes."""
+    """Cameras, shape and poses of the start, from which the state counts its deviations."""
 
     @classmethod
     def of(
@@ -400,7 +413,7 @@ class SilhouetteFit:
         config: CaptureRefineConfig,
         memory: Float[np.ndarray, " n"] | None = None,
     ) -> "SilhouetteFit":
-        """Prepares the fit of a capture. memory: see `refine_capture`."""
+        """Returns the constants of a refinement of a capture. memory: see `refine_capture`."""
         small = max(capture.images.shape[1:3]) <= config.longest_side
         looked_at = capture if small else capture.resized(config.longest_side)
         cameras, masks = looked_at.cameras, looked_at.masks
@@ -439,8 +452,8 @@ class SilhouetteFit:
         )
 
     def run(self) -> tuple[FitState, float]:
-        """Returns the state after all matchings, and the largest change of the state in the last
-        one, in expected standard deviations.
+        """Returns the state after all matchings, and the largest change of a number of the state in
+        the last matching, in units of its standard deviation.
         """
         config, state, move = self.config, start_state(self.origin, self.config), 0.0
         first, last = config.reach
@@ -457,8 +470,9 @@ class SilhouetteFit:
         return state, move
 
     def calls(self) -> Iterator[Call]:
-        """Yields the programs that `run` and `score` call, the longest first, with arguments of the
-        right shapes. Which programs are compiled depends on the shapes alone, not on the values.
+        """Yields the compiled functions that `run` and `score` call, with arguments of the right
+        shapes. The one that takes longest to compile comes first. The values of the arguments do
+        not matter.
         """
         state, capture = start_state(self.origin, self.config), self.capture
         betas, cameras = self.origin.betas, self.cameras
@@ -477,8 +491,8 @@ class SilhouetteFit:
         yield silhouettes.coverage, (np.zeros(self.masks.shape[1:], np.float32), places)
 
     def _no_evidence(self) -> Evidence:
-        """Returns evidence that shows nothing. Its arrays have the shapes that all evidence of this
-        fit has.
+        """Returns evidence without any matches. Its arrays have the same shapes as all other
+        evidence of this fit.
         """
         views, count = len(self.masks), self.config.points
         pixels, ends = np.zeros((2, 0, 2), np.float32), np.zeros((0, 2), int)
@@ -498,7 +512,9 @@ class SilhouetteFit:
         )
 
     def look(self, state: FitState, reach: float) -> Evidence:
-        """Returns what the views show, matched within `reach` pixels of the body in this state."""
+        """Returns the evidence of the views for the body in this state. Silhouettes are matched
+        within `reach` pixels.
+        """
         count = self.config.points
         moved = moved_capture(self.capture, self.origin, state)
         boundaries = [
@@ -528,8 +544,8 @@ class SilhouetteFit:
         )
 
     def _keypoint_errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
-        """Returns the distances of a capture's body from the keypoints, (v, k), pixels of the
-        photos. NaN where there is no keypoint.
+        """Returns the distances between the body's landmarks and the keypoints, (v, k), pixels of
+        the photos at full size. NaN where there is no keypoint.
         """
         cameras = capture.cameras
         seen = replace(
@@ -545,8 +561,8 @@ class SilhouetteFit:
         return np.where(known, errors, np.nan)[:, 0]
 
     def body_views(self, capture: Capture) -> list[silhouettes.BodyView]:
-        """Returns the body in every view. capture: the photos of this fit with any body and
-        cameras.
+        """Returns the body as each view sees it at the reduced size. capture: the photos of this
+        fit with any body and cameras.
         """
         cameras = capture.cameras.resized(self.cameras.width, self.cameras.height)
         vertices = posed_vertices(capture.body, from_host(capture.betas), capture.poses)
@@ -557,8 +573,8 @@ class SilhouetteFit:
         ]
 
     def score(self, capture: Capture) -> Score:
-        """Returns how well a body agrees with masks and keypoints. capture: the photos of this fit
-        with any body and cameras.
+        """Returns how well a body agrees with the masks and keypoints. capture: the photos of this
+        fit with any body and cameras.
         """
         known = [None] * len(self.masks) if self.unknown is None else list(~self.unknown)
         pairs = zip(self.body_views(capture), self.masks, known, strict=True)
@@ -591,7 +607,8 @@ def overlap(
     known: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
     """Returns the intersection over union of a body and a mask. It is NaN if the mask is empty.
-    known: pixels where the body counts, by default all. The mask counts everywhere.
+
+    known: pixels in which the body counts. None: all pixels. The mask counts in all pixels.
     """
     person = mask > 0.5
     if known is not None:
@@ -613,11 +630,12 @@ def posed_vertices(
 def _noise(
     boundaries: Sequence[silhouettes.Boundary], matches: Sequence[silhouettes.Matches]
 ) -> float:
-    """Returns the standard deviation of the distances between bodies and masks, pixels, from their
-    median. It is at least 0.7, and 1.0 if nothing was matched.
+    """Returns the standard deviation of the distances between the silhouettes of body and mask,
+    pixels. It is estimated from their median, and is at least 0.7. It is 1.0 if nothing was
+    matched.
 
-    Clothes make masks less certain, and so does a body that has not yet arrived. Silhouettes are
-    never more exact than 0.7 pixels.
+    Clothes make the distances larger, and so does a body that has not moved to its place yet.
+    Silhouettes are never more exact than 0.7 pixels.
     """
     found = [np.zeros(0)]
     for boundary, own in zip(boundaries, matches, strict=True):
@@ -634,9 +652,9 @@ def _person_height(
     masks: Sequence[Float[np.ndarray, "h w"]] | Float[np.ndarray, "v h w"],
     observations: Observations | None,
 ) -> float:
-    """Returns the height of the person in the image, pixels. This is the median over the views of
-    the mask's height or width, whichever is larger. If all masks are empty, the keypoints are
-    measured instead. Without masks and keypoints, the result is NaN.
+    """Returns the height of the person in the images, pixels. It is the median over the views of
+    the larger side of the mask's box. If all masks are empty, the box of the keypoints is used.
+    Without masks and keypoints, the result is NaN.
     """
     sizes = [max(np.ptp(x) for x in np.nonzero(mask > 0.5)) for mask in masks if (mask > 0.5).any()]
     if not sizes and observations is not None:
@@ -671,15 +689,15 @@ def refine_capture(
 ) -> RefinedCapture:
     """Refines cameras (rotation, centre, focal length), shape and poses of a capture.
 
-    In a view whose mask is empty, only the keypoints count. The start is kept if the result is not
+    If a view has an empty mask, only its keypoints count. The start is kept if the result is not
     clearly better.
 
     Args:
         capture: the start.
         keypoints: keypoints in the capture's views, or None.
         config: settings. `usual_config` returns settings that suit the start.
-        memory: correlation of each pose but the first with the pose before, (m - 1,), in [0, 1), as
-            in a video. None: poses are independent.
+        memory: correlation of each pose with the pose before, (m - 1,), in [0, 1), as in a video.
+            None: poses are independent.
 
     Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint. ValueError if
     the keypoints have another number of views than the capture.
@@ -714,7 +732,9 @@ def refine_capture(
 
 
 def _better(found: Score, before: Score, most_worse: float) -> bool:
-    """Returns whether a result is kept. most_worse: see `CaptureRefineConfig.keypoints_worse`."""
+    """Returns whether a result is clearly better than the start. most_worse: see
+    `CaptureRefineConfig.keypoints_worse`.
+    """
     if found.keypoints is None or before.keypoints is None:
         # masks of clothes are fitted a little better by wrong bodies, which keypoints would show:
         # for four people who started at the truth, by up to 0.15 of the loss

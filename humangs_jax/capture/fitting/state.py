@@ -1,26 +1,27 @@
 """The state and the solver that all fits share. A state holds shape and poses and, if a fit moves
 them, cameras, clothing and the places of landmarks.
 
-The numbers of a state are deviations from an `Origin` in units of their expected size. So zeros are
-the origin, a step of length 1 means as much in all directions, and half the square of a number is
-its negative logarithmic prior.
+The numbers of a state are deviations from an `Origin`, in units of their expected size. So a state
+of zeros is the origin, and a step of length 1 means as much in all directions. If a number has a
+prior, half its square is the negative log prior.
 
     keypoints    betas, the pose of every frame, places of    origin: the mean shape in the usual
                  landmarks                                    pose
     refinement   betas, poses, cameras, clothing              origin: a capture
 
-The root turns by global_orient after the origin's rotation, because sums of rotation vectors near
-half a turn are no measure of small turns.
+The rotation by global_orient is applied after the root's rotation in the origin. Rotation vectors
+are not added here, because near half a turn a sum does not measure a small rotation.
 
-The module also has the prior of poses: for every joint the usual rotation, its standard deviation
-and its limits. They are rotation vectors of SMPL-X's joints by name, in radians about the axes of
-the T-pose: x to the person's left, y up, z forward. Limits are boxes of rotation vectors, which are
-generous where axes mix (hips, shoulders). They are written for the left side. The right side is its
-mirror image (x, -y, -z). A knee bends about +x, the left elbow about -y, left fingers about -z. The
-left arm hangs at z = -1.4.
+The module also has the prior of poses. For every joint it has the usual rotation, its standard
+deviation and its limits. They are rotation vectors of SMPL-X's joints by name, in radians about the
+axes of the T-pose: x to the person's left, y up, z forward. Limits are boxes of rotation vectors,
+and are generous for joints that turn about several axes (hips, shoulders).
 
-The solver minimises half the square sum of residuals over a pytree of numbers of about unit size. A
-robust loss enters as a residual whose square is the loss. There are two methods:
+The values are written for the left side. The right side is its mirror image (x, -y, -z). A knee
+bends about +x, the left elbow about -y, left fingers about -z. The left arm hangs at z = -1.4.
+
+The solver minimises half the sum of squared residuals over a pytree of numbers of about unit size.
+A robust loss enters as a residual with the loss as its square. There are two methods:
 
     lbfgs   for many unknowns; cheap under vmap, and works through the renderer, which has a
             backward rule only
@@ -48,20 +49,20 @@ from humangs_jax.geometry.camera import Camera
 
 T = TypeVar("T")
 NORMAL_MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+"""Ratio of the standard deviation to the median absolute deviation, for a normal distribution."""
 
 
 def half_squares(tree: PyTree) -> Float[Array, ""]:
-    """Returns half the square sum of all leaves."""
+    """Returns half the sum of the squares of all leaves."""
     return sum((0.5 * jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
 
 
 def robust(errors: Float[Array, "*n d"], scale: Float[Array, ""] | float) -> Float[Array, "*n d"]:
-    """Returns residuals whose square is Geman and McClure's loss of the errors' lengths: e c /
-    sqrt(c^2 + |e|^2), where c is the scale.
+    """Returns errors that are scaled down so that their squared lengths are the Geman-McClure loss:
+    e c / sqrt(c^2 + |e|^2), where c is the scale.
 
-    Near 0 they are like e, and they are never longer than c. So a keypoint on another person pulls
-    no harder than one that is a little off.
+    Small errors hardly change, and no error stays longer than c. So a keypoint on another person
+    counts no more than about c.
     """
     return errors * (
         scale / jnp.sqrt(scale * scale + jnp.sum(jnp.square(errors), axis=-1, keepdims=True))
@@ -77,18 +78,18 @@ def solve(
     tolerance: float = 1e-4,
     free: T | None = None,
 ) -> tuple[T, Float[Array, ""]]:
-    """Minimises half the square sum of residuals.
+    """Minimises half the sum of squared residuals.
 
     Args:
         residuals: function that returns a pytree of residuals.
         start: pytree of unknowns to begin with.
         steps: largest number of steps.
         method: see the module's docstring.
-        tolerance: the solver stops when a step changes each unknown and the loss by less than
-            this number times (1 + its size).
+        tolerance: the solver stops when a step changes each unknown and the loss by less than this
+            number times (1 + its size).
         free: pytree of booleans like start. Numbers that are False stay. None: all move.
-    Returns: the solution and half its square sum. If the solution is not at least as good as the
-    start, or not finite, these are the start and its half square sum.
+    Returns: the solution and half its sum of squared residuals. If the solution is worse than the
+    start, or not finite, the start and its value are returned.
     """
     import lineax
     import optimistix
@@ -99,7 +100,7 @@ def solve(
         moving = None if free is None else ravel_pytree(free)[0]
 
         def held(y):
-            """Returns the unknowns. Those that are not free are as at the start."""
+            """Returns the unknowns, with numbers that are not free as at the start."""
             return y if moving is None else jnp.where(moving, y, flat)
 
         def of(y):
@@ -124,25 +125,25 @@ def solve(
 
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
-"""Factors that turn a rotation vector into that of the mirrored rotation."""
+"""Factors that turn a rotation vector into its mirror image."""
 _UNLIMITED = np.pi
-"""Limit of a rotation vector's component that has no other limit, radians."""
+"""Limit for components of a rotation vector that have no real limit, radians."""
 
 
 Vector = tuple[float, float, float]
 
 
 class Range(NamedTuple):
-    """The prior of one joint's rotation vector, by component."""
+    """The prior of one joint's rotation vector. Each entry has three components."""
 
     mean: Vector
     """Usual rotation vector, radians."""
     std: Vector
     """Standard deviation of each component, radians."""
     lower: Vector
-    """Least value of each component, radians."""
+    """Lower limit of each component, radians."""
     upper: Vector
-    """Largest value of each component, radians."""
+    """Upper limit of each component, radians."""
 
 
 _UNKNOWN = Range(
@@ -180,8 +181,8 @@ _RANGES = {
     **{f"left_{finger}1": _KNUCKLE for finger in FINGERS if finger != "thumb"},
     **{f"left_{finger}{k}": _FINGER for finger in FINGERS if finger != "thumb" for k in (2, 3)},
 }
-"""Ranges of everyday movement, for the joints in the middle and on the left side. They are wider
-than measured joint angles, because components of a rotation vector are not joint angles.
+"""Ranges of everyday movement by joint, for the joints in the middle and on the left side. They are
+wider than measured joint angles, because components of a rotation vector are not joint angles.
 """
 
 
@@ -189,7 +190,7 @@ than measured joint angles, because components of a rotation vector are not join
 class PosePrior:
     """The prior of the rotations of a body's j joints, in the body's order.
 
-    Of the root only the mean is used, because every orientation is equally likely.
+    For the root only the mean is used, because every orientation is equally likely.
     """
 
     mean: Float[np.ndarray, "j 3"]
@@ -197,14 +198,14 @@ class PosePrior:
     std: Float[np.ndarray, "j 3"]
     """Standard deviations, (j, 3), radians."""
     lower: Float[np.ndarray, "j 3"]
-    """Least values, (j, 3), radians."""
+    """Lower limits, (j, 3), radians."""
     upper: Float[np.ndarray, "j 3"]
-    """Largest values, (j, 3), radians."""
+    """Upper limits, (j, 3), radians."""
 
 
 def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
-    """Returns the prior of a body. Joints with other names than SMPL-X's have mean 0, standard
-    deviation 0.3 rad and no limits.
+    """Returns the prior of a body. Joints without a SMPL-X name have mean 0, standard deviation 0.3
+    rad and no limits.
     """
     rows = []
     for name in joint_names:
@@ -220,7 +221,7 @@ def limit_residuals(
     prior: PosePrior, joints: tuple[int, ...], rotations: Float[Array, "j 3"]
 ) -> Float[Array, "a 3"]:
     """Returns how far joints turn beyond their limits, (a, 3), in standard deviations. joints:
-    indices of the a joints. rotations: rotation vectors of all joints, radians.
+    indices of the a joints. rotations: rotation vectors of all joints, (j, 3), radians.
     """
     rows = np.asarray(joints, int)
     turned = rotations[rows]
@@ -232,16 +233,16 @@ def limit_residuals(
 _RADIANS = math.pi / 180
 """Radians in a degree."""
 SAME = 1e-4
-"""Largest difference of cameras that count as the same: relative for focal lengths, radians for
-rotations, metres for positions.
+"""Two cameras count as one if they differ by less than this. It is relative for focal lengths, in
+radians for rotations, and in metres for positions.
 """
 
 
 @pytree_dataclass
 class StateStd:
-    """Expected sizes of the deviations from an origin, as standard deviations.
+    """Standard deviations of the deviations from an origin.
 
-    They are numbers, or arrays () where one program is compiled for all values.
+    They are numbers. They are arrays () if one compiled program is used for all values.
     """
 
     focal: Float[Array, ""] | float = 0.05
@@ -255,7 +256,9 @@ class StateStd:
     transl: Float[Array, ""] | float = 0.05
     """Standard deviation of the person's position along each axis, metres."""
     body_pose: Float[Array, ""] | float = 4.0
-    """Standard deviation of each joint's rotation about each axis, degrees."""
+    """Standard deviation of each joint's rotation about each axis, degrees. Only refinements use
+    it.
+    """
     betas: Float[Array, ""] | float = 0.3
     """Standard deviation of the shape coefficients."""
     clothing: Float[Array, ""] | float = 0.03
@@ -265,14 +268,14 @@ class StateStd:
 
 
 FREE = StateStd(global_orient=math.degrees(0.3), transl=0.1, betas=1.0)
-"""Units for a fit without a start. Orientation and position have no prior in such a fit. Their
-units are step lengths of the solver. The shape has its usual standard deviation.
+"""Units for a fit without a start. Orientation and position have no prior in such a fit, and their
+units only set the step lengths of the solver. The shape has its usual standard deviation.
 """
 
 
 @pytree_dataclass
 class CameraState:
-    """Deviations of c cameras with g focal lengths, in units of `StateStd`."""
+    """Deviations of c cameras and g focal lengths from the origin, in units of `StateStd`."""
 
     rotations: Float[Array, "c 3"]
     """Deviations of the rotations, (c, 3)."""
@@ -284,8 +287,8 @@ class CameraState:
 
 @pytree_dataclass
 class FitState:
-    """The numbers that a fit moves, in units of `StateStd`. Parts that the fit does not move are
-    None.
+    """The numbers that a fit moves, in units that the `Origin` gives. Parts that the fit does not
+    move are None.
 
     In a fit of m frames the poses have a leading axis (m, ...), and all frames share one shape. The
     number of free joints is a.
@@ -294,7 +297,7 @@ class FitState:
     betas: Float[Array, " s"]
     """Deviations of the shape coefficients, (s,)."""
     global_orient: Float[Array, "*m 3"]
-    """Turns of the root after its rotation in the origin, (3,) or (m, 3)."""
+    """Rotation vectors that are applied after the root's rotation in the origin, (3,) or (m, 3)."""
     transl: Float[Array, "*m 3"]
     """Deviations of the position, (3,) or (m, 3)."""
     body_pose: Float[Array, "*m a 3"]
@@ -302,18 +305,20 @@ class FitState:
     cameras: CameraState | None = None
     """Deviations of the cameras. None if the fit does not move them."""
     clothing: Float[Array, " b"] | None = None
-    """Thickness of clothes on the segments of the root and of the free joints, (a + 1,), in units
-    of `StateStd`. None without clothing.
+    """Thickness of clothes on each segment of the body, (a + 1,), in units of `StateStd`. The
+    segments belong to the root and to the free joints. None if the fit has no clothing.
     """
     places: Float[Array, "g 3"] | None = None
-    """Deviations of the places of groups of landmarks, (g, 3), see `LandmarkModel.moved`. Their
+    """Deviations of the places of g groups of landmarks, (g, 3), see `LandmarkModel.moved`. Their
     unit is `residuals.keypoints.PLACE_STD`. None if the fit does not move them.
     """
 
 
 @pytree_dataclass
 class CameraOrigin:
-    """The cameras of v views where a fit begins, and the indices of their numbers in the state."""
+    """The cameras of v views at the start of a fit, and for each view the indices of its numbers in
+    the state.
+    """
 
     K: Float[Array, "v 3 3"]
     """Intrinsics, (v, 3, 3), pixels."""
@@ -329,7 +334,9 @@ class CameraOrigin:
 
 @pytree_dataclass
 class Origin:
-    """The values that zeros of a state stand for, and the unit of each of its numbers."""
+    """Shape, poses and cameras that a state of zeros stands for, and the units of a state's
+    numbers.
+    """
 
     betas: Float[Array, " s"]
     """Shape coefficients, (s,)."""
@@ -340,17 +347,17 @@ class Origin:
     cameras: CameraOrigin | None = None
     """Cameras of the views. None for a fit without cameras."""
     segment: Int[Array, " j"] | None = None
-    """Index of each joint's number in `FitState.clothing`, (j,). None without clothing."""
+    """Index into `FitState.clothing` for each joint, (j,). None if the fit has no clothing."""
     joints: tuple[int, ...] = static_field(default=())
     """Indices of the a free joints. The root (joint 0) is always free and not among them."""
     std: StateStd = FREE
-    """Units of everything that moves, except joints' rotations and landmarks' places."""
+    """Units of all numbers of a state except joints' rotations and landmarks' places."""
 
     @property
     def views(self) -> CameraOrigin:
-        """The cameras.
+        """The cameras of the views.
 
-        Raises: ValueError if there are none.
+        Raises: ValueError if the origin has no cameras.
         """
         if self.cameras is None:
             raise ValueError("expected an origin with cameras")
@@ -358,7 +365,7 @@ class Origin:
 
 
 def usual_origin(prior: PosePrior, joints: tuple[int, ...], coefficients: int) -> Origin:
-    """Returns the origin with the mean shape in the prior's usual pose at the world's origin.
+    """Returns an origin with the mean shape, in the prior's usual pose, at the world's origin.
     joints: indices of the free joints. coefficients: number of shape coefficients.
     """
     pose = BodyPose(from_host(prior.mean), _zeros(3))
@@ -387,12 +394,12 @@ def zero_state(origin: Origin) -> FitState:
 
 
 def _zeros(*shape: int) -> Float[Array, "..."]:
-    """Returns zeros from the host, for which JAX compiles no program."""
+    """Returns zeros that are made on the host, so that JAX compiles no program for them."""
     return from_host(np.zeros(shape, np.float32))
 
 
 def frame_axes(state: FitState) -> FitState:
-    """Returns `in_axes` of `jax.vmap` for a state with one shape and a batch of frames."""
+    """Returns the `in_axes` of `jax.vmap` for a state with one shape and a batch of frames."""
     none = jax.tree.map(lambda leaf: None, state)
     return replace(none, global_orient=0, transl=0, body_pose=0)
 
@@ -403,9 +410,9 @@ def betas_of(origin: Origin, state: FitState) -> Float[Array, " s"]:
 
 
 def pose_of(origin: Origin, state: FitState) -> BodyPose:
-    """Returns the pose of a state, or the batch of poses. It is differentiable everywhere.
+    """Returns the pose of a state, or a batch of poses. It is differentiable everywhere.
 
-    Joints that are not free are as in the origin.
+    Joints that are not free have their rotations in the origin.
     """
     rotations = origin.pose.rotations
     rotations = rotations.at[..., np.asarray(origin.joints, int), :].add(
@@ -419,8 +426,8 @@ def pose_of(origin: Origin, state: FitState) -> BodyPose:
 
 
 def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitState:
-    """Returns the state of a shape and a pose, or a batch of poses. Joints that are not free are
-    ignored.
+    """Returns the state that stands for a shape and a pose, or for a batch of poses. Joints that
+    are not free are ignored.
 
     The state has no cameras and no clothing.
     """
@@ -439,10 +446,10 @@ def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitSt
 def cameras_of(
     origin: Origin, state: FitState
 ) -> tuple[Float[Array, "v 3 3"], Float[Array, "v 4 4"]]:
-    """Returns K, (v, 3, 3), and cam_from_world, (v, 4, 4), of every view. A camera turns about its
-    centre, in its axes, and the centre moves.
+    """Returns K, (v, 3, 3), and cam_from_world, (v, 4, 4), of every view in a state. If the state
+    has no cameras, they are the origin's.
 
-    If the state has no cameras, they are as in the origin.
+    A camera is rotated about its centre, in its axes, and its centre is shifted.
     Raises: ValueError if the origin has no cameras.
     """
     start, moved, std = origin.views, state.cameras, origin.std
@@ -466,8 +473,8 @@ def cameras_of(
 def clothing_thickness(
     origin: Origin, state: FitState, weights: Float[Array, "*p j"]
 ) -> Float[Array, "*p"]:
-    """Returns how far masks reach beyond the body at points with these skinning weights, (..., j),
-    metres. It is 0 without clothing.
+    """Returns how far masks reach beyond the body at points of the surface, (...), metres. It is 0
+    if there is no clothing. weights: skinning weights of the points, (..., j).
     """
     if origin.segment is None or state.clothing is None:
         return jnp.zeros(weights.shape[:-1])
@@ -477,8 +484,8 @@ def clothing_thickness(
 
 
 def segments(parents: tuple[int, ...], joints: tuple[int, ...]) -> Int[np.ndarray, " j"]:
-    """Returns the segment of each joint, (j,): 0 for the root, 1 + i for joint `joints[i]`, and for
-    other joints the segment of their nearest ancestor that has one.
+    """Returns the segment of each joint, (j,). It is 0 for the root, and 1 + i for joint
+    `joints[i]`. Each other joint has the segment of its nearest ancestor with a segment.
     """
     number = {joint: i + 1 for i, joint in enumerate(joints)} | {parents.index(-1): 0}
     found = []
@@ -491,7 +498,8 @@ def segments(parents: tuple[int, ...], joints: tuple[int, ...]) -> Int[np.ndarra
 
 def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"]) -> CameraOrigin:
     """Returns the origin of cameras. Views with the same K and cam_from_world share a camera in the
-    state. Views with the same focal lengths share a focal length. frames: frame of each view, (v,).
+    state. Views with the same focal lengths share a focal length in the state. frames: frame of
+    each view, (v,).
     """
     K, matrices = np.asarray(cameras.K, float), np.asarray(cameras.cam_from_world, float)
     camera = camera_numbers(K, matrices, SAME)
@@ -502,8 +510,9 @@ def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"]) -> CameraOrigi
 def camera_numbers(
     K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], same: float
 ) -> Int[np.ndarray, " v"]:
-    """Returns the number of each view's camera, (v,), from 0. Views of one camera that stood still
-    have the same number. same: difference below which two views are of one camera, see `SAME`.
+    """Returns the number of each view's camera, (v,), from 0. Two views have the same number if
+    their K and cam_from_world are the same. same: largest difference between views of one camera,
+    see `SAME`.
     """
     focal = K[:, :1, 0]
     rows = [np.log(focal), K.reshape(len(K), -1) / focal, matrices.reshape(len(K), -1)]

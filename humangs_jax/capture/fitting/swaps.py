@@ -1,18 +1,20 @@
-"""Finds bookkeeping errors that keypoints reveal: exchanged sides, or exchanged cameras.
+"""Finds exchanges that keypoints reveal: exchanged sides, cameras or hands.
 
 Correct views of one frame agree: the rays of a landmark meet. Exchanges that people and detectors
-make are undone on trial. As long as the views then agree clearly better, the clearest exchange is
-kept. Exchanged cameras are reported first, then exchanged sides by view:
+often make are undone on trial. The exchange after which the views agree clearly better is kept, and
+the search goes on, until no exchange is clear. Exchanged cameras are reported first, then exchanged
+sides by view:
 
-    sides     left and right of the keypoints of one view; needs two views, of which either may be
-              the wrong one
+    sides     left and right of the keypoints of one view; needs two views, and either of the two
+              may be the wrong one
     cameras   of two views, which looks the same as exchanged photos; needs three views
     hands     left and right keypoints of the hands alone, in one view
 
 If left and right are exchanged in all views, the views agree too, and nothing is found.
 
-A view agrees with a landmark if its keypoint is near the best of the points that pairs of views
-propose (`triangulation.triangulate_robustly`). So outliers count little.
+Pairs of views propose a point for each landmark, and the best proposal is taken
+(`triangulation.triangulate_robustly`). A view agrees with a landmark if its keypoint is near this
+point. So outliers count little.
 """
 
 import dataclasses
@@ -35,23 +37,24 @@ from humangs_jax.core.pytree import replace
 
 @dataclasses.dataclass(frozen=True)
 class _Clear:
-    """Limits that decide if an exchange explains a disagreement clearly."""
+    """Limits that decide whether an exchange clearly explains a disagreement."""
 
     least_gain: float = 0.1
-    """Least growth of the agreement, as a share of what is attainable: this number + `chance` /
-    sqrt(n) for n keypoints.
+    """An exchange is clear if it adds at least the share least_gain + chance / sqrt(n) of the
+    agreement that could be reached with n keypoints.
     """
     chance: float = 0.8
-    """Share that exchanges gain by chance. Without an exchange, 17 keypoints with 20 % of outliers
-    and three times the expected noise gain up to 0.26, and 67 keypoints gain nothing.
+    """See `least_gain`. This term allows for what an exchange gains by chance. In correct views, 17
+    keypoints with 20 % of outliers and three times the expected noise gain up to 0.26, and 67
+    keypoints gain nothing.
     """
     many: int = 5
-    """Number of views from which on the right views outvote an exchange. Then only exchanges that
-    look better at once are tried.
+    """With at least this many views, only exchanges are tried that improve the agreement with the
+    points as they are. So many views outvote the exchanged ones.
     """
     alike: float = 0.9
-    """Share of the gain from which on another exchange explains as much. In a ring of evenly spaced
-    cameras several exchanges are equivalent.
+    """Another exchange is an alternative if it gains more than this share of what the best one
+    gains. In a ring of evenly spaced cameras several exchanges are equivalent.
     """
 
 
@@ -60,15 +63,17 @@ _CLEAR = _Clear()
 
 @dataclasses.dataclass(frozen=True)
 class Swap:
-    """One exchange that explains a disagreement. `str()` is a sentence about it."""
+    """One exchange that explains a disagreement. `str()` returns a sentence about it."""
 
     kind: Literal["sides", "cameras", "hands"]
     """What is exchanged."""
     views: tuple[str, ...]
-    """Names of the views that are exchanged. For cameras, those of the first frame."""
+    """Names of the views that are exchanged. If cameras are exchanged, these are their views in the
+    first frame.
+    """
     instead: tuple[str, ...] = ()
-    """Alternatives that explain the disagreement as well: names of views, or for cameras pairs ("a
-    and b").
+    """Alternatives that explain the disagreement as well. They are names of views, or for cameras
+    pairs of names ("a and b").
     """
     frames: int = 1
     """Number of frames in which the cameras are exchanged."""
@@ -97,12 +102,12 @@ def find_swaps(
     names: tuple[str, ...],
 ) -> tuple[Swap, ...]:
     """Returns exchanged cameras, the clearest first, and then exchanged sides by view. Sides are
-    found in frames with two or more views, cameras in frames with three or more.
+    found in frames with at least two views, cameras in frames with at least three.
 
     Args:
         observations: keypoints, a batch of m frames.
         kind: set of the keypoints.
-        views: index into `names` of each view, (m, c). -1 where there is none, see
+        views: index of each view in `names`, (m, c). -1 where there is no view, see
             `group_by_frame`.
         names: names of all views.
     """
@@ -124,8 +129,8 @@ def find_swaps(
 
 
 def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[Swap, ...]:
-    """Returns a swap for each view in which the hands' keypoints are at each other's wrists. It is
-    empty if the set of keypoints has no roots of hands.
+    """Returns a swap for each view in which the keypoints of each hand lie at the other hand's
+    wrist. It is empty if the set of keypoints has no roots of hands.
     """
     wanted = ("left_hand_root", "right_hand_root", "left_wrist", "right_wrist")
     if not set(wanted) <= set(keypoints.set.names):
@@ -143,13 +148,13 @@ def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[
 
 
 class Order(NamedTuple):
-    """The keypoints that each of c cameras gets in m frames."""
+    """Which keypoints each of c cameras has in m frames."""
 
     source: Int[np.ndarray, "m c"]
-    """Index of the camera from which they come, (m, c)."""
+    """Index of the camera whose keypoints are used, (m, c)."""
     mirrored: Bool[np.ndarray, "m c"]
-    """Whether left and right of the keypoints are exchanged, (m, c). The second index is the camera
-    from which the keypoints come.
+    """Whether left and right of a camera's keypoints are exchanged, (m, c). The second axis is the
+    camera that the keypoints come from.
     """
 
     def exchanged(
@@ -158,10 +163,10 @@ class Order(NamedTuple):
         a: Int[np.ndarray, " e"],
         b: Int[np.ndarray, " e"] | None,
     ) -> "Order":
-        """Returns the order after an exchange in some frames.
+        """Returns the order after another exchange in some frames.
 
-        Cameras a and b exchange their keypoints. If b is None, left and right of camera a's
-        keypoints are exchanged.
+        Cameras a and b exchange their keypoints. If b is None, left and right of the keypoints that
+        camera a has are exchanged.
         """
         source, mirrored = self.source.copy(), self.mirrored.copy()
         if b is None:
@@ -172,23 +177,21 @@ class Order(NamedTuple):
 
 
 def given(frames: int, views: int) -> Order:
-    """Returns the order in which every camera has its own keypoints, with their sides as they
-    are.
-    """
+    """Returns the order without any exchange."""
     return Order(np.tile(np.arange(views), (frames, 1)), np.zeros((frames, views), bool))
 
 
 def _arranged(
     observations: Observations, mirror: Int[np.ndarray, " k"], order: Order
 ) -> Observations:
-    """Returns the keypoints of m frames in an order. If the order exchanges sides, they have no 3D
-    landmarks. mirror: index of each keypoint's mirror image, (k,).
+    """Returns the keypoints of m frames in an order. They have no 3D landmarks if the order
+    exchanges sides. mirror: index of each keypoint's mirror image, (k,).
     """
     rows = np.arange(len(order.source))[:, None]
     columns = np.where(order.mirrored[rows, order.source, None], mirror, np.arange(len(mirror)))
 
     def pick(values):
-        """Returns values of the keypoints, (m, c, k, ...), in the order."""
+        """Returns values of the keypoints, (m, c, k, ...), after the exchanges of the order."""
         return from_host(np.asarray(values)[rows[..., None], order.source[..., None], columns])
 
     # where left and right are exchanged the detector may have seen the body turned round: its
@@ -205,18 +208,18 @@ def _arranged(
 
 
 class Agreement(NamedTuple):
-    """How well c views agree with the points that they agree on best. Agreement is the sum of the
-    confidences over keypoints, which count less for larger errors.
+    """How well the keypoints of c views agree with robustly triangulated points. Agreement is a sum
+    of confidences over the keypoints, in which a larger error gives less weight.
 
-    The points are triangulated from the keypoints as they are, and not again for an exchange.
+    The points are triangulated from the keypoints as they are, and not again for each exchange.
     """
 
     own: Float[Array, " c"]
-    """Agreement of each view with its keypoints, (c,)."""
+    """Agreement of each view, (c,)."""
     crossed: Float[Array, "c c"]
-    """Agreement of the first view with the keypoints of the second, (c, c)."""
+    """Agreement of view i if it had the keypoints of view j, (c, c). Axes are i and j."""
     mirrored: Float[Array, " c"]
-    """Agreement of each view with left and right of its keypoints exchanged, (c,)."""
+    """Agreement of each view if left and right of its keypoints were exchanged, (c,)."""
 
 
 @jax.jit
@@ -224,14 +227,16 @@ def agreements(
     observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]
 ) -> Agreement:
     """Returns how well the views of each frame agree, a batch of m. mirror: index of each
-    keypoint's mirror image.
+    keypoint's mirror image, (k,).
     """
 
     def of_frame(seen):
         points, counts, weights = triangulate_robustly(seen)
 
         def near(keypoints, confidences):
-            """Returns the agreement of all views, (c,), if each had these keypoints, (k, 2)."""
+            """Returns the agreement of each view, (c,), if all of them had these keypoints, (k,
+            2).
+            """
             alike = replace(
                 seen,
                 points=jnp.broadcast_to(keypoints, seen.points.shape),
@@ -253,7 +258,7 @@ def agreements(
 
 
 class _Trial(NamedTuple):
-    """An exchange in some frames, and what it gains."""
+    """An exchange in some frames, and how much agreement it gains."""
 
     gain: float
     """Agreement that the exchange adds."""
@@ -262,17 +267,17 @@ class _Trial(NamedTuple):
     a: Int[np.ndarray, " e"]
     """Camera whose keypoints are exchanged in each frame, (e,)."""
     b: Int[np.ndarray, " e"] | None
-    """Camera with which it is exchanged in each frame, (e,). None if left and right of camera a are
-    exchanged.
+    """Camera with which camera a exchanges its keypoints in each frame, (e,). None if left and
+    right of camera a are exchanged.
     """
 
 
 class _Search:
-    """Keypoints in an order, how well the views agree, and what exchanges would add.
+    """Keypoints in an order, how well their views agree, and which exchanges are worth a trial.
 
-    cameras: (m, c), equal numbers for one camera that stands still, -1 where there is no view.
-    total: (m,) agreement of each frame. views: (m, c), which views have keypoints. sides: (m, c)
-    and pairs: (m, c, c), which exchanges are tried.
+    Attributes: cameras: number of the camera, (m, c), equal for views of one camera that stands
+    still, -1 where there is no view. total: agreement of each frame, (m,). views: which views have
+    keypoints, (m, c). sides, (m, c), and pairs, (m, c, c): which exchanges are tried.
     """
 
     def __init__(
@@ -316,8 +321,8 @@ class _Search:
     def is_clear(self, trial: _Trial, of: Bool[np.ndarray, " k"]) -> bool:
         """Returns whether an exchange of the keypoints `of` gains enough.
 
-        The gain is compared with what is attainable: agreement on all keypoints that another view
-        sees too.
+        The gain is compared with the largest possible agreement: the sum of the confidences of all
+        keypoints that another view sees, too.
         """
         seen = (self.confidences > 0) & of
         shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
@@ -332,8 +337,8 @@ class _Search:
         return trial.gain / max(attainable, 1e-6) > least
 
     def flips(self) -> dict[int, _Trial]:
-        """Returns a trial for each frame in which the sides of a view are clearly exchanged, by
-        frame. It is the trial of the view whose exchange gains most.
+        """Returns for each frame a trial in which the sides of one view are exchanged. It is the
+        trial that gains most. Frames without a clear trial are left out.
         """
         found: dict[int, _Trial] = {}
         sided = self.mirror != np.arange(len(self.mirror))
@@ -347,8 +352,8 @@ class _Search:
         return found
 
     def exchanges(self) -> list[_Trial]:
-        """Returns the clear exchanges of two cameras. An exchange is tried in all frames of the two
-        cameras together, and in each frame alone.
+        """Returns the clear exchanges of two cameras. Each pair of cameras is tried in all of its
+        frames together, and in each of them alone.
         """
         # pairs of cameras that look exchanged in some frame are tried in all of their frames
         suspected = {self._pair(*at) for at in np.argwhere(self.pairs).tolist()}
@@ -369,12 +374,14 @@ class _Search:
         return [trial for trial in (*together, *alone) if self.is_clear(trial, every)]
 
     def _pair(self, frame: int, a: int, b: int) -> tuple[int, ...]:
-        """Returns the numbers of the cameras in two columns of a frame, sorted."""
+        """Returns the numbers of two cameras of a frame, sorted. a and b: their columns in the
+        frame.
+        """
         return tuple(sorted(self.cameras[frame, [a, b]].tolist()))
 
 
 def _together(trials: Sequence[_Trial]) -> _Trial:
-    """Joins the exchanges of two cameras in several frames to one."""
+    """Returns one trial that joins the exchanges of two cameras in several frames."""
     frames, a, b = (
         np.concatenate([getattr(trial, key) for trial in trials]) for key in ("frames", "a", "b")
     )
@@ -384,7 +391,7 @@ def _together(trials: Sequence[_Trial]) -> _Trial:
 def _cameras(
     best: _Trial, tried: Sequence[_Trial], views: Int[np.ndarray, "m c"], names: Sequence[str]
 ) -> Swap:
-    """Returns the best exchange as a swap. Other exchanges of the same frames that gain nearly as
+    """Returns the best exchange as a swap. Other exchanges in the same frames that gain nearly as
     much are its alternatives.
     """
 
@@ -403,8 +410,8 @@ def _cameras(
 def _sides(
     observations: Observations, views: Int[np.ndarray, "m c"], order: Order, names: Sequence[str]
 ) -> list[Swap]:
-    """Returns a swap for each view whose sides are exchanged. If these are half of the views, the
-    other half may be exchanged instead.
+    """Returns a swap for each view with exchanged sides. If these are half of a frame's views, the
+    other half are its alternatives.
     """
     found = []
     seen = np.any(np.asarray(observations.confidences) > 0, axis=-1)

@@ -1,16 +1,16 @@
-"""Triangulates points from several views, and finds which people in several views are the same
+"""Triangulates points from several views, and finds out which people in several views are the same
 person.
 
-A pixel is a ray. The point with the least weighted sum of squared distances to the rays solves 3 x
-3 equations. Weights of focal length over distance turn metres into pixels (Hartley and Zisserman,
-Multiple View Geometry, 12.2). The robust solution begins with the pair of views that most views
-agree with.
+A pixel is a ray. The point with the least weighted sum of squared distances to the rays is the
+solution of 3 x 3 equations. Weights of focal length over distance turn metres into pixels (Hartley
+and Zisserman, Multiple View Geometry, 12.2). The robust solution begins with the pair of views that
+most views agree with.
 
-The landmarks of one person triangulate: points in space project to that person's landmarks in other
-cameras, within a few hundredths of the person's size. The landmarks of two people do not, nor do
-those of a person whose left and right are exchanged in one view. Every pair of people in two views
-proposes points, once as they are and once with left and right of the second exchanged. People in
-other views join where they agree.
+If two views show the same person, the triangulated landmarks project to the person's landmarks in
+other cameras, within a few hundredths of the person's size. Landmarks of two different people do
+not, nor do landmarks of a person with left and right exchanged in one view. So every pair of people
+in two views proposes points, once as they are, and once with left and right of the second person
+exchanged. People in other views who agree with the points join the pair.
 """
 
 import dataclasses
@@ -29,18 +29,18 @@ from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.geometry.transform import EXACT
 
 PAIRS_AT_ONCE = 16
-"""Number of pairs of views whose proposals are compared with all views at once. It is fixed, so
-that memory does not grow with the number of pairs.
+"""Number of pairs of views that are evaluated at the same time. It is fixed, so that memory does
+not grow with the number of pairs.
 """
 _MARGIN = 6.0
-"""Largest error at which a view agrees with a point, standard deviations of the noise."""
+"""A view agrees with a point if its error is below this, in standard deviations of the noise."""
 
 
 def triangulate(
     observations: Observations, weights: Float[Array, "c k"] | None = None
 ) -> tuple[Float[Array, "k 3"], Float[Array, " k"]]:
-    """Triangulates points by least squares over all views. Returns the points, (k, 3), metres, and
-    how many views see each, (k,).
+    """Returns points triangulated by least squares over all views, (k, 3), metres, and how many
+    views have a weight for each point, (k,).
 
     Arguments: weights: weight of each point in each view, (c, k). None: the confidences.
     """
@@ -59,11 +59,12 @@ def triangulate(
 def triangulate_robustly(
     observations: Observations,
 ) -> tuple[Float[Array, "k 3"], Float[Array, " k"], Float[Array, "c k"]]:
-    """Triangulates points robustly. Returns the points, (k, 3), metres, how many views agree with
-    each, (k,), and the weights of these views, (c, k).
+    """Returns robustly triangulated points, (k, 3), metres, how many views agree with each point,
+    (k,), and the weights of these views, (c, k).
 
-    Every pair of views proposes a point. The proposal that the views agree with most is improved
-    from those views alone. A point that fewer than two views agree with has weights of 0.
+    Every pair of views proposes a point. The proposal that the views agree with most is chosen, and
+    is triangulated again from the views that agree with it. If fewer than two views agree with a
+    point, its weights are 0.
     """
     views = observations.points.shape[0]
     if views < 2:
@@ -89,8 +90,8 @@ def triangulate_robustly(
 
 
 def agreement(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
-    """Returns how well views agree with points, (c, k): their confidences, which are less the
-    larger the errors are, and 0 beyond the margin.
+    """Returns how well views agree with points, (c, k). It is the confidence for an error of 0,
+    decreases with the error, and is 0 beyond the margin.
     """
     errors = reprojection_errors(observations, points)
     return observations.confidences * jnp.maximum(
@@ -141,23 +142,23 @@ def _nearest(
 
 @dataclasses.dataclass(frozen=True)
 class _SamePerson:
-    """Limits that decide if people in views of one moment are one person."""
+    """Limits that decide whether people in several views of one moment are one person."""
 
     agree: float = 0.06
-    """Largest median distance of a view's landmarks from the triangulated points of the same
-    person, a share of the person's size in the photo. Cameras that are off by a degree contribute
-    0.02.
+    """Largest median distance between a person's landmarks in a view and the projected points of
+    the same person, as a share of the person's size in the photo. A camera that is off by a degree
+    contributes 0.02.
     """
     clearly: float = 0.5
-    """Largest ratio of the distances with and without exchanged sides, for the sides to be
-    exchanged.
+    """Sides count as exchanged if an exchange multiplies this distance by less than this number. It
+    holds if the view agrees without an exchange.
     """
     rather: float = 0.8
-    """The ratio of `clearly` for views that do not agree without an exchange."""
+    """The number in place of `clearly` if the view does not agree without an exchange."""
     seen: float = 0.3
-    """Least visibility of a landmark that is used."""
+    """A landmark is used if it has at least this visibility."""
     fewest: int = 6
-    """Least number of landmarks that two views have to share to be compared."""
+    """Two views are compared if they share at least this many landmarks."""
 
 
 _SAME_PERSON = _SamePerson()
@@ -165,28 +166,30 @@ _SAME_PERSON = _SamePerson()
 
 @dataclasses.dataclass(frozen=True)
 class _SameWay:
-    """Limits that decide if people in two successive frames are one person."""
+    """Limits that decide whether people in two successive frames are one person."""
 
     farthest: float = 1.0
-    """Largest distance between a person's positions in two successive frames, metres. It is used
-    where several views show the position.
+    """Largest distance between a person's positions in two successive frames, metres. It is used if
+    several views show the person.
     """
     near: float = 0.5
-    """Largest movement in the photo of one camera between two successive frames, a share of the
-    person's size in it.
+    """Largest movement of a person in one camera's photos, as a share of the person's size in the
+    photo.
     """
     resized: float = 1.5
-    """Largest ratio of a person's sizes in the photo of one camera in two successive frames."""
+    """Largest ratio between a person's sizes in one camera's photos."""
     shorter: float = 0.3
-    """Least length that the movements between two frames have to gain if two people are exchanged,
-    for the people to be linked, a share of the largest movement.
+    """People are linked only if every other choice makes the sum of movements longer by at least
+    this, as a share of the largest allowed movement.
     """
     far: float = 3.0
-    """Multiple of the largest movement from which on all movements count as equally long."""
+    """Longer movements count as this one, as a multiple of the largest allowed movement."""
     still_degrees: float = 10.0
-    """Largest rotation of a view between two frames that still counts as one camera, degrees."""
+    """Two views count as one camera only if the rotation between them is at most this, degrees."""
     still_metres: float = 0.3
-    """Largest movement of a view between two frames that still counts as one camera, metres."""
+    """Two views count as one camera only if the distance between their centres is at most this,
+    metres.
+    """
 
 
 _SAME_WAY = _SameWay()
@@ -213,14 +216,17 @@ class Match(NamedTuple):
     members: tuple[int | None, ...]
     """Index of the person in each view. None where the view does not show the person."""
     mirrored: tuple[bool, ...]
-    """Whether the person's left and right are exchanged, for each view."""
+    """Whether left and right are exchanged in each view, compared with most of the person's
+    views.
+    """
     error: float
-    """Mean over the views of the median distance of the landmarks from the triangulated points, a
-    share of the person's size. The two views that proposed the points count as one, with the larger
-    distance. It is infinite for a person who is seen in one view.
+    """Mean error of the views. The error of a view is the median distance between the person's
+    landmarks and the projected points, as a share of the person's size. The two views that proposed
+    the points count as one view, with the larger of their errors. The error is infinite for a
+    person who is seen in one view.
     """
     center: Float[np.ndarray, "3"]
-    """Median of the triangulated points, (3,), metres. NaN if no point was triangulated, as for a
+    """Median of the triangulated points, (3,), metres. NaN if there are no such points, as for a
     person who is seen in one view.
     """
 
@@ -228,9 +234,10 @@ class Match(NamedTuple):
 def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
     """Returns a match for each person in some views of one moment.
 
-    People that most views show come first, and people of a single view come last.
+    People who are seen in most views come first, and people who are seen in a single view come
+    last.
 
-    Arguments: mirror: for each landmark the index of its mirror image.
+    Arguments: mirror: for each landmark the index of its mirror image, (k,).
     """
     # each pair of people in two views proposes points, as they are and with sides exchanged;
     # whoever agrees with these in other views joins
@@ -270,8 +277,10 @@ def _gathered(
     points: Float[np.ndarray, "k 3"],
     known: Bool[np.ndarray, " k"],
 ) -> tuple[dict[Key, bool], float]:
-    """Adds to a pair of people the people of other views who agree with its points. Returns the
-    group, {(view, person): exchanged}, and its mean error.
+    """Adds people of other views to a pair of people, if they agree with the pair's points. Returns
+    the group, {(view, person): whether sides are exchanged}, and its mean error.
+
+    error, points and known: error and triangulated points of the pair, and which points count.
     """
     group, errors = dict(pair), [error]
     for v in set(range(len(views))) - {v for v, _ in pair}:
@@ -293,7 +302,7 @@ def _is_exchanged(plain: float, exchanged: float) -> bool:
     """Returns whether sides are exchanged. plain and exchanged: errors without and with an
     exchange.
 
-    Left and right of a small or thin person hardly differ. Then nothing is exchanged.
+    If a person is small or thin, left and right hardly differ. Then nothing counts as exchanged.
     """
     most = (
         _SAME_PERSON.clearly * plain
@@ -329,8 +338,8 @@ def _match(
 def _triangulated(
     views: Sequence[Seen], rows: dict[int, Float[np.ndarray, "k 3"]]
 ) -> tuple[Float[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
-    """Triangulates points by linear least squares. Returns the points, (k, 3), metres, and which of
-    them all views see, (k,).
+    """Returns points triangulated by linear least squares, (k, 3), metres, and which of these
+    landmarks all views see, (k,).
     """
     known = np.logical_and.reduce([row[:, 2] >= _SAME_PERSON.seen for row in rows.values()])
     equations = []
@@ -350,8 +359,9 @@ def _error(
     points: Float[np.ndarray, "k 3"],
     known: Bool[np.ndarray, " k"],
 ) -> float:
-    """Returns the median distance of landmarks from projected points, over the size of the person.
-    It is infinite if the person is behind the camera, or too few landmarks are shared.
+    """Returns the median distance between landmarks and projected points, divided by the person's
+    size in the photo. It is infinite if the person is behind the camera, or if too few landmarks
+    are shared.
     """
     seen = known & (row[:, 2] >= _SAME_PERSON.seen)
     if seen.sum() < _SAME_PERSON.fewest:
@@ -367,7 +377,7 @@ def _error(
 
 
 def comparable(first: Float[np.ndarray, "k 3"], second: Float[np.ndarray, "k 3"]) -> bool:
-    """Returns whether two views share enough landmarks to show that they see two people."""
+    """Returns whether two views of a person share enough landmarks to be compared."""
     return (
         int(((first[:, 2] >= _SAME_PERSON.seen) & (second[:, 2] >= _SAME_PERSON.seen)).sum())
         >= _SAME_PERSON.fewest
@@ -377,16 +387,16 @@ def comparable(first: Float[np.ndarray, "k 3"], second: Float[np.ndarray, "k 3"]
 def in_order_of_time(
     frames: Sequence[list[Match]], shown: Sequence[Sequence[Seen]] | None = None
 ) -> list[list[Match | None]]:
-    """Orders the matches of successive frames so that the i-th match of each frame is the same
-    person.
+    """Follows people over successive frames. Returns for each frame a list with one entry per
+    person, in the same order in all frames. The entry is the person's match, or None if the frame
+    does not show the person.
 
-    People are linked so that the sum of all movements is the least. Movements are measured in
-    space first. People who are not linked then are compared in the photos of one camera. A person
-    is not linked if another choice is nearly as short.
+    People are linked so that the sum of all movements is smallest. Movements are first measured in
+    space. People who are not linked by this are then compared in the photos of one camera. A person
+    is not linked if another choice is nearly as short. A match that is linked to nobody becomes a
+    new person, who may in truth be one of the others.
 
     Arguments: shown: the views of each frame. None: people are followed in space alone.
-    Returns: for each frame a match for each person, None where the frame does not show the person.
-    A match that is linked to nobody is added as a new person, who may still be one of the others.
     """
     people: list[list[Match | None]] = []
     for f, matches in enumerate(frames):
@@ -420,8 +430,8 @@ def in_order_of_time(
 
 
 def _last_center(person: Sequence[Match | None]) -> Float[np.ndarray, "3"]:
-    """Returns the last position of a person that several views have seen, (3,), metres. NaN if
-    there is none.
+    """Returns the last known position of a person, (3,), metres. NaN if there is none. Only matches
+    of several views have a position.
     """
     centers = [
         match.center for match in person if match is not None and np.isfinite(match.center).all()
@@ -430,9 +440,9 @@ def _last_center(person: Sequence[Match | None]) -> Float[np.ndarray, "3"]:
 
 
 def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tuple[int, int]]:
-    """Returns pairs (person, match) with the least sum of movements. Pairs are left out if another
-    choice is nearly as short. ways: movement of each person to each match. longest: largest
-    movement.
+    """Returns pairs (person, match) with the smallest sum of movements. A pair is left out if
+    another choice is nearly as short. ways: movement of each person to each match, (n, m). longest:
+    largest allowed movement.
     """
     # longer ways, and those that are not known, are all as unlikely
     ways = np.fmin(ways, _SAME_WAY.far * longest)
@@ -455,8 +465,9 @@ def _plainly_shortest(ways: Float[np.ndarray, "n m"], longest: float) -> list[tu
 def _moved_in_photos(
     before: Sequence[Seen], first: Match, now: Sequence[Seen], second: Match
 ) -> float:
-    """Returns the largest movement that one person would have made in the photos of all cameras
-    that show both matches, a share of the person's size.
+    """Returns how far a person would have moved if two matches were the same person, as a share of
+    the person's size. It is the largest movement in the photos of the cameras that show both
+    matches.
 
     It is infinite if no camera shows both, or if the size in a photo changed too much.
     """
@@ -476,7 +487,7 @@ def _moved_in_photos(
 
 
 def _stands_still(before: Seen, now: Seen) -> bool:
-    """Returns whether two views are of one camera that hardly moved."""
+    """Returns whether two views can be of one camera that hardly moved."""
     first, second = before.cam_from_world[:3], now.cam_from_world[:3]
     turn = first[:, :3] @ second[:, :3].T
     degrees = np.rad2deg(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
@@ -487,8 +498,8 @@ def _stands_still(before: Seen, now: Seen) -> bool:
 
 
 def _box(row: Float[np.ndarray, "k 3"]) -> tuple[Float[np.ndarray, "2"], float]:
-    """Returns the median of the seen landmarks, (2,), pixels, and the longer side of the box around
-    them.
+    """Returns the median of the visible landmarks, (2,), pixels, and the longer side of their
+    bounding box, pixels. If none is visible, all landmarks are used.
     """
     seen = row[row[:, 2] >= _SAME_PERSON.seen, :2]
     seen = seen if len(seen) else row[:, :2]

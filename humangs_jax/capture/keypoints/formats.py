@@ -10,10 +10,10 @@ the set's name, and the names of the v views. `humangs detect` writes the people
             {"presence": 0.99, "pixels": [[x, y], ...], "visibility": [...], "world": [[x, y, z],
             ...]}, null]}]}
 
-world: metres from the middle of the hips in the camera's axes (x right, y down, z away), as if the
-camera looked straight at the person, who is taken to be of average size. The i-th entry of `people`
-is the same person in all images, or null if the person is not in the image. A person may also have
-"hands", see `SeenPerson.hands`.
+"world" has positions in metres from the middle of the hips, in the camera's axes (x right, y down,
+z away). They are as if the camera looked straight at the person, and the person had average size.
+The i-th entry of "people" is the same person in all images, or null if the person is not in the
+image. A person may also have "hands", see `SeenPerson.hands`.
 """
 
 import dataclasses
@@ -53,13 +53,11 @@ from humangs_jax.io.arrays import ArrayFile, write_npz
 from humangs_jax.io.reading import check_limit, limits, shown, write_json
 
 FORMAT = "humangs-people"
-"""Value of the field "format" of the files."""
+"""Value of the field "format" in our JSON files."""
 VERSION = 1
 """Version of the format that is written. No other version is read."""
 _DECIMALS = 4
-"""Number of decimals of numbers in the file: a ten-thousandth of a pixel, a tenth of a
-millimetre.
-"""
+"""Number of decimals in the file. Pixels are rounded to 0.0001, and metres to 0.1 mm."""
 
 
 def recognizes_own(source: KeypointFile) -> bool:
@@ -68,8 +66,8 @@ def recognizes_own(source: KeypointFile) -> bool:
 
 
 def read_own(source: KeypointFile, format: SourceFormat) -> Detections:
-    """Returns the keypoints in one of our files, of one person or of all people. People have
-    confidence 0 in images that they are not in.
+    """Returns the keypoints in one of our files, of one person or of all people. If a person is not
+    in an image, the confidences there are 0.
 
     Raises: CaptureError if the file is not valid.
     """
@@ -146,15 +144,16 @@ class SeenPerson:
     presence: float
     """Probability that there is a person, in [0, 1]."""
     hands: Float[np.ndarray, "42 6"] | None = None
-    """The 21 landmarks of the left and then of the right hand, (42, 6): pixels, confidence, and
-    position in metres. Zeros for a hand that was not seen. None if neither was seen, or hands were
-    not looked for.
+    """The 21 landmarks of the left and then of the right hand, (42, 6). The columns are x and y in
+    pixels, confidence, and x, y and z in metres. The rows of a hand that was not seen are 0. None
+    if neither was seen, or if hands were not looked for.
     """
 
 
 def columns_of(person: SeenPerson | None, hands: bool) -> Float[np.ndarray, "k 6"]:
-    """Returns pixels, confidence and position of a person's points, (k, 6). Zeros for None. The
-    points are those of `MEDIAPIPE_69` if `hands`, else of `MEDIAPIPE_33`.
+    """Returns the points of a person, (k, 6), in the set `MEDIAPIPE_69` if `hands` is True, else in
+    `MEDIAPIPE_33`. The columns are x and y in pixels, confidence, and x, y and z in metres. All are
+    0 if the person is None.
     """
     if person is None:
         kind = MEDIAPIPE_69 if hands else MEDIAPIPE_33
@@ -175,7 +174,7 @@ class ImagePeople:
     size: tuple[int, int]
     """Width and height of the image, pixels."""
     people: tuple[SeenPerson | None, ...]
-    """All people of the photos. None for those who are not in this image."""
+    """One entry for each person in the photos. It is None if the person is not in this image."""
 
 
 def write_people(path: str | Path, images: Sequence[ImagePeople]) -> None:
@@ -216,8 +215,8 @@ def _described(person: SeenPerson) -> dict[str, Any]:
 
 
 def read_people(path: Path, content: Any = None) -> tuple[KeypointSet, tuple[ImagePeople, ...]]:
-    """Returns the set of keypoints and the images of a file of people. content: the JSON value of
-    the file, if it is read already.
+    """Returns the keypoint set and the images of a file of people. content: the JSON value of the
+    file. None: the file is read.
 
     Raises: CaptureError with the name of file and field.
     """
@@ -266,11 +265,13 @@ def _own_person(person: Any, count: int, path: Path, field: str) -> SeenPerson |
 # -----------------------------------------------------------------------------------------------
 
 BODY = "pose_keypoints_2d"
-"""Key of the points of the body."""
+"""Key of the points of the body in OpenPose's files."""
 _BODY_POINTS = (25, 18)
-"""Numbers of points of a body: 25 in the models BODY_25 and BODY_25B, 18 in COCO."""
+"""Possible numbers of points of a body: 25 for the models BODY_25 and BODY_25B, 18 for the model
+COCO.
+"""
 _OTHER_MODELS = {15: "MPI", 135: "BODY_135", 20: "an animal of ControlNet"}
-"""Models that are refused, by their number of points."""
+"""Names of models that cannot be read, by their number of points. They appear in error messages."""
 
 
 def recognizes_openpose(source: KeypointFile) -> bool:
@@ -280,8 +281,8 @@ def recognizes_openpose(source: KeypointFile) -> bool:
 
 
 def read_openpose(source: KeypointFile, format: SourceFormat) -> Detections:
-    """Returns the people of one image, or of the frames of a video in a file with a list of frames.
-    Node-based programs (ControlNet) write such lists.
+    """Returns the people of one image. If the file is a list of frames, it returns the people of
+    each frame of a video. Node-based programs (ControlNet) write such lists.
 
     Raises: CaptureError if the file is not valid.
     """
@@ -309,8 +310,8 @@ def read_openpose(source: KeypointFile, format: SourceFormat) -> Detections:
 
 
 def _canvas(frame: dict[str, Any], file: Path) -> tuple[int, int] | None:
-    """Returns width and height of the image in which the points are, or None if the file does not
-    state them.
+    """Returns width and height of the image that the points refer to, pixels. None if the file does
+    not state them.
     """
     width, height = frame.get("canvas_width"), frame.get("canvas_height")
     if width is None or height is None:
@@ -350,9 +351,9 @@ def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np
 def _parts(
     person: dict[str, Any], counts: dict[str, int], file: Path, field: str
 ) -> Float[np.ndarray, "k 3"]:
-    """Returns the points of all parts of a person, (k, 3). counts: number of points of each part,
-    by its key. Zeros for a part that was not detected: its key is missing, or its value null or an
-    empty list.
+    """Returns the points of all parts of a person, one after the other, (k, 3). The points of a
+    part are 0 if its key is missing, null or an empty list, because the part was not detected.
+    counts: number of points of each part, by its key.
     """
     points = []
     for key, count in counts.items():
@@ -373,9 +374,9 @@ def recognizes_easymocap(source: KeypointFile) -> bool:
 
 
 def read_easymocap(source: KeypointFile, format: SourceFormat) -> Detections:
-    """Returns the people of one image. Person i has the personID i, if this is a whole number from
-    0 to 63 that no person before it has. People with other IDs get the lowest numbers that are
-    left.
+    """Returns the people of one image, ordered by their personID. An ID counts if it is a whole
+    number from 0 to 63 and no earlier person has it. People without such an ID get the lowest
+    numbers that are free.
 
     Raises: CaptureError if the file is not valid.
     """
@@ -412,7 +413,7 @@ def read_easymocap(source: KeypointFile, format: SourceFormat) -> Detections:
 def _part(
     entry: dict[str, Any], key: str, count: int | None, file: Path, field: str
 ) -> Float[np.ndarray, "k 3"]:
-    """Returns the points of a part of a person, (k, 3). Zeros if the part is missing or empty.
+    """Returns the points of a part of a person, (k, 3). They are 0 if the part is missing or empty.
     count: number of points. None: any number.
     """
     if not entry.get(key):
@@ -430,7 +431,9 @@ _COCO_PARTS = {
     "lefthand_kpts": 21,
     "righthand_kpts": 21,
 }
-"""Keys and numbers of points of COCO-WholeBody's parts, in the order of its 133 points."""
+"""Number of points of each part of COCO-WholeBody, by its key. Parts are in the order of the 133
+points.
+"""
 
 
 def recognizes_coco(source: KeypointFile) -> bool:
@@ -446,8 +449,8 @@ def recognizes_coco(source: KeypointFile) -> bool:
 
 
 def read_coco(source: KeypointFile, format: SourceFormat) -> Detections:
-    """Returns the people of all images of a file. Images of a list of results come in the order in
-    which they first appear.
+    """Returns the people of all images of a file. If the file is a list of results, images are in
+    the order in which they first appear.
 
     Raises: CaptureError if the file is not valid.
     """
@@ -507,8 +510,8 @@ def _image_label(value: Any, file: Path, field: str) -> str | int:
 
 
 def _whole_body(entries: list[Any]) -> bool:
-    """Returns whether some person has a part of COCO-WholeBody besides the body. Then people
-    without such a part get its points with confidence 0.
+    """Returns whether any person has a part of COCO-WholeBody in addition to the body. If so,
+    people without a part get its points with confidence 0.
     """
     return any(
         isinstance(entry, dict) and len(_COCO_PARTS.keys() & entry.keys()) > 1 for entry in entries
@@ -527,10 +530,12 @@ def _coco_person(
 def _by_visibility(
     person: Float[np.ndarray, "k 3"], file: Path, field: str
 ) -> Float[np.ndarray, "k 3"]:
-    """Converts visibilities of a person's points to confidences: 1 for a visible point, 0.5 for a
-    hidden one, 0 for one without annotation. person: (k, 3).
+    """Returns the points of a person, (k, 3), with confidences in place of COCO's visibilities. The
+    confidence is 1 for a visible point, 0.5 for a hidden one, and 0 for one without annotation.
+    person: x, y and visibility, (k, 3).
 
-    Fractions occur in COCO-WholeBody, where any value above 0 means reliable.
+    COCO-WholeBody also has fractions as visibilities, and any value above 0 means that the point is
+    reliable.
     Raises: CaptureError for values outside of 0 to 2.
     """
     visibility = person[:, 2]
@@ -545,10 +550,10 @@ def _by_visibility(
 
 
 def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
-    """Returns width and height that the file states for an image, pixels, or None if one of them is
-    0 or missing.
+    """Returns width and height that the file states for an image, pixels. None if one of them is 0
+    or missing.
 
-    Raises: CaptureError for values that are no size.
+    Raises: CaptureError if the values cannot be a size.
     """
     width, height = size = image.get("width"), image.get("height")
     if not width or not height:
@@ -564,12 +569,12 @@ def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
 # ----------------------------------------------------------------------------------
 
 _PREFIX = "results_"
-"""Prefix of the demo scripts before the name of the image."""
+"""MMPose's demo scripts put this before the name of the image."""
 
 
 def recognizes_mmpose(source: KeypointFile) -> bool:
-    """Returns whether a file has a list of instances or frames. An empty list counts, although
-    another program may have written it.
+    """Returns whether a file has a list of instances or frames. An empty list is accepted, too,
+    although another program may have written it.
     """
     entries = _entries(source)
     if not isinstance(entries, list):

@@ -1,5 +1,5 @@
-"""Keypoints in memory, of a capture's views and as files have them, and the sets of points that
-detectors are trained on.
+"""Keypoints in memory: the keypoints of a capture's views, the keypoints in a file, and the sets of
+points that detectors are trained on.
 
 The names of points are, with `side` left or right (the person's own):
 
@@ -43,7 +43,7 @@ SIDES = ("left", "right")
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 """Fingers in the order of OpenPose's hands."""
 _FACE_POINTS = 68
-"""Number of 300-W's landmarks of the face."""
+"""Number of face landmarks in 300-W."""
 
 _FOOT = ("big_toe", "small_toe", "heel")
 _FEET = tuple(f"{side}_{part}" for side in SIDES for part in _FOOT)
@@ -74,22 +74,22 @@ class KeypointSet:
     names: tuple[str, ...]
     """Names of the k points."""
     mirror: tuple[int, ...]
-    """Index of each point's mirror image. A point in the middle of the body is its own mirror
+    """Index of each point's mirror image, (k,). A point in the middle of the body is its own mirror
     image.
     """
     places: tuple[LandmarkDefinition, ...] = ()
-    """Places on the body of points that may lie elsewhere than `body.landmarks` has them: where the
-    detector is known to see them, or a fit has found that it does.
+    """Where points lie on the body, if this can differ from `body.landmarks`. The detector is known
+    to see a point elsewhere, or a fit can find that it does.
     """
     certainty: tuple[float, ...] = ()
-    """Certainty of each point, (k,): the noise of all points over its noise, as a fit has found it.
-    If it is empty, `usual_certainty` holds.
+    """Certainty of each point as a fit has found it, (k,). It is the noise of all points, divided
+    by the noise of this one. If it is empty, `usual_certainty` is used.
     """
 
     @property
     def offsets(self) -> Float[np.ndarray, "k 3"]:
-        """Offsets of the points' places on the body, (k, 3), metres. 0 for points without a
-        place.
+        """Offset of each point in `places`, (k, 3), metres. It is 0 for points that are not in
+        `places`.
         """
         known = {place.name: place.offset for place in self.places}
         return np.asarray([known.get(name, (0.0, 0.0, 0.0)) for name in self.names])
@@ -97,8 +97,8 @@ class KeypointSet:
     def adapted(
         self, offsets: Float[np.ndarray, "k 3"], certainty: Float[np.ndarray, " k"]
     ) -> "KeypointSet":
-        """Returns the set with places and certainty as a fit has found them. offsets: offsets of
-        all points, (k, 3), metres. Those of points without a place are ignored.
+        """Returns the set with the offsets and certainties that a fit has found. offsets: offsets
+        of all points, (k, 3), metres. Offsets of points that are not in `places` are ignored.
         """
         own = dict(zip(self.names, np.asarray(offsets, float).tolist(), strict=True))
         places = tuple(place._replace(offset=tuple(own[place.name])) for place in self.places)
@@ -141,8 +141,8 @@ COCO_WHOLEBODY_133 = _keypoint_set(
         *hand_names("right"),
     ),
 )
-"""COCO-WholeBody's 133 points: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the
-left and 21 of the right hand.
+"""The 133 points of COCO-WholeBody: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of
+the left hand and 21 of the right hand.
 """
 
 HALPE_26 = _keypoint_set(
@@ -155,8 +155,8 @@ HALPE_26 = _keypoint_set(
         *(f"{side}_{part}" for part in _FOOT for side in SIDES),
     ),
 )
-"""Halpe's 26 points of the body, which AlphaPose and RTMPose use: COCO's 17, three in the middle of
-the body, and six of the feet.
+"""Halpe's 26 points of the body, which AlphaPose and RTMPose use. They are COCO's 17 points, three
+in the middle of the body, and six of the feet.
 """
 
 HALPE_136 = _keypoint_set(
@@ -168,12 +168,12 @@ HALPE_136 = _keypoint_set(
         *hand_names("right"),
     ),
 )
-"""Halpe's 136 points, which AlphaPose uses: the 26 of the body, 68 of the face, 21 of the left and
+"""Halpe's 136 points, which AlphaPose uses: 26 of the body, 68 of the face, 21 of the left hand and
 21 of the right hand.
 """
 
 OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
-"""OpenPose's BODY_25 with its left and right hand.
+"""The points of OpenPose's BODY_25, and of its left and right hand.
 
 OpenPose's 70 points of the face are not in this set, and are ignored.
 """
@@ -188,9 +188,9 @@ OPENPOSE_67B = _keypoint_set(
     "openpose_b67",
     (*_COCO, "upper_neck", "head_top", *_FEET, *hand_names("left"), *hand_names("right")),
 )
-"""OpenPose's BODY_25B with its left and right hand.
+"""The points of OpenPose's BODY_25B, and of its left and right hand.
 
-Files do not tell if they have BODY_25 or BODY_25B, see `orders`.
+Files do not state whether they have BODY_25 or BODY_25B, see `orders`.
 """
 
 
@@ -247,8 +247,8 @@ MEDIAPIPE_33 = _keypoint_set(
     ),
     _BLAZEPOSE_PLACES,
 )
-"""MediaPipe's 33 points (BlazePose). The corners of the eyes and of the mouth have the names of the
-face's points.
+"""MediaPipe's 33 points (BlazePose). Corners of eyes and mouth have the names of the corresponding
+face points.
 """
 
 _COARSE = ("pinky_1", "index_1", "thumb_2")
@@ -258,8 +258,8 @@ MEDIAPIPE_69 = _keypoint_set(
     (*(name for name in MEDIAPIPE_33.names if name.split("_", 1)[-1] not in _COARSE), *_HANDS),
     tuple(each for each in _BLAZEPOSE_PLACES if each.name.split("_", 1)[-1] not in _COARSE),
 )
-"""BlazePose's points without those of the hands, and mediapipe's 21 of the left and of the right
-hand.
+"""BlazePose's points except its three points of each hand, then mediapipe's 21 points of the left
+hand, and its 21 points of the right hand.
 """
 
 _DETECTORS = (
@@ -274,13 +274,13 @@ _DETECTORS = (
     MEDIAPIPE_69,
 )
 KEYPOINT_SETS = {each.name: each for each in _DETECTORS}
-"""All sets by name, as our npz files name them."""
+"""All sets by name. Our npz files use these names."""
 SETS_BY_COUNT = {
     len(each.names): each for each in (COCO_17, HALPE_26, COCO_WHOLEBODY_133, HALPE_136)
 }
 """Sets by their number of points, for lists of points without names.
 
-OpenPose's sets are not here: its files keep body and hands apart.
+OpenPose's sets are missing here, because its files have body and hands in separate lists.
 """
 
 
@@ -294,7 +294,7 @@ class Keypoints:
 
     points: Float[np.ndarray, "v k 2"]
     """Detected points, (v, k, 2), float32, pixels: x right and y down, with the centre of the first
-    pixel at (0.5, 0.5). They are finite, and have to be ignored where the confidence is 0.
+    pixel at (0.5, 0.5). They are finite. Points with confidence 0 have to be ignored.
     """
     confidences: Float[np.ndarray, "v k"]
     """Confidences, (v, k), float32 in [0, 1]. 0 where the point is missing."""
@@ -303,9 +303,9 @@ class Keypoints:
     missing: tuple[str, ...] = ()
     """Names of the views without a usable point."""
     world: Float[np.ndarray, "v k 3"] | None = None
-    """The detector's 3D landmarks, (v, k, 3), metres, of a person of average size. The z axis is
-    the ray to the person, and the translation is arbitrary. None if the detector has no such
-    landmarks.
+    """The detector's 3D landmarks, (v, k, 3), metres, for a person of average size. The z axis is
+    the ray from the camera to the person, and the translation is arbitrary. None if the detector
+    has no such landmarks.
     """
     warnings: tuple[str, ...] = ()
     """Problems of a file that could still be read, one line each."""
@@ -313,7 +313,7 @@ class Keypoints:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class DetectedImage:
-    """The people that a file has in one image."""
+    """The people in one image of a file."""
 
     image: str | int
     """Name or path of the image as the file has it. A number if the file has only numbers."""
@@ -321,7 +321,7 @@ class DetectedImage:
     """File from which the people were read."""
     people: tuple[Float[np.ndarray, "k columns"], ...]
     """Points of each person, (k, 3) or (k, 6), not yet checked. The columns are x and y in the
-    pixels of the tool, confidence, and if there are six the 3D landmark, see `Keypoints.world`.
+    tool's pixels, and confidence. If there are six, the 3D landmark follows, see `Keypoints.world`.
     Missing numbers are NaN.
     """
     size: tuple[int, int] | None = None
@@ -337,42 +337,44 @@ class Detections:
     images: tuple[DetectedImage, ...]
     """The images, in the order of the file."""
     offset: float = 0.5
-    """Pixels that have to be added to x and y so that pixel centres are at +0.5. All tools whose
-    files we read have the centre of the first pixel at 0.
+    """Number that has to be added to x and y so that pixel centres are at +0.5, pixels. It is 0.5
+    for other tools, which have the centre of the first pixel at 0, and 0 for our files.
     """
     warnings: tuple[str, ...] = ()
     """Problems of the files, one line each."""
     tool: str = ""
-    """Name of the tool that has written the files. Empty if they do not say."""
+    """Name of the tool that wrote the files. Empty if the files do not state it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KeypointFile:
-    """A file that is given to a reader of a format."""
+    """A file of keypoints, as the readers of all formats get it."""
 
     path: Path
     """Path of the file."""
     name: str
-    """Name of the image or video that the file may be about: its path in the folder, without the
-    suffix.
+    """Path of the file within the folder, without the suffix. In some formats it is the name of the
+    image or video.
     """
     alone: bool
-    """Whether this is the only file that is read. Then the frames of a video are known by their
-    number, else by name/number.
+    """Whether no other file is read. If so, the frames of a video are named by their number. If
+    not, they are named name/number.
     """
 
     @functools.cached_property
     def json(self) -> Any:
-        """The JSON value of the file. None if its suffix is that of another format.
+        """The JSON value of the file. None if the file's suffix belongs to a format that is not
+        JSON.
 
-        Raises: CaptureError if it is not valid JSON.
+        Raises: CaptureError if the file is not valid JSON.
         """
         return None if self.path.suffix.lower() in KEYPOINTS.suffixes else checked_json(self.path)
 
 
 def detections_of(images: Sequence[DetectedImage], *more: KeypointSet) -> Detections:
-    """Returns detections with the keypoint set that has as many points as a person. The set is None
-    if there is no person. more: sets besides those of `SETS_BY_COUNT`.
+    """Returns detections of these images, with the keypoint set that has the right number of
+    points. The set is None if there is no person. more: sets to choose from in addition to
+    `SETS_BY_COUNT`.
 
     Raises: CaptureError if no set has this number of points, or if people have different numbers.
     """
@@ -398,10 +400,10 @@ def triples(
     value: Any, file: Path, field: str, count: int | None = None
 ) -> Float[np.ndarray, "k 3"]:
     """Returns x, y and confidence of each point, (k, 3), from a flat list of numbers. null becomes
-    NaN. count: number of points. None: any.
+    NaN. count: number of points. None: any number.
 
-    Raises: CaptureError if these are no numbers, or not 3 * count (a multiple of 3 if count is
-    None).
+    Raises: CaptureError if the list has other values than numbers and null, or not 3 numbers for
+    each point.
     """
     array = file_numbers(value, file, field, nulls=True)
     wanted = "a multiple of 3" if count is None else f"{3 * count} ({count} times x, y, confidence)"
@@ -415,9 +417,10 @@ def triples(
 def with_hands(
     body: Float[np.ndarray, "33 *c"], hands: Sequence[Float[np.ndarray, "21 *c"] | None]
 ) -> Float[np.ndarray, "69 *c"]:
-    """Joins the values of BlazePose and of the left and the right hand to those of `MEDIAPIPE_69`.
+    """Returns the values of the points of `MEDIAPIPE_69`, (69, ...), from the values of BlazePose's
+    points and of the points of the left and the right hand.
 
-    A hand that is None has zeros, except for the points that BlazePose has.
+    If a hand is None, its values are 0, except for the points that BlazePose has, too.
     """
     names = MEDIAPIPE_33.names
     found = np.zeros((len(MEDIAPIPE_69.names), *body.shape[1:]), body.dtype)

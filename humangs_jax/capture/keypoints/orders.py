@@ -1,5 +1,6 @@
-"""Finds the order of OpenPose's points, which its files do not tell. 25 points are those of BODY_25
-or BODY_25B. 18 points are those of OpenPose's COCO model, or COCO's 17 points and a neck.
+"""Finds the order of OpenPose's points, because its files do not state it. 25 points are either
+BODY_25's or BODY_25B's. 18 points are either those of OpenPose's model COCO, or COCO's 17 points
+and a neck.
 
 In the right order the bones are shortest on average. In a wrong order a bone can lead from a knee
 to a wrist.
@@ -25,15 +26,15 @@ from humangs_jax.core.array_types import Float
 
 
 class Order(NamedTuple):
-    """An order of the points of the body."""
+    """A possible order of the points of the body."""
 
     name: str
     """Name of the order."""
     points: tuple[str, ...]
     """Names of the points, in this order."""
     set: KeypointSet
-    """Set that the points are converted to. It has the same points of the body, perhaps in another
-    order, and then hands.
+    """Set to which the points are converted. It has the same points of the body, perhaps in another
+    order, and then the points of the hands.
     """
 
 
@@ -47,7 +48,7 @@ _ORDERS = {
         Order("COCO with a neck", (*COCO_17.names, "neck"), OPENPOSE_60),
     ),
 }
-"""Possible orders by the number of points, the usual one first."""
+"""Possible orders, by the number of points. The usual order comes first."""
 _BONES = (
     *(("nose", f"{side}_eye") for side in SIDES),
     *((f"{side}_eye", f"{side}_ear") for side in SIDES),
@@ -68,29 +69,30 @@ _BONES = (
 
 @dataclasses.dataclass(frozen=True)
 class _Known:
-    """Limits that decide if points tell which order they have."""
+    """Limits that decide whether the order of points is clear from their positions."""
 
     shorter: float = 1.15
-    """Least ratio of the bones' mean lengths in any other order and in the order that is found. It
-    is larger for 99 % of single people in random poses, seen from anywhere, with errors of 1 % of
-    their height.
+    """An order is clear only if every other order makes the mean length of the bones larger by at
+    least this factor. It does so for 99 % of single people in random poses, seen from anywhere,
+    with errors of 1 % of their height.
     """
     longest: float = 0.36
-    """Largest mean length of bones in the order that is found, sizes of a person. It is 0.13 to 0.3
-    for people in random poses, 0.25 to 0.35 if only the trunk is seen, and 0.52 for points without
-    an order.
+    """An order is clear only if the mean length of its bones is at most this, as a share of the
+    person's size. It is 0.13 to 0.3 for people in random poses, 0.25 to 0.35 if only the trunk is
+    seen, and 0.52 for points in random order.
     """
     fewest: int = 6
-    """Least number of bones of all people together. With fewer, no order is found."""
+    """An order is clear only if all people together show at least this many bones."""
     confident: float = 0.1
-    """Confidence above which a point is used."""
+    """A point is used if its confidence exceeds this number."""
 
 
 KNOWN = _Known()
 
 
 def in_order(detections: Detections, count: int) -> Detections:
-    """Returns detections whose order of points was found, with the set and the order of its points.
+    """Returns detections with the right keypoint set, and with the points in the order of this set.
+    The order of the given points is found from their positions.
 
     count: number of points of the body, 25 or 18. Points of the hands may follow. If the order is
     not clear, the usual one is assumed. A warning names the order, except if 25 points are clearly
@@ -130,8 +132,8 @@ def _order_note(order: Order, known: bool, count: int) -> str:
 def _mean_bone(
     people: Sequence[Float[np.ndarray, "k columns"]], names: tuple[str, ...], count: int
 ) -> float:
-    """Returns the mean length of the bones in an order, in sizes of their person. It is infinite if
-    there are too few bones. names: names of the points in this order.
+    """Returns the mean length of the bones in an order, as a share of the person's size. It is
+    infinite if there are too few bones. names: names of the points in this order.
     """
     index = {name: i for i, name in enumerate(names)}
     pairs = np.asarray([[index[a], index[b]] for a, b in _BONES if a in index and b in index])

@@ -1,5 +1,5 @@
-"""Reads the keypoints of a capture's views from a detector's file: finds the image of each view,
-and the one person in it.
+"""Reads the keypoints of a capture's views from a detector's file. Finds the image of each view,
+and the person in it.
 """
 
 import collections
@@ -30,47 +30,47 @@ from humangs_jax.io.images import PHOTO_SUFFIXES
 from humangs_jax.io.reading import check_limit, reading, walk
 
 _TRUNK_AND_LIMBS = frozenset(COCO_17.names)
-"""Points that tell people from ghosts, which are false finds of a detector. Points of hands and
-feet, and the 68 points of the face, do not count. Detectors leave them out where they are small, or
-were not asked for them.
+"""Points that distinguish people from ghosts, which are false detections. Points of hands and feet,
+and the 68 points of the face, do not count, because detectors leave them out if they are small or
+were not asked for.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class _Plausible:
-    """Limits of numbers that can be pixels and scores of keypoints."""
+    """Limits for numbers that can be pixels or scores of keypoints."""
 
     least_extent: float = 2.0
-    """Least size of the largest coordinate of all views, pixels. If it is smaller, the coordinates
-    are shares of the image.
+    """If no coordinate in any view reaches this, coordinates are not pixels but shares of the
+    image, and are refused. Pixels.
     """
     largest_pixel: float = 1e6
-    """Largest coordinate, pixels. Larger ones mean nothing, and are replaced by this one, because
-    they could become inf in float32.
+    """Larger coordinates are replaced by this one, because they could become inf in float32. They
+    have no meaning. Pixels.
     """
     outside: float = 0.5
     """Largest distance of a point from its image, as a share of the image's size. Detectors
-    extrapolate a little beyond the image, but points further out mean nothing.
+    extrapolate a little beyond the image, but points farther out have no meaning.
     """
     overshoot: float = 1.1
-    """Largest score on the scale [0, 1]. Heat maps overshoot 1 a little (1.02 is common) and
-    undershoot 0. Larger scores are on another scale, such as the maxima of SimCC heads (RTMPose,
-    RTMW, DWPose), and are divided by the largest of the file.
+    """Up to this score, scores are on the scale [0, 1]. Heat maps exceed 1 a little (1.02 is
+    common) and can be below 0. If a file has larger scores, such as the maxima of SimCC heads
+    (RTMPose, RTMW, DWPose), all of its scores are divided by the largest.
     """
     largest_score: float = 20.0
     """Largest number that can be a score."""
     smallest_score: float = -1.0
-    """Least number that can be a score."""
+    """Smallest number that can be a score."""
 
 
 _PLAUSIBLE = _Plausible()
 
 
 def read_detections(path: Path) -> Detections:
-    """Returns the people in the images of a file or folder. Its content decides which format of
-    `KEYPOINTS` it has.
+    """Returns the people in the images of a file or folder. The format is one of `KEYPOINTS`, and
+    is found from the content.
 
-    All JSON files in a folder and its sub-folders are read together.
+    If it is a folder, all JSON files in it and in its subfolders are read together.
     Raises: CaptureError if there is no such file or folder, or if the content is not valid.
     InvalidFileError if a limit is exceeded.
     """
@@ -143,17 +143,17 @@ def read_keypoints(
         names: names of the capture's views. Images of the file are matched by name, or by the
             number in the name if the file has only numbers. Images that match no view are ignored.
         width, height: size of the capture's photos, pixels. The keypoints have to be in photos of
-            this size, or in photos of several sizes that were padded to it when they were imported.
-        person: number of the person to take where several people are seen, from 0 in the order of
-            the file. None: the only person.
+        this size, or in photos of several sizes that were padded to it when they were imported.
+        person: number of the person to take if several people are seen, from 0 in the order of the
+            file. None: the only person.
 
     Returns: keypoints of v views and k points. Views without a usable point have confidence 0 and
     are in `missing`.
 
-    Raises: CaptureError, one line with file and field, if the file is damaged or has no known
-    format, if its images match no view or have another size, if it shows several people and
-    `person` is None, if no view has the person, or if no point is usable. ArgumentError if `person`
-    is negative.
+    Raises: CaptureError, one line with file and field. It is raised if the file is damaged or has
+    no known format, if its images match no view or have another size, if it shows several people
+    and `person` is None, if no view has the person, or if no point is usable. ArgumentError if
+    `person` is negative.
     """
     path = Path(path)
     if person is not None and person < 0:
@@ -167,7 +167,7 @@ def read_keypoints(
 def _read(
     path: Path, names: Sequence[str], width: int, height: int, person: int | None
 ) -> Keypoints:
-    """Does what `read_keypoints` describes, once its arguments are checked."""
+    """Returns the result of `read_keypoints`, after its arguments were checked."""
     detections = read_detections(path)
     if detections.set is None:
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
@@ -211,8 +211,8 @@ def _read(
 
 
 def _largest_score(detections: Detections) -> float:
-    """Returns the score that counts as confidence 1. This is the largest score of the file if
-    scores are on another scale than [0, 1], else 1.
+    """Returns the score that becomes confidence 1. It is 1 if scores are on the scale [0, 1], else
+    the largest score of the file.
     """
     scores = np.concatenate([each[:, 2] for image in detections.images for each in image.people])
     largest = float(scores[np.isfinite(scores)].max(initial=0.0))
@@ -227,12 +227,12 @@ def _chosen_people(
     kind: KeypointSet,
     person: int | None,
 ) -> list[int | None]:
-    """Returns the index of the chosen person in each view, or None for a view without this person.
-    The chosen person has the number `person`. If this is None, it is the person with the most
-    confidence, and all others have to be ghosts.
+    """Returns the index of the chosen person in each view. None if the view does not show this
+    person. If `person` is given, it is the index. If it is None, the person with the largest sum of
+    confidences is chosen, and all others have to be ghosts.
 
-    Raises: CaptureError if `person` is None and a view shows several people, or if no view has the
-    number.
+    Raises: CaptureError if `person` is None and a view shows several people, or if no view has so
+    many people.
     """
     body = np.asarray([name in _TRUNK_AND_LIMBS for name in kind.names])
     chosen: list[int | None] = []
@@ -261,9 +261,9 @@ def _chosen_people(
 def _check_pixels(
     path: Path, detections: Detections, points: Float[np.ndarray, "n 2"], dropped: int, far: int
 ) -> None:
-    """Checks that there are usable points, and that their coordinates are pixels. dropped: number
-    of points that were left out because they are not finite. far: number of points left out because
-    they are far outside of the photos.
+    """Checks that there are usable points, and that their coordinates are pixels. points: all
+    usable points, (n, 2). dropped: number of points that were left out because they are not finite.
+    far: number of points that were left out because they are far outside of the photos.
 
     Raises: CaptureError.
     """
@@ -281,8 +281,8 @@ def _check_pixels(
 
 
 def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> str:
-    """Returns a line about the first image whose number differs from the number of its view,
-    because they are counted from different numbers. "" if there is no such image.
+    """Returns a line about the first image with another number than its view. The numbers differ if
+    images and views are counted from different numbers. "" if there is no such image.
     """
     for image, name in zip(images, names, strict=True):
         if image is None:
@@ -340,8 +340,8 @@ def _images_of_views(
 
 
 def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
-    """Returns whether a find of a detector is a person and not a ghost. confidences: confidences of
-    the points in `_TRUNK_AND_LIMBS`, (k,).
+    """Returns whether a detection is a person and not a ghost. confidences: confidences of the
+    points in `_TRUNK_AND_LIMBS`, (k,).
     """
     present = confidences[confidences > 0]
     # a person has more than a quarter of them, with a mean confidence of more than 0.3
@@ -352,11 +352,11 @@ def _usable_people(
     image: DetectedImage | None, view: str, offset: float, largest: float, size: tuple[int, int]
 ) -> Float[np.ndarray, "p k columns"] | None:
     """Returns the people of an image, (p, k, columns), with pixel centres at +0.5 and all numbers
-    finite. Confidences are in [0, 1], and 0 for points that cannot be used. None if there is
+    finite. Confidences are in [0, 1]. They are 0 for points that cannot be used. None if there is
     nobody.
 
-    Arguments: offset: pixels that are added to the points. largest: score that counts as confidence
-    1. size: width and height of the photo, pixels.
+    Arguments: offset: number that is added to x and y, pixels. largest: score that becomes
+    confidence 1. size: width and height of the photo, pixels.
     Raises: CaptureError for numbers that cannot be scores.
     """
     if image is None or not image.people:
@@ -381,17 +381,19 @@ def _usable_people(
 
 
 def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int | None]:
-    """Returns for each image the index of its view, None for images that match no view.
+    """Returns for each image the index of its view. None if the image matches no view.
 
-    Views have names like "front", "000012" or, where that would be ambiguous, "images_cam0_000012"
-    (folders joined by _). Images of keypoint files have names like "front.jpg", "cam0/000012.png"
-    and "cam0_000000000012" (OpenPose counts a video's frames in twelve digits), or are mere numbers
-    (COCO's image ids, the frames of a video).
+    Views have names like "front" or "000012". If these would be ambiguous, the names are like
+    "images_cam0_000012", with folders joined by _. Images of keypoint files have names like
+    "front.jpg", "cam0/000012.png" and "cam0_000000000012" (OpenPose counts a video's frames in
+    twelve digits). Or they are only numbers (COCO's image ids, the frames of a video).
 
-    The frames of a video may be counted from 0 and its photos from 1 (ffmpeg), or the other way
-    round. If there are as many frames as photos, without gaps, they are matched in order, for each
-    video separately. Mere numbers are matched in order, wherever they begin, if there is one for
-    every view, and neither they nor the last numbers in the views' names have gaps.
+    Frames of a video may be counted from 0 and its photos from 1 (ffmpeg), or the reverse. If there
+    are as many frames as photos, without gaps, they are matched in order, for each video
+    separately.
+
+    Images that are only numbers are matched in order, whatever the first number is, if there is one
+    for every view, and if neither these numbers nor the last numbers in the views' names have gaps.
 
     Raises: ValueError if two images match one view, or if a number matches two views.
     """
@@ -422,8 +424,9 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
 
 
 def _shift_of_numbers(images: Sequence[str | int], names: Sequence[str]) -> int:
-    """Returns the difference between the numbers in the views' names and mere numbers of images. It
-    is 0, unless there is one number for every view and neither numbers nor names have gaps.
+    """Returns what has to be added to images that are only numbers to get the numbers in the views'
+    names. It is 0, unless there is one such image for every view, and neither images nor names have
+    gaps in their numbers.
     """
     numbers = sorted({image for image in images if isinstance(image, int)})
     of_names = sorted(number for number in map(_last_number, names) if number is not None)
@@ -438,8 +441,9 @@ def _recounted_videos(
     names: Sequence[str],
     find: Callable[[str | int], list[int]],
 ) -> dict[str | int, list[int]]:
-    """Returns the views of frames in videos that are counted from 0 where the photos are counted
-    from 1, or the other way round. found: the views of each image by its name.
+    """Returns the views of video frames that are counted from 0 if the photos are counted from 1,
+    or the reverse. The key is the image's name. Other images are left out. found: the views of each
+    image without such a correction.
     """
     videos: dict[str, list[tuple[int, str]]] = {}
     for image in found:
@@ -468,8 +472,8 @@ def _recounted_videos(
 
 
 def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
-    """Returns a function that finds the views of an image by its name or number. For a name it
-    finds one view or none. For a number it may find several.
+    """Returns a function that finds the views of an image from its name or number. For a name it
+    returns one view or none. For a number it may return several.
     """
     exact = {name: [i] for i, name in enumerate(names)}
     plain, ends, numbers = (collections.defaultdict(list) for _ in range(3))
@@ -516,7 +520,7 @@ def _split_number(name: str) -> tuple[str, int | None]:
 
 
 def _last_number(name: str) -> int | None:
-    """Returns the last number in a name, None if it has none."""
+    """Returns the last number in a name. None if the name has no number."""
     found = re.findall(r"\d+", name)
     return int(found[-1]) if found else None
 

@@ -1,5 +1,5 @@
 """Keypoints as evidence: observations and their residuals. Observations have fixed shapes, so that
-frames and people can be vmapped.
+they can be vmapped over frames and people.
 """
 
 import dataclasses
@@ -34,29 +34,29 @@ from humangs_jax.geometry.transform import EXACT
 
 AnyArray = Float[Array, "m c ..."] | Float[np.ndarray, "m c ..."]
 NEAR = 0.05
-"""Least depth, metres. Smaller depths are clamped to it."""
+"""Smallest depth, metres. Smaller depths are clamped to it."""
 NOISE = 0.005
-"""Expected standard deviation of detections, a share of the person's height in the photo: 2 pixels
-of 400.
+"""Expected standard deviation of detections, as a share of the person's height in the photo. It is
+2 pixels for a person of 400 pixels.
 """
 LEAST_NOISE = 0.3
-"""Least expected standard deviation of detections, pixels."""
+"""The expected standard deviation of detections is at least this, pixels."""
 OUTER = (0.03, 0.97)
-"""Quantiles of the coordinates between which a person's size is measured, so that outliers do not
-count.
+"""A person's size is measured between these two quantiles of the coordinates, so that outliers do
+not count.
 """
 _NOISE_RANGE = (0.5, 8.0)
-"""Bounds of the noise that a fit finds, multiples of the expected noise."""
+"""Smallest and largest noise that a fit can find, as multiples of the expected noise."""
 PLACE_STD = 0.02
-"""Standard deviation of the difference between the place where a detector sees a landmark and the
-expected place, along each axis, metres.
+"""Standard deviation, along each axis, of the difference between where a detector sees a landmark
+on the body and where it is expected, metres.
 """
 _WORLD_STD = 0.15
-"""Standard deviation of a detector's 3D landmarks, a share of the root mean square of their
-distances from their mean.
+"""Standard deviation of a detector's 3D landmarks, as a share of the person's size. The size is the
+root mean square distance of the landmarks from their mean.
 """
 RAYLEIGH_MEDIAN = 1.1774
-"""Median length of a vector whose two components have a standard deviation of 1."""
+"""Median length of a 2D vector with two normal components of standard deviation 1."""
 
 
 @pytree_dataclass
@@ -86,8 +86,8 @@ def make_observations(
     cam_from_world: AnyArray,
     world: AnyArray | None = None,
 ) -> Observations:
-    """Returns a batch of m frames from arrays (m, c, ...), with the expected noise of their
-    keypoints.
+    """Returns a batch of m frames from arrays (m, c, ...). The noise of each frame is computed from
+    the keypoints, see `expected_noise`.
     """
     noise = expected_noise(np.asarray(points), np.asarray(confidences))
     given = [points, confidences, K, cam_from_world, noise]
@@ -97,8 +97,8 @@ def make_observations(
 
 
 def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -> Observations:
-    """Returns keypoints of photos in pixels of resized photos, a batch with one view each (c = 1).
-    All views have the same noise, which is expected of the views together.
+    """Returns keypoints of photos, in pixels of resized photos. The result is a batch of views with
+    c = 1. All views have the same noise, computed from all of them together.
 
     cameras: cameras of the resized photos. photos: cameras of the photos.
     """
@@ -118,9 +118,9 @@ def scaled_observations(cameras: Camera, keypoints: Keypoints, photos: Camera) -
 def group_by_frame(
     photos: Photos | Capture, keypoints: Keypoints
 ) -> tuple[Observations, Int[np.ndarray, "m c"]]:
-    """Groups the keypoints of views by frame. Returns a batch of m frames, and the index of each
-    frame's views, (m, c). The index is -1 where a frame has fewer views than others. 3D landmarks
-    are kept only if every frame has one view.
+    """Returns the keypoints as a batch of m frames, and the indices of each frame's views, (m, c).
+    If a frame has fewer views than others, the remaining indices are -1. 3D landmarks are kept only
+    if every frame has one view.
     """
     frames, count = np.asarray(photos.frames), photos.frame_count
     # frames with fewer views than others have missing ones, whose keypoints have confidence 0
@@ -150,10 +150,10 @@ def in_camera_axes(
     weights: Float[np.ndarray, "*b k"],
     K: Float[np.ndarray, "*b 3 3"],
 ) -> Float[np.ndarray, "*b k 3"]:
-    """Returns landmarks in the axes of their camera, (..., k, 3).
+    """Returns a detector's 3D landmarks in the axes of the camera, (..., k, 3).
 
-    world: the landmarks in axes whose z axis is the camera's ray to the weighted mean of the
-    points. points: pixels, (..., k, 2). weights: (..., k). K: intrinsics, (..., 3, 3), pixels.
+    world: landmarks in axes that have z along the ray from the camera through the weighted mean of
+    `points`. points: pixels, (..., k, 2). weights: (..., k). K: intrinsics, (..., 3, 3), pixels.
     """
     total = weights.sum(-1, keepdims=True)
     middle = (weights[..., None] * points).sum(-2) / np.maximum(total, 1e-9)
@@ -169,8 +169,9 @@ def in_camera_axes(
 def expected_noise(
     points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]
 ) -> Float[np.ndarray, " m"]:
-    """Returns the expected noise of each frame, (m,), pixels. It follows from the median size of
-    the person in the views, and is at least `LEAST_NOISE`. It is 1 where nothing is seen.
+    """Returns the expected noise of the keypoints in each frame, (m,), pixels. It is proportional
+    to the median size of the person in the views, and at least `LEAST_NOISE`. It is 1 if nothing is
+    seen.
     """
 
     def of_frame(points, seen):
@@ -187,11 +188,12 @@ def expected_noise(
 
 
 def found_noise(lengths: Array | np.ndarray, expected: Array | np.ndarray | np.floating) -> Any:
-    """Returns the noise of keypoints, estimated from the median of the lengths of their errors,
-    which outliers hardly change. It stays within `_NOISE_RANGE` times the expected noise.
+    """Returns the noise of keypoints. It is estimated from the median length of their errors, so
+    that outliers hardly change it. It stays within `_NOISE_RANGE` times the expected noise.
 
-    NaN marks a missing error. Without any error the noise is the expected one. `lengths`,
-    `expected` and the result have one unit. If `lengths` is a numpy array, so is the result.
+    lengths: lengths of the errors, NaN where an error is missing. If all are missing, the expected
+    noise is returned. All arguments and the result have the same unit. If `lengths` is a numpy
+    array, the result is one, too.
     """
     xp: Any = jnp
     if isinstance(lengths, np.ndarray):
@@ -235,8 +237,8 @@ def body_errors(
         [Observations, Float[Array, "k 3"]], Float[Array, "c k ..."]
     ] = keypoint_errors,
 ) -> Float[Array, "n c k ..."]:
-    """Returns the `errors` of a person for a batch of n observations, (n, c, k, ...). frames: index
-    of each observation's pose in `poses`, (n,).
+    """Returns the errors of a posed body for a batch of n observations, (n, c, k, ...), by the
+    function `errors`. frames: index of each observation's pose in `poses`, (n,).
     """
     landmarks = jax.vmap(lambda pose: pose_landmarks(model, betas, pose)[0])(poses)
     return jax.vmap(errors)(seen, landmarks[frames])
@@ -247,8 +249,8 @@ _TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")
 
 
 def trunk_weights(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
-    """Returns weights of landmarks, (k,): 1 for the trunk, and 0.02 for the others. So the others
-    only decide where the trunk is not seen.
+    """Returns weights of landmarks, (k,): 1 for trunk and head, and 0.02 for all others. The others
+    therefore matter only if trunk and head are not seen.
     """
     return np.asarray([1.0 if kind_of(name) in _TRUNK else 0.02 for name in names], np.float32)
 
@@ -259,9 +261,9 @@ def keypoint_residuals(
     landmarks: Float[Array, "k 3"],
     scale: Float[Array, ""] | float,
 ) -> Float[Array, "c k 2"]:
-    """Returns the robust errors of keypoints, (c, k, 2), in standard deviations, times the roots of
-    their confidences. They are 0 for landmarks that the body lacks. scale: robust scale, standard
-    deviations.
+    """Returns the residuals of keypoints, (c, k, 2). They are robust errors in standard deviations,
+    multiplied by the square root of the confidence. They are 0 for landmarks that the body lacks.
+    scale: robust scale, in standard deviations.
     """
     errors = (
         keypoint_errors(observations, landmarks) / observations.noise * model.certainty[:, None]
@@ -271,7 +273,7 @@ def keypoint_residuals(
 
 
 def _roots(weights: Float[Array, "c k"]) -> Float[Array, "c k"]:
-    """Returns square roots of weights, which are differentiable at 0."""
+    """Returns the square roots of weights. Their derivative is finite at 0."""
     return jnp.where(weights > 0, jnp.sqrt(jnp.where(weights > 0, weights, 1.0)), 0.0)
 
 
@@ -281,8 +283,10 @@ def world_residuals(
     landmarks: Float[Array, "k 3"],
     scale: Float[Array, ""] | float,
 ) -> Float[Array, "c k"]:
-    """Returns the differences between depths of landmarks and those that the detector sees, (c, k),
-    in standard deviations. Both are scaled to one size of the person.
+    """Returns the residuals of depths, (c, k). They are robust differences between the depths of
+    the body's landmarks and of the detector's 3D landmarks, in standard deviations, multiplied by
+    the square root of the confidence. Both are first centred, and scaled to size 1. scale: robust
+    scale, in standard deviations.
     """
     weights = observations.confidences * np.asarray(model.known, np.float32)
     total = jnp.maximum(jnp.sum(weights, axis=1), 1e-6)
@@ -292,7 +296,7 @@ def world_residuals(
         return x - jnp.sum(weights[..., None] * x, axis=1, keepdims=True) / total[..., None, None]
 
     def size(x):
-        """Returns the root mean square of the distances from the mean, (c, 1)."""
+        """Returns the root mean square length of centred points, (c, 1)."""
         square = jnp.sum(weights * jnp.sum(jnp.square(x), axis=-1), axis=1) / total
         return jnp.sqrt(square + NEAR**2)[:, None]
 
@@ -303,26 +307,26 @@ def world_residuals(
 
 @pytree_dataclass
 class Targets:
-    """Triangulated landmarks."""
+    """Triangulated landmarks, to which a stage of a fit pulls the body."""
 
     points: Float[Array, "k 3"]
     """Positions, (k, 3), metres."""
     known: Float[Array, " k"] | Bool[Array, " k"]
     """Weights, (k,). 0 for landmarks that were not triangulated."""
     pixel: Float[Array, ""]
-    """Length at the person that one pixel shows, (), metres."""
+    """Length at the person that corresponds to one pixel, (), metres."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KeypointProblem:
-    """What stays the same in a fit to keypoints."""
+    """The constants of a fit to keypoints."""
 
     model: LandmarkModel
     """Landmarks of the body."""
     prior: PosePrior
     """Prior of poses and limits of joints."""
     origin: Origin
-    """The values that zeros of the state stand for."""
+    """Shape and pose from which a state counts its deviations, and their units."""
 
     @property
     def known(self) -> Float[np.ndarray, " k"]:
@@ -330,15 +334,15 @@ class KeypointProblem:
         return np.asarray(self.model.known, np.float32)
 
     def model_of(self, state: FitState) -> LandmarkModel:
-        """Returns the landmarks at the places of the state, or those of the problem if the state
-        has none.
+        """Returns the landmark model with the state's places of landmarks. If the state has no
+        places, it is the model of the problem.
         """
         return self.model if state.places is None else self.model.moved(PLACE_STD * state.places)
 
     def landmarks_and_joints(
         self, state: FitState
     ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
-        """Returns landmarks, (k, 3), and joints, (j, 3), of a state, metres."""
+        """Returns the landmarks, (k, 3), and the joints, (j, 3), of the body in a state, metres."""
         return pose_landmarks(
             self.model_of(state), betas_of(self.origin, state), pose_of(self.origin, state)
         )
@@ -351,10 +355,11 @@ def frame_residuals(
     scale: Float[Array, ""] | float,
     targets: Targets | None = None,
 ) -> dict[str, Float[Array, "..."]]:
-    """Returns all residuals of one frame, by kind. Half their square sum is the negative log
-    posterior, except for a constant.
+    """Returns all residuals of one frame. The key is the kind of residual. Half the sum of their
+    squares is the negative log posterior, up to a constant.
 
-    scale: robust scale of keypoints, standard deviations. targets: triangulated landmarks, or None.
+    scale: robust scale of keypoints, in standard deviations. targets: triangulated landmarks, or
+    None.
     """
     betas, pose = betas_of(problem.origin, state), pose_of(problem.origin, state)
     landmarks, _ = pose_landmarks(problem.model_of(state), betas, pose)

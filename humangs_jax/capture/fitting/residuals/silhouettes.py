@@ -1,16 +1,19 @@
-"""Silhouettes as evidence: compares the silhouette of a posed body with that of a mask.
+"""Silhouettes as evidence: compares the silhouette of a posed body with the silhouette of a mask.
 
 A body's silhouette consists of mesh edges between a face that looks at the camera and one that
-looks away (Sander et al. 2000, "Silhouette clipping"), as far as the image shows no body outside of
-them. Its points are known functions of the pose. A mask's silhouette is where its coverage crosses
-one half. Both are found on the host and held fixed while a solver moves the body.
+looks away (Sander et al. 2000, "Silhouette clipping"). Of these, only edges count that have no
+other part of the body outside of them in the image. Points on these edges are differentiable
+functions of the pose. A mask's silhouette is where its coverage crosses one half. Both are found on
+the host and held fixed while a solver moves the body.
 
 Points are matched as in edge trackers (Harris and Stennett 1990, "RAPiD"). Each point of the body's
 silhouette looks along its normal for the nearest end of the mask. Each point of the mask's
-silhouette looks for the nearest point of the body's silhouette that faces the same way. Both give
-an equation n . x = n . q, where x is the point of the body in the image, q the point of the mask
-and n the normal: x may slide along the mask's silhouette. People wear clothes and hair. So points
-of the body outside of the mask can have a larger robust scale than points inside.
+silhouette looks for the nearest point of the body's silhouette that faces the same way.
+
+Both kinds of match give an equation n . x = n . q, where x is the point of the body in the image, q
+the point of the mask and n the normal. So x may slide along the mask's silhouette. People wear
+clothes and hair. So points of the body outside of the mask can have a larger robust scale than
+points inside.
 """
 
 import dataclasses
@@ -36,22 +39,24 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 @dataclasses.dataclass(frozen=True)
 class _Edges:
-    """Constants by which silhouettes are found in images."""
+    """Constants for finding silhouettes in images."""
 
     probe: float = 1.5
-    """Distance outside of a silhouette at which there must be no body, pixels."""
-    nearest: float = 0.05
-    """Distance to the camera, metres. Edges of faces that are nearer, or behind the camera, are no
-    silhouette.
+    """An edge belongs to the silhouette only if the image shows no body at this distance outside of
+    it, pixels.
     """
+    nearest: float = 0.05
+    """Edges of faces with a smaller depth than this do not belong to the silhouette, metres."""
     border: float = 1.0
-    """Distance to the image border, pixels. Nothing that is nearer is a silhouette, because the
-    image ends there, not the person.
+    """Points within this distance of the image border do not belong to the silhouette, pixels.
+    There the image ends, and not the person.
     """
     speck: float = 0.03
-    """Contours that are shorter than this share of the longest contour of a mask are noise."""
+    """A contour of a mask that is shorter than this share of the mask's longest contour is ignored
+    as noise.
+    """
     smoothing: float = 1.5
-    """Standard deviation of the blur whose gradient gives the normals of a mask, pixels."""
+    """Standard deviation of the blur of a mask before its gradient gives the normals, pixels."""
 
 
 _EDGES = _Edges()
@@ -63,7 +68,7 @@ class MeshEdges(NamedTuple):
     ends: Int[np.ndarray, "e 2"]
     """Vertices at both ends, (e, 2)."""
     faces: Int[np.ndarray, "e 2"]
-    """Faces on both sides, (e, 2). -1 where there is no second face."""
+    """Faces on both sides, (e, 2). The second is -1 if the edge has only one face."""
 
 
 class BodyView(NamedTuple):
@@ -74,14 +79,14 @@ class BodyView(NamedTuple):
     depths: Float[np.ndarray, " n"]
     """Depths of the vertices, (n,), metres."""
     normals: Float[np.ndarray, "n 2"]
-    """Surface normals at the vertices, projected into the image, (n, 2). Unit vectors."""
+    """Unit normals of the surface at the vertices, projected into the image, (n, 2)."""
     covered: Bool[np.ndarray, "h w"]
     """Which pixels show the body, (h, w)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Boundary:
-    """Points of a silhouette, evenly spread over it. There may be none."""
+    """Points that are evenly spread over a silhouette. There may be none."""
 
     positions: Float[np.ndarray, "p 2"]
     """Positions, (p, 2), pixels."""
@@ -96,7 +101,7 @@ class Boundary:
 
 
 def body_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
-    """Returns all edges of a mesh. Where more than two faces share an edge, two of them are
+    """Returns all edges of a mesh. If more than two faces share an edge, two of these faces are
     kept.
     """
     ends, sides = mesh_edges(faces)
@@ -109,7 +114,7 @@ def body_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
 
 
 def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> BodyView:
-    """Projects and rasterizes a posed body. vertices: (n, 3), metres."""
+    """Returns a posed body as a camera sees it. vertices: (n, 3), metres."""
     return BodyView(*map(np.asarray, look(vertices, faces, camera)))
 
 
@@ -136,8 +141,8 @@ def look(
 def body_boundary(
     view: BodyView, faces: Int[np.ndarray, "f 3"], mesh: MeshEdges, count: int
 ) -> Boundary:
-    """Returns `count` points of the body's silhouette, or no points if the image shows no
-    silhouette.
+    """Returns `count` points of the body's silhouette. If the image shows no silhouette, there are
+    no points.
     """
     # faces that look at the camera, by their orientation in the image
     corners = view.pixels[faces]
@@ -170,8 +175,8 @@ def body_boundary(
 def mask_boundary(
     mask: Float[np.ndarray, "h w"], count: int, hidden: Bool[np.ndarray, "h w"] | None = None
 ) -> Boundary:
-    """Returns `count` points where the coverage of a mask crosses one half, or no points if there
-    is no such place.
+    """Returns `count` points at which the coverage of a mask crosses one half. If there is no such
+    place, there are no points.
 
     Contours along the image border are left out. hidden: pixels where something may stand in front
     of the person, (h, w). Contours through these pixels are left out, too.
@@ -209,8 +214,8 @@ def mask_boundary(
 def _inside_image(
     positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]
 ) -> Bool[np.ndarray, "*p"]:
-    """Returns which positions (x, y) are more than `_EDGES.border` inside of an image. shape:
-    (height, width).
+    """Returns which positions (x, y) lie inside an image, more than `_EDGES.border` pixels from its
+    border. shape: (height, width).
     """
     size = np.asarray([shape[1], shape[0]])
     return np.all((positions > _EDGES.border) & (positions < size - _EDGES.border), axis=-1)
@@ -227,9 +232,9 @@ def _covered(
 def _spread(
     lengths: Float[np.ndarray, " l"], count: int
 ) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Spreads `count` points evenly over pieces of a line with these lengths, (l,). Returns the
-    piece of each point, (count,), and its position in the piece, (count,), in [0, 1]. No points if
-    the whole length is 0.
+    """Spreads `count` points evenly over a line that consists of pieces. Returns the index of each
+    point's piece, (count,), and the point's position in the piece, (count,), in [0, 1]. If the
+    whole line has length 0, there are no points. lengths: lengths of the pieces, (l,).
     """
     ends = np.cumsum(lengths)
     if len(ends) == 0 or ends[-1] <= 0:
@@ -240,25 +245,25 @@ def _spread(
 
 
 LOOKS = 129
-"""Number of samples along a normal. With usual settings, they are half a pixel apart in the first
-matching of a person of 400 pixels, and closer in later ones.
+"""Number of samples along a normal. With usual settings and a person of 400 pixels, samples are
+half a pixel apart in the first matching, and closer in later ones.
 """
 
 
 @pytree_dataclass
 class Matches:
-    """Equations of one view. Point `points[i]` of the body's silhouette shall lie on the line
-    normals[i] . x = offsets[i].
+    """Equations of one view. Each says that point `points[i]` of the body's silhouette lies on the
+    line normals[i] . x = offsets[i].
     """
 
     points: Int[Array | np.ndarray, " e"]
-    """Indices of the points on the body's silhouette, (e,)."""
+    """Index of the point on the body's silhouette, (e,)."""
     normals: Float[Array | np.ndarray, "e 2"]
     """Unit normals of the lines, (e, 2). They point out of the person."""
     offsets: Float[Array | np.ndarray, " e"]
     """Offsets of the lines, (e,), pixels."""
     weights: Float[Array | np.ndarray, " e"]
-    """Weights, (e,). 0 for rows that are no equation."""
+    """Weights, (e,). 0 for rows that only fill the array."""
 
 
 def match(
@@ -277,8 +282,9 @@ def match(
         mask: coverage of the mask, (h, w), 0 to 1.
         boundary: silhouette of the mask.
         reach: how far points look for their match, pixels.
-        count: most points of each silhouette.
-        hidden: pixels where the mask says nothing, since something may be in front, (h, w).
+        count: largest number of points of each silhouette.
+        hidden: pixels where something may be in front of the person, so that the mask does not
+            count, (h, w).
     """
     of_body, of_mask = _ends_of_mask(body, mask, reach, hidden), _nearest(body, boundary, reach)
     points, normals, offsets = map(np.concatenate, zip(of_body, of_mask, strict=True))
@@ -286,13 +292,15 @@ def match(
 
 
 Pairs = tuple[Int[np.ndarray, " e"], Float[np.ndarray, "e 2"], Float[np.ndarray, " e"]]
-"""Equations without weights: indices of the points on the body's silhouette, normals and offsets of
-their lines.
+"""Equations without weights. The three arrays are `points`, `normals` and `offsets` of
+`Matches`.
 """
 
 
 def matches_of(pairs: Pairs, count: int) -> Matches:
-    """Returns the equations of at most 2 `count` pairs, padded with rows of weight 0."""
+    """Returns the equations of at most 2 `count` pairs as `Matches` with 2 `count` rows. Rows
+    without a pair have weight 0.
+    """
     points, normals, offsets = (padded(x, 2 * count) for x in pairs)
     weights = np.arange(2 * count) < len(pairs[0])
     return Matches(
@@ -309,8 +317,8 @@ def _ends_of_mask(
     reach: float,
     hidden: Bool[np.ndarray, "h w"] | None,
 ) -> Pairs:
-    """Matches points of the body with the mask: finds along each point's normal where the mask
-    ends, that is, goes from inside to outside.
+    """Matches points of the body with the mask. For each point it finds the nearest place along the
+    point's normal at which the mask ends, from the inside to the outside.
     """
     steps = np.linspace(-reach, reach, LOOKS)
     places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
@@ -336,8 +344,8 @@ def coverage(mask: Float[Array, "h w"], places: Float[Array, "p l 2"]) -> Float[
 
 
 def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
-    """Matches points of the mask with points of the body: finds for each point of the mask the
-    nearest point of the body within `reach` pixels that faces the same way.
+    """Matches points of the mask with points of the body. For each point of the mask it finds the
+    nearest point of the body that faces the same way, within `reach` pixels.
     """
     if not len(body.positions) or not len(mask.positions):
         return np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
@@ -356,8 +364,8 @@ def _nearest(body: Boundary, mask: Boundary, reach: float) -> Pairs:
 def distances(
     matches: Matches, pixels: Float[Array | np.ndarray, "p 2"]
 ) -> Float[Array | np.ndarray, " e"]:
-    """Returns how far points of the body are outside of their lines, (e,), pixels. Negative
-    inside.
+    """Returns how far points of the body lie outside of the lines of their equations, (e,), pixels.
+    It is negative for points inside.
     """
     # term by term: XLA's CPU compiler (jaxlib 0.10.2) makes wrong Jacobians of `jnp.sum` over both
     # under `jax.jacfwd`
@@ -373,17 +381,18 @@ def silhouette_residuals(
     scales: tuple[Float[Array, ""], Float[Array, ""]],
     independent: float,
 ) -> Float[Array, " e"]:
-    """Returns the robust distances between the silhouettes, (e,), in standard deviations, times the
-    roots of their weights.
+    """Returns the residuals of a view's silhouette, (e,). They are robust distances in standard
+    deviations, multiplied by the square roots of their weights.
 
     Args:
         matches: equations of the view.
         pixels: points of the body's silhouette in the image, (p, 2), pixels.
-        clothes: pixels by which the mask reaches beyond the body at each point, (p,).
+        clothes: how far the mask reaches beyond the body at each point, (p,), pixels.
         noise: standard deviation of a silhouette, pixels.
         scales: robust scales outwards and inwards, pixels.
-        independent: number of independent equations that all equations of the view count as, at
-            most. Neighbours on a silhouette err together.
+        independent: all equations of the view together weigh at most as much as this number of
+            independent equations. They are not independent, because neighbours on a silhouette have
+            similar errors.
     """
     off = distances(matches, pixels) + clothes[matches.points]
     scale = jnp.where(off > 0, *scales)
@@ -399,8 +408,8 @@ def silhouette_residuals(
 def boundary_points(
     body: BodyModel, boundaries: Sequence[Boundary], count: int, coefficients: int
 ) -> SurfacePoints:
-    """Returns the points of v silhouettes of the body as functions of shape and pose,
-    (v, count, ...). They are padded with points that no equation uses.
+    """Returns the points of v silhouettes of the body, (v, count, ...), as points on its surface
+    that can be posed. They are padded with points that no equation uses.
     """
     ends, shares = (
         np.stack([padded(getattr(each, name), count) for each in boundaries])
@@ -410,7 +419,7 @@ def boundary_points(
 
 
 def padded(rows: np.ndarray, count: int) -> np.ndarray:
-    """Returns the rows, followed by rows of zeros up to `count` rows."""
+    """Returns the rows, followed by zeros, so that there are `count` rows."""
     return np.pad(rows, ((0, count - len(rows)),) + ((0, 0),) * (rows.ndim - 1))
 
 
