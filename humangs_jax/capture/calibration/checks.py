@@ -21,11 +21,11 @@ from humangs_jax.data.cameras import (
 )
 
 REPROJECTION_LIMIT = 2.0
-"""Largest mean reprojection error without a warning, pixels. Calibrations usually have less than
-one.
+"""There is a warning if the mean reprojection error exceeds this, pixels. Calibrations usually have
+less than 1.
 """
 DISTANCES = (0.3, 30.0)
-"""Least and largest distance of cameras from a person, metres."""
+"""Smallest and largest plausible distance of cameras from a person, metres."""
 UNITS = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres"}
 """Names of the units in which people calibrate. The key is the number of metres in the unit."""
 USUAL_DISTANCE = 2.5
@@ -43,16 +43,16 @@ the point's median depth. It is large because some cameras look at the person's 
 the face.
 """
 TILT_LIMIT = 45.0
-"""Largest angle between the mean upward direction of the photos and +y without a warning,
-degrees.
+"""There is a warning if the angle between the mean upward direction of the photos and +y exceeds
+this, degrees.
 """
 OFF_CENTER = 0.25
-"""If the principal point is at least this far from the middle of the image, there is a warning: the
-intrinsics may belong to an image of another size. As a share of the image's width or height.
+"""There is a warning if the principal point is at least this share of the image's width or height
+away from its middle. The intrinsics may then belong to an image of another size.
 """
 COINCIDENT = 1e-3
-"""All cameras count as standing in one place if the median depth of the point where the axes meet
-is less than this share of the largest distance of a camera from the world's origin.
+"""Cameras count as standing in one place if the point where their axes meet is very near: its
+median depth is less than this share of the largest distance of a camera from the world's origin.
 """
 
 

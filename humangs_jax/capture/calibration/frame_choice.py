@@ -27,8 +27,8 @@ cannot be seen at this size does no harm.
 _CELLS = 24
 """Number of rows and of columns of the thumbnails that are compared."""
 _NOTHING_SHOWN = 3.0
-"""Least standard deviation of the grey values (0 to 255) of a frame that shows something. A frame
-of one color has noise alone, which stays below.
+"""Smallest standard deviation of the grey values (0 to 255) of a frame that shows something. A
+frame of one color has only noise, which is smaller.
 """
 NOTHING_NEW = 0.05
 """Frames are chosen until the best remaining frame has less novelty than this. Novelty is the root
@@ -113,8 +113,8 @@ FRAMES = 16
 The others help poses and refinement.
 """
 USUAL = 0.15
-"""A frame's worth is halved if its pose differs by this much from the usual pose. As a share of the
-person's size, see `unusual`.
+"""A frame's worth is halved if its pose differs by this share of the person's size from the usual
+pose. See `unusual`.
 """
 WORTHLESS = 0.1
 """Smallest factor by which a frame's worth is multiplied because of an unusual pose."""

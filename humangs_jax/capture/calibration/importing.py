@@ -86,7 +86,7 @@ class ImportReport:
     height: int
     """Height of the photos, pixels."""
     undistorted: int
-    """Number of photos of which lens distortion was removed."""
+    """Number of photos that were undistorted."""
     turned: int
     """Number of photos that were turned upright, or have a mask that was turned, because of EXIF
     orientations.
@@ -148,20 +148,21 @@ def import_cameras(
     written. The folder has no body.npz yet.
 
     Args:
-        source: file or folder in any format of docs/cameras.md. The content decides which format it
-            is.
+        source: file or folder in any format of docs/cameras.md. The format is found from the
+            content.
         images: folder of the photos, or of a video of each camera (CAMERA.mp4).
         out: the capture folder.
         masks: folder of the photos' masks, or of a video of masks of each camera, with the names of
             the photos or videos. None: the masks that the calibration names, if any.
-        others: folder of masks of other people and of things in front of the person, which have the
-            photos' names. Photos in which nothing covers the person need none.
+        others: folder of masks of other people and of things in front of the person. The masks have
+            the photos' names. A photo in which nothing covers the person needs no mask.
         scale: metres per unit of the source. None: the unit of the format, or metres. If the
-            cameras then stand too near to a person or too far, another unit is taken that fits.
-        up: the axis of the source's world that points up, "+y", "-z", .... None: as the format
+            cameras would then stand too near to a person or too far away, another unit is chosen
+            that fits.
+        up: the axis of the source's world that points up, such as "+y" or "-z". None: as the format
             says.
-        pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0),
-            "half": (0.5, 0.5). None: as the format says.
+        pixel_centers: position of the first pixel's centre in the source. "integer" means (0, 0),
+            and "half" means (0.5, 0.5). None: as the format says.
         every: step between the frames of videos.
         frames: largest number of frames of videos. None: all.
         overwrite: whether a capture at `out` is replaced as a whole.
@@ -208,10 +209,10 @@ def import_cameras(
 
 
 def photo_size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
-    """Returns width and height of the photo that the source calls `name`.
+    """Returns width and height of the photo that the source calls `name`, pixels.
 
-    If there is no such photo, it returns the size of another one, because a camera without a photo
-    is left out later.
+    If there is no such photo, it returns the size of any photo. This does no harm, because a camera
+    without a photo is left out later.
 
     Raises: CaptureError if the folder has no photos.
     """
@@ -236,8 +237,8 @@ def import_calibration(
     pixel_centers: str | None = None,
     also: Mapping[str, object] | None = None,
 ) -> ImportReport:
-    """Imports photos and a calibration in memory. Arguments and result are those of
-    `import_cameras`. A capture at `out` is replaced.
+    """Writes a capture folder of photos and a calibration that is in memory. The other arguments
+    and the result are as in `import_cameras`. A capture at `out` is replaced.
     """
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
     about_unit = None
@@ -318,7 +319,7 @@ def import_calibration(
 
 
 def _no_common_frame(calibration: Calibration) -> str:
-    """Returns the warning that no two photos are of the same frame."""
+    """Returns a warning for a calibration in which no two photos show the same frame."""
     if calibration.per_image:
         return "no two photos show the same moment: each is a frame with another pose"
     same = "photos of one frame must have the same file name"

@@ -67,17 +67,17 @@ def load_cameras(
     y_up: bool = False,
     scale: float = 1.0,
 ) -> SceneCameras:
-    """Returns the cameras of a calibration of COLMAP, nerfstudio, OpenCV and the other formats of
-    docs/cameras.md, with their lenses.
+    """Returns the cameras of a calibration, with their lenses. It may come from COLMAP, nerfstudio,
+    OpenCV or another tool in docs/cameras.md.
 
     Args:
-        path: File or folder. Its content decides which format it is.
+        path: File or folder. The format is found from its content.
         images: Folder of the photos, for formats that do not state the photos' sizes.
-        lenses: Whether the cameras have the distortion of the file, fisheyes included, as photos
-            show it. False: they are pinholes, for photos that are undistorted, and a fisheye is
-            refused.
-        y_up: Whether the world is turned so that y is up. False: the axes are those of the file,
-            as for Gaussians of other programs.
+        lenses: Whether the cameras keep the lens distortion of the file, also of fisheyes, as the
+            photos show it. False: the cameras are pinholes, for photos that are undistorted. A
+            fisheye then raises an error.
+        y_up: Whether the world is turned so that y is up. False: the axes of the file are kept, as
+            for Gaussians of other programs.
         scale: Metres per unit of the file.
 
     Returns:

@@ -453,7 +453,7 @@ def recognizes_toml(source: CalibrationFile) -> bool:
 
 
 def read_toml(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """Reads the cameras of a file, without those that are marked with `ignore`.
+    """Reads the cameras of a file. Cameras that are marked with `ignore` are left out.
 
     Raises: CaptureError with the name of the key.
     """

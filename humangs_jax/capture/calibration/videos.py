@@ -356,7 +356,7 @@ curves are taken for sRGB's.
 _WIDEST_PIXEL = 4
 """Largest ratio of a pixel's longer side to its shorter side. The largest in use is 2."""
 _SQUARE = "scale=w=round(iw*max(sar\\,1)):h=round(ih*max(1/sar\\,1)),setsar=1"
-"""Filter that makes pixels square. It only enlarges frames, so that nothing is lost."""
+"""ffmpeg filter that makes pixels square. It only enlarges frames, so that no detail is lost."""
 _TABLE = "colors.cube"
 """Name of the temporary file with the color lookup table."""
 
@@ -468,9 +468,9 @@ def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"
 def color_frames(
     path: Path, longer_side: int, chosen: Sequence[int] | None
 ) -> Iterator[UInt[np.ndarray, "h w 3"]]:
-    """Yields frames of a video in the stored colors, (h, w, 3). Frames whose longer side exceeds
-    `longer_side` pixels are shrunk to it. chosen: numbers of the frames, from 0 and ascending.
-    None: all.
+    """Yields frames of a video in the stored colors, (h, w, 3). Frames with a longer side of more
+    than `longer_side` pixels are shrunk to this size. chosen: numbers of the frames, from 0 and
+    ascending. None: all.
 
     Raises: CaptureError with the name of the video.
     """

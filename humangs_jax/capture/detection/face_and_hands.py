@@ -37,7 +37,7 @@ PALM = (0, 1, 2, 3, 5, 6, 9, 10, 13, 14, 17, 18)
 palm and near it, because fingers move more.
 """
 SMALLEST = 24.0
-"""Least side of a region in which faces and hands are looked for, pixels."""
+"""Faces and hands are looked for only in regions with at least this side, pixels."""
 SHAPE_NAMES = ARKIT[:-1]
 """Names of the scores: all of ARKit's shapes except the tongue."""
 SHAPE_POINTS = (

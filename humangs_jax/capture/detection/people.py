@@ -426,8 +426,8 @@ class _SearchConfig:
     is found in the others. Most windows are of this kind.
     """
     large: float = 0.4
-    """If somebody's crop has at least this side, the smaller windows are not used. As a share of
-    the photo's longer side.
+    """The smaller windows are used only if nobody's crop has at least this share of the photo's
+    longer side.
 
     Windows of half the longer side find people from a sixth of that side on, and their crops are a
     fifth of it. So a person who is found only in smaller windows has at most a quarter of the
@@ -497,7 +497,7 @@ BELIEVED = _Believed()
 MARGINS = (1 / 150, 1 / 100)
 """How far the painted area reaches beyond a mask, as shares of the photo's longer side. The second
 value is tried if the first one shows nobody more. If the area is too small, a rim remains that
-looks like a person. If it is too large, it hides people who stand behind.
+looks like a person. If the area is too large, it hides people who stand behind.
 """
 SEEN = 0.5
 """A pixel belongs to the person if the mask exceeds this probability."""

@@ -60,8 +60,8 @@ class _Decision:
     moves a point by 1.5 cm at a distance of 3 m.
     """
     most_degrees: float = 8.0
-    """If any rotation exceeds this angle, the calibration has another error, and nothing is
-    reported. Degrees.
+    """Nothing is reported if any rotation exceeds this angle, degrees. The calibration then has
+    another error.
     """
     alike: float = 0.9
     """Another camera is named as a possible cause, too, if turning it in place of the reported
@@ -322,7 +322,7 @@ class _Projected(NamedTuple):
     depth: Float[np.ndarray, "m c k"]
     """Depths of the points, at least 5 cm, (m, c, k), metres."""
     slope: Float[np.ndarray, "m c k 2"]
-    """x and y over the depth, (m, c, k, 2)."""
+    """x / depth and y / depth of the points, (m, c, k, 2)."""
     focal: Float[np.ndarray, "m c 1 2"]
     """Focal lengths, (m, c, 1, 2), pixels."""
     errors: Float[np.ndarray, "m c k 2"]

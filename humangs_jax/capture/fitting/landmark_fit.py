@@ -74,8 +74,8 @@ MOTION_SCALE = 5.0
 frame that shows another person hardly affects the other frames.
 """
 FEW = 6
-"""A frame with fewer landmarks than this has little influence on its pose, which is then mostly the
-prior's. Smooth motion interpolates such a frame.
+"""If a frame shows fewer landmarks than this, its pose comes mostly from the prior. Smooth motion
+interpolates such a frame.
 """
 
 

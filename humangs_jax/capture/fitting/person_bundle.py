@@ -40,7 +40,7 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.core.array_types import Float, Int
 
 NEAR = 0.05
-"""Least depth, metres. Smaller depths are clamped to it."""
+"""Smallest depth, metres. Smaller depths are clamped to it."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -79,10 +79,12 @@ class _OneMoment:
     compared with the result.
     """
     mirrored: float = 0.7
-    """A view is mirrored only if this multiplies the cost by less than this number."""
+    """A view counts as mirrored only if mirroring it multiplies the cost by less than this
+    number.
+    """
     least_angle: float = 4.0
-    """If all photos see the person from directions that differ by less than this angle, each photo
-    counts as a moment. Degrees.
+    """Each photo counts as a moment if all of them see the person from directions that differ by
+    less than this angle, degrees.
     """
     far: float = 0.2
     """Larger errors of a landmark count as this error."""
@@ -264,7 +266,7 @@ def _without_one(
 def _with_others(
     seen: PersonViews, trial: Trial, views: tuple[int, ...], others: Sequence[int]
 ) -> tuple[Trial, tuple[int, ...]]:
-    """Adds those of the other photos that agree with the trial, either mirrored or not.
+    """Adds the other photos that agree with the trial, either mirrored or not.
 
     Returns a trial in which the cameras of `views` and of the added photos are fitted together, and
     the indices of all these photos.
@@ -394,8 +396,8 @@ def _focal_lengths(
     If a photo states no focal length, it gets the median of the others, relative to the diagonal of
     the photo. If no photo states any, the usual one is assumed.
 
-    All cameras with a focal length from EXIF are of one kind. Photos without it that have the same
-    size are assumed to be from one camera, and form another kind.
+    All cameras with a focal length from EXIF are of one kind. Photos without a focal length that
+    have the same size are assumed to be from one camera, and form another kind.
     """
     diagonals = np.hypot(*np.asarray(seen.sizes, float).T)
     known = np.isfinite(seen.focal)

@@ -78,9 +78,7 @@ class CaptureRefineConfig:
     std: StateStd = dataclasses.field(default_factory=StateStd)
     """Standard deviations of the errors that the start may have."""
     coefficients: int = 10
-    """The shape gets at least this many coefficients. A capture with fewer gets more, if its body
-    has more.
-    """
+    """The shape gets at least this many coefficients, as far as the body model has so many."""
     fixed_cameras: bool = False
     """Whether the cameras stay as they are, so that only shape and poses move."""
     iterations: int = 10
@@ -351,7 +349,7 @@ class Score:
     ious: Float[np.ndarray, " v"]
     """Intersection over union of body and mask in each view, (v,). NaN without a mask."""
     iou: float | None
-    """Mean of `ious` over the views with a mask. None if no view has one."""
+    """Mean of `ious` over the views with a mask. None if no view has a mask."""
     keypoints: float | None
     """Median error of the keypoints, pixels. None without keypoints."""
     loss: float
@@ -377,9 +375,7 @@ class SilhouetteFit:
     masks: Float[np.ndarray, "v h w"]
     """Masks at the reduced size, (v, h, w), 0 to 1. Zeros if the capture has no masks."""
     unknown: Bool[np.ndarray, "v h w"] | None
-    """Pixels where it is unknown whether they show the person, (v, h, w). None: there are no such
-    pixels.
-    """
+    """Pixels that may or may not show the person, (v, h, w). None: there are no such pixels."""
     hidden: list[Bool[np.ndarray, "h w"] | None]
     """For each view, the unknown pixels and a rim around them, (h, w). In the rim the mask ends at
     an object in front of the person. None for a view without unknown pixels.

@@ -40,8 +40,8 @@ class _Clear:
     """Limits that decide whether an exchange clearly explains a disagreement."""
 
     least_gain: float = 0.1
-    """An exchange is clear if it adds at least the share least_gain + chance / sqrt(n) of the
-    agreement that could be reached with n keypoints.
+    """An exchange is clear if it adds more than the share least_gain + chance / sqrt(n) of the
+    agreement that n keypoints could reach.
     """
     chance: float = 0.8
     """See `least_gain`. This term allows for what an exchange gains by chance. In correct views, 17
@@ -49,8 +49,9 @@ class _Clear:
     keypoints gain nothing.
     """
     many: int = 5
-    """With at least this many views, only exchanges are tried that improve the agreement with the
-    points as they are. So many views outvote the exchanged ones.
+    """In frames with at least this many views, an exchange is tried only if it improves the
+    agreement with the points as they are. This suffices, because the other views outvote the
+    exchanged ones.
     """
     alike: float = 0.9
     """Another exchange is an alternative if it gains more than this share of what the best one

@@ -150,11 +150,13 @@ class _SamePerson:
     contributes 0.02.
     """
     clearly: float = 0.5
-    """Sides count as exchanged if an exchange multiplies this distance by less than this number. It
-    holds if the view agrees without an exchange.
+    """If a view agrees without an exchange, its sides count as exchanged only if an exchange
+    multiplies the distance (see `agree`) by less than this number.
     """
     rather: float = 0.8
-    """The number in place of `clearly` if the view does not agree without an exchange."""
+    """If a view does not agree without an exchange, this number is used in place of `clearly`. With
+    the exchange it has to agree.
+    """
     seen: float = 0.3
     """A landmark is used if it has at least this visibility."""
     fewest: int = 6

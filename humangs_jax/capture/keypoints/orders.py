@@ -1,6 +1,5 @@
-"""Finds the order of OpenPose's points, because its files do not state it. 25 points are either
-BODY_25's or BODY_25B's. 18 points are either those of OpenPose's model COCO, or COCO's 17 points
-and a neck.
+"""Finds the order of OpenPose's points, because its files do not state it. 25 points are BODY_25's
+or BODY_25B's. 18 points are those of OpenPose's model COCO, or COCO's 17 points and a neck.
 
 In the right order the bones are shortest on average. In a wrong order a bone can lead from a knee
 to a wrist.

@@ -41,12 +41,12 @@ class _Plausible:
     """Limits for numbers that can be pixels or scores of keypoints."""
 
     least_extent: float = 2.0
-    """If no coordinate in any view reaches this, coordinates are not pixels but shares of the
-    image, and are refused. Pixels.
+    """At least one coordinate in any view has to reach this, pixels. If none does, the coordinates
+    are shares of the image, and are refused.
     """
     largest_pixel: float = 1e6
-    """Larger coordinates are replaced by this one, because they could become inf in float32. They
-    have no meaning. Pixels.
+    """Larger coordinates are replaced by this one, pixels. They have no meaning, and could become
+    inf in float32.
     """
     outside: float = 0.5
     """Largest distance of a point from its image, as a share of the image's size. Detectors
