@@ -20,7 +20,7 @@ the camera's frames. It is a little more than one half, because the clocks of ph
 """
 _GAP = 1.5
 """Frames are missing between two frames if the time between them exceeds this many times the usual
-time.
+time between frames.
 """
 _SAME_RATE = 0.01
 """Cameras count as having the same frame rate if the times between their frames differ by less than

@@ -193,8 +193,8 @@ def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
 
 
 def photo_of(folder: Path, name: str, file: Path) -> Path:
-    """Returns the photo that a calibration file names. The name is a path that may lack its suffix,
-    have another one, or begin with folders above `folder`.
+    """Returns the photo that a calibration file names. The name is a path. It may lack its suffix,
+    have another suffix, or begin with folders above `folder`.
 
     Raises: CaptureError if there is no such photo, or if it is a link to something outside of the
     folder, see `io.reading.inside`.

@@ -217,18 +217,18 @@ class _Bytes:
         self.data, self.at = read_bytes(file, "mesh_bytes"), 0
 
     def take(self, size: int) -> bytes:
-        """Returns the next bytes."""
+        """Returns the next `size` bytes."""
         self.at += size
         if self.at > len(self.data):
             raise InvalidFileError("not a readable COLMAP model: cut short, or damaged")
         return self.data[self.at - size : self.at]
 
     def read(self, kinds: str) -> tuple[Any, ...]:
-        """Reads values of the types that `kinds` names, in the letters of `struct`."""
+        """Returns the next values in the file. kinds: their types, in the letters of `struct`."""
         return struct.unpack("<" + kinds, self.take(struct.calcsize("<" + kinds)))
 
     def name(self) -> str:
-        """Reads text up to the next zero byte."""
+        """Returns the text up to the next zero byte."""
         end = self.data.find(b"\0", self.at)
         size = (end if end >= 0 else len(self.data)) - self.at
         return self.take(size + 1)[:-1].decode("utf-8", "replace")

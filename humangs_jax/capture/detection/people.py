@@ -106,7 +106,7 @@ class Detection(NamedTuple):
     """Point whose distance from the hips is the body's size, (2,), pixels."""
 
     def crop(self) -> Crop:
-        """Returns the square that the landmark network looks at."""
+        """Returns the square of the photo that the landmark network looks at for this person."""
         x, y = self.head - self.hips
         return Crop(
             self.hips, 2 * ENLARGED * float(np.hypot(x, y)), float(np.pi / 2 - np.arctan2(-y, x))
@@ -197,8 +197,8 @@ class Networks:
         return outputs_of(self._runs[which], image)
 
     def detect(self, photo: Float[np.ndarray, "h w 3"], window: Crop) -> list[Detection]:
-        """Finds the people in an upright window of a photo, and returns them with the best score
-        first.
+        """Returns the people that the detector finds in an upright window of a photo. The person
+        with the best score comes first.
 
         photo: values in [0, 1]. Beyond the photo the window is black.
         """
@@ -235,8 +235,8 @@ class Networks:
 def sampled(
     photo: Float[np.ndarray, "h w 3"], crop: Crop, size: int, outside: float | None = None
 ) -> Float[np.ndarray, "size size 3"]:
-    """Samples a crop of the photo bilinearly at (size, size) points. outside: value beyond the
-    photo. None: the value at the photo's edge.
+    """Returns (size, size) samples of a crop of the photo, bilinearly interpolated, (size, size,
+    3). outside: value beyond the photo. None: the value at the photo's edge.
     """
     steps = np.arange(size) / size
     points = crop.to_photo(np.stack(np.meshgrid(steps, steps), axis=-1))
@@ -248,8 +248,8 @@ def bilinear(
     points: Float[np.ndarray, "a b 2"],
     outside: float | None = None,
 ) -> Float[np.ndarray, "a b *c"]:
-    """Interpolates an image at points (x, y), where whole numbers are the middles of pixels.
-    outside: value beyond the image. None: the value at the image's edge.
+    """Returns the image interpolated at points (x, y), (a, b, ...). Whole numbers are the centres
+    of pixels. outside: value beyond the image. None: the value at the image's edge.
     """
     height, width = image.shape[:2]
     x, y = points[..., 0], points[..., 1]

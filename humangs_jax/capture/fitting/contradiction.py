@@ -102,12 +102,13 @@ def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | 
     """Returns the contradiction between the keypoints of one person and the calibration of the
     photos, or None.
 
-    The result is None in these cases:
-    - Keypoints and calibration agree, or too few landmarks are seen in several views.
-    - They agree after the cameras that `find_camera_errors` finds were corrected.
-    - No usual mistake explains the contradiction, and all views except one agree.
-    - No remedy is known and the contradiction is small. The person may have moved between the
-      photos.
+    The result is None if keypoints and calibration agree, or if too few landmarks are seen in
+    several views. It is None if they agree after the cameras that `find_camera_errors` finds were
+    corrected. If no usual mistake explains the contradiction, it is None if all views except one
+    agree.
+
+    If no remedy is known, a small contradiction gives None, too, because the person may have moved
+    between the photos.
     """
     K = np.asarray(photos.cameras.K, np.float64)
     matrices = np.asarray(photos.cameras.cam_from_world, np.float64)

@@ -185,8 +185,8 @@ def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfi
 
 
 def _body_pose_std(names: Sequence[str], config: CaptureRefineConfig) -> Float[Array, "a 3"]:
-    """Returns the standard deviations of the rotations of a free joints, (a, 3), radians. names:
-    names of these joints.
+    """Returns the standard deviations of the free joints' rotations, (a, 3), radians. names: names
+    of the free joints.
     """
     factors = [
         next((factor for word, factor in config.by_joint if word in name), 1.0) for name in names

@@ -66,7 +66,7 @@ class MeshEdges(NamedTuple):
     """The edges of a triangle mesh."""
 
     ends: Int[np.ndarray, "e 2"]
-    """Vertices at both ends, (e, 2)."""
+    """Indices of the vertices at both ends, (e, 2)."""
     faces: Int[np.ndarray, "e 2"]
     """Faces on both sides, (e, 2). The second is -1 if the edge has only one face."""
 
