@@ -65,8 +65,8 @@ class Checks:
     observations: int
     """Number of observations."""
     distance: float | None
-    """Median distance of the cameras from the point where their axes meet, along these axes,
-    metres. None if the axes are parallel, or if there is one camera.
+    """Median distance from the cameras to the point where their optical axes meet, measured along
+    the axes, metres. None if the axes are parallel, or if there is one camera.
     """
     warnings: tuple[str, ...]
     """Properties that look wrong, one line each."""

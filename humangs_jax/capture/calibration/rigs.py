@@ -2,10 +2,10 @@
 EasyMocap, Panoptic, multical, TOML and Qualisys.
 
 In OpenCV's convention a world point X is at R X + T in the camera, and pixel centres are at whole
-numbers. A camera's values are either in a separate map, `{"cam00": {"K": .., "R": .., "T": ..,
-"imgSize": [W, H]}}`, or the values of all cameras are in one map with the camera's name at the end
-of each key: `K_01`, `dist_01`, `Rot_01` or `R_01` (matrix or rotation vector), `T_01`, with the
-list `names`, as in EasyMocap's intri.yml and extri.yml
+numbers. There are two layouts. Each camera's values can be in a separate map, `{"cam00": {"K": ..,
+"R": .., "T": .., "imgSize": [W, H]}}`. Or the values of all cameras are in one map, with the
+camera's name at the end of each key: `K_01`, `dist_01`, `Rot_01` or `R_01` (matrix or rotation
+vector), `T_01`, and the list `names`. EasyMocap's intri.yml and extri.yml are like this
 (https://chingswy.github.io/easymocap-public-doc/database/1_camera.html).
 
 The YAML of OpenCV's FileStorage is not quite YAML: the header is `%YAML:1.0`, and flow maps have no

@@ -1,5 +1,5 @@
-"""Fits a body to photos with cameras and keypoints. Reports how well the body is known and how well
-it agrees with the keypoints.
+"""Fits a body to photos with cameras and keypoints. Reports the uncertainty of the body, and how
+well it agrees with the keypoints.
 """
 
 import dataclasses

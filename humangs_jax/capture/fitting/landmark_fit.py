@@ -94,13 +94,15 @@ class LandmarkFit:
     noise: Float[Array, " m"]
     """Standard deviation of the detections in each frame, (m,), pixels."""
     state: FitState
-    """The result in units of the problem's origin."""
+    """State at the end of the fit: deviations from the origin of `keypoint_problem`."""
     smoothness: Float[Array, ""]
     """Expected acceleration that was used, (), metres per frame squared. 0 if frames are
     independent.
     """
     certainty: Float[Array, " k"]
-    """Certainty of each landmark, (k,): the noise of all landmarks over its noise."""
+    """Certainty of each landmark, (k,): the noise of all landmarks, divided by the noise of this
+    one.
+    """
 
 
 @checked_arguments
@@ -339,8 +341,8 @@ def _stages(problem: KeypointProblem, targets: Targets) -> _Stage:
     ones, none = jnp.ones_like(trunk), jnp.zeros_like(trunk)
 
     def free(shape, joints):
-        """Returns which numbers move: orientation and position always, shape and joints if asked
-        for.
+        """Returns which numbers of a state move. Orientation and position always move. shape:
+        whether the shape moves. joints: whether each joint moves.
         """
         return replace(
             resting,
@@ -368,7 +370,7 @@ def _noise_found(
     problem: KeypointProblem, observations: Observations, states: FitState
 ) -> Float[Array, " m"]:
     """Returns the noise of the detections in each frame, (m,), pixels. It is estimated from the
-    errors that the states leave.
+    errors of the keypoints in these states.
     """
 
     def of_frame(seen, state):

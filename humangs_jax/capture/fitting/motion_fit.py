@@ -639,10 +639,11 @@ def _matrix(turn: Rotation, shift: Float[np.ndarray, "3"]) -> Float[np.ndarray, 
 def betas_of_joints(
     body: BodyModel, rest_joints: Float[np.ndarray, "j 3"]
 ) -> Float[np.ndarray, " s"]:
-    """Returns the shape whose joints in the T-pose are nearest to `rest_joints`, up to a
-    translation. It is used for the joints of an avatar.
+    """Returns the shape coefficients for which the joints in the T-pose are nearest to
+    `rest_joints`, up to a translation, (s,). It is used for the joints of an avatar. rest_joints:
+    (j, 3), metres.
 
-    Raises: ValueError for another number of joints.
+    Raises: ValueError if the number of joints is not the body's.
     """
     body = without_expression(body)
     mean = np.asarray(body.joint_regressor, np.float64) @ np.asarray(body.template, np.float64)

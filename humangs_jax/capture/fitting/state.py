@@ -240,9 +240,9 @@ radians for rotations, and in metres for positions.
 
 @pytree_dataclass
 class StateStd:
-    """Standard deviations of the deviations from an origin.
+    """Expected sizes of the deviations from an origin, as standard deviations.
 
-    They are numbers. They are arrays () if one compiled program is used for all values.
+    They are numbers, or arrays () if one compiled program is used for all values.
     """
 
     focal: Float[Array, ""] | float = 0.05
