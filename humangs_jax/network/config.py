@@ -109,8 +109,8 @@ class HumanGSConfig:
 
     @property
     def tokens(self) -> TokenSelection:
-        """The selection of tokens that is used: the runtime's, or that of the conventions if it is
-        None.
+        """The selection of tokens that is used: `Runtime.tokens`, or if this is None
+        `Conventions.tokens`.
         """
         return self.forward_context().tokens
 
@@ -122,8 +122,8 @@ class HumanGSConfig:
 
     @property
     def image_size(self) -> int:
-        """Side of the photos that is used, pixels: the runtime's, or that of the conventions if it
-        is None.
+        """Side of the photos that is used, pixels: `Runtime.image_size`, or if this is None
+        `Conventions.image_size`.
         """
         return self.runtime.image_size or self.conventions.image_size
 

@@ -1,10 +1,10 @@
 """Converts the authors' released checkpoint to our variables and back. This concerns names,
 layouts, and the configuration that follows from the shapes.
 
-`io.tensors` reads the files, without torch. From the release to here, layouts change so: linear
-(out, in) -> (in, out); convolution (out, in, kh, kw) -> (kh, kw, in, out); 1x1 convolution (out,
-in, 1, 1) -> (in, out); transposed convolution (in, out, kh, kw) -> (kh, kw, in, out), unflipped
-(see `upsampler.UpConvolution`).
+`io.tensors` reads the files, without torch. From the release to this package, layouts change as
+follows: linear (out, in) -> (in, out); convolution (out, in, kh, kw) -> (kh, kw, in, out); 1x1
+convolution (out, in, 1, 1) -> (in, out); transposed convolution (in, out, kh, kw) -> (kh, kw, in,
+out), unflipped (see `upsampler.UpConvolution`).
 """
 
 import dataclasses
@@ -64,9 +64,9 @@ class Layout(NamedTuple):
     """A conversion of a tensor from the release's layout to ours, and its inverse."""
 
     from_release: Callable[[np.ndarray], np.ndarray]
-    """Returns the array in our layout of an array in the release's layout."""
+    """Takes an array in the release's layout, and returns it in our layout."""
     to_release: Callable[[np.ndarray], np.ndarray]
-    """Returns the array in the release's layout of an array in our layout."""
+    """Takes an array in our layout, and returns it in the release's layout."""
 
 
 SAME = Layout(lambda x: x, lambda x: x)
@@ -183,12 +183,12 @@ def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
 
 
 def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConfig:
-    """Returns the configuration with the sizes of the tensors. Settings that shapes do not show are
-    taken from `presets.published`.
+    """Returns the configuration of a network with tensors of these shapes. Settings that shapes do
+    not show are taken from `presets.published`. Each vertex is taken to have one tight Gaussian.
 
-    head_width: width of a head, for a network without normalised queries and keys, where no shape
-    shows it. One Gaussian of each vertex counts as tight. Raises: ValueError for a variant that is
-    not supported, or if a tensor that determines a size is missing or has another number of axes.
+    head_width: width of an attention head. It is needed if queries and keys are not normalised,
+    because no shape shows it then. Raises: ValueError for a variant that is not supported, or if a
+    tensor that determines a size is missing or has another number of axes.
     """
     if UNSUPPORTED in state:
         raise ValueError(
@@ -270,11 +270,11 @@ def _count_layers(state: StateDict) -> int:
 
 def _infer_heads(state: StateDict, head_width: int | None) -> dict[str, Any]:
     """Returns two arguments of `TransformerConfig` by name: the width of a head, and whether
-    queries and keys have norms. The shape of the norms gives the width; without norms it is
-    `head_width`.
+    queries and keys have norms. The width is taken from the shape of the norms, or from
+    `head_width` if there are no norms.
 
-    Raises: ValueError without norms if `head_width` is None or below 1, or if norms have another
-    width.
+    Raises: ValueError if there are no norms and `head_width` is None or below 1, or if the norms
+    have another width than `head_width`.
     """
     if not any(key.endswith((".attn.q_norm.weight", ".attn.k_norm.weight")) for key in state):
         if head_width is None:

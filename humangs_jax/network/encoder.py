@@ -38,8 +38,8 @@ from humangs_jax.rendering.mesh.rasterizer import BACKGROUND
 TEXTURE_STD = 0.1
 """Standard deviation of the neural texture before training."""
 NOWHERE = 3.0
-"""Value of all channels of the pixels in slots without a patch. As a position it lies outside of
-the neural texture, whose gradient then costs nothing.
+"""Value of all channels of the pixels in slots that hold no patch. As a canonical position it lies
+outside of the neural texture, so that such pixels add nothing to the texture's gradient.
 """
 
 
@@ -253,10 +253,10 @@ def encoder_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "
 
 
 def _photo_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
-    """Returns the input at every pixel, (v, h, w, 12), of an encoder without cameras and poses.
+    """Returns the input of an encoder without cameras and poses at every pixel, (v, h, w, 12).
 
-    The channels are rgb, then in place of rays the pixel's place (x, y) in [-1, 1] and its sines
-    and cosines, then zeros in place of the canonical position.
+    Three channels are rgb. Six replace the ray: the place (x, y) of the pixel in the photo, in [-1,
+    1], sin(pi x), sin(pi y), cos(pi x) and cos(pi y). Three zeros replace the canonical position.
     """
     height, width = inputs.images.shape[1:3]
 

@@ -124,8 +124,8 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     """Returns fresh variables of a network, float32.
 
     Args:
-        key: of JAX's random numbers.
-        config: of the network.
+        key: random key of JAX.
+        config: configuration of the network.
 
     Returns:
         {"params": {"encoder", "reader", "decoder", "driver"}, "batch_stats": {"encoder"}}. A part
@@ -213,8 +213,8 @@ def part_variables(variables: Variables, part: str) -> Variables:
 
 
 def _example_inputs(parts: Architecture) -> HumanGSInputs:
-    """Returns inputs of one view of two by two patches with one vertex, which are enough to find
-    shapes.
+    """Returns the smallest inputs that show the shapes of a network's variables: one view of 2 x 2
+    patches, and a body of one vertex.
     """
     side, wanted = 2 * parts.encoder.patch_size, parts.surface_map
     grid, vertex = jnp.zeros((1, side, side)), jnp.zeros((1, 1, 3))

@@ -17,10 +17,10 @@ a position (0 for texels that do not exist),
     sum_c w_c (bias + sum_ab K_ab x[c + (a, b) - 1])
         = bias * sum_c w_c + sum_ab K_ab (sum_c w_c x[c + (a, b) - 1]).
 
-XLA's CPU backend turns the two convolutions of a convolution's gradient into ones that its library
-knows, but looks for them outside of loops only. In a loop, as over the subjects of a batch, they
-ran thirty times slower. Here they are written as the library wants them: batch, two axes of space,
-channels.
+The gradient of a convolution consists of two more convolutions. XLA's CPU backend rewrites them
+into a form that its library knows, but only outside of loops. In a loop, such as the one over the
+subjects of a batch, they ran thirty times slower. So they are written here in the form of the
+library: batch, two axes of space, channels.
 """
 
 from typing import Any, Literal
@@ -36,8 +36,8 @@ from humangs_jax.core.array_types import Array, Float
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 KERNEL = 3
 REACH = KERNEL // 2 + 1
-"""Texels of padding around a map. A texel that weighs on a position may lie one texel outside, and
-its neighbours one texel further.
+"""Texels of zeros that are put around a map. Interpolation reads texels up to one outside of the
+map, and the kernel reads the neighbours of these texels.
 """
 OUTSIDE = -4.0
 """A texel index outside of every map, together with its neighbourhood. Reading there gives zeros,
@@ -67,7 +67,7 @@ def sample_bilinear(
     """Returns the grid's values at texel indices, interpolated bilinearly between texel centres.
     Texels outside of the grid count as zeros.
 
-    origin: texel index, of both axes, that is added to `indices`. If `indices` are relative to the
+    origin: number that is added to both coordinates of `indices`. With `indices` relative to the
     middle of the grid, float32 keeps more digits of their fractions. Positions that are outside by
     a texel or more, infinite or NaN give zero with zero gradient.
     """
@@ -113,12 +113,12 @@ def sample_nearest(grid: Float[Array, "h w"], indices: Float[Array, "*p 2"]) -> 
 def sample_neighborhoods(
     grid: Float[Array, "h w c"], indices: Float[Array, "p 2"]
 ) -> tuple[Float[Array, "p 3*3*c"], Float[Array, " p"]]:
-    """Returns the 3 x 3 texels around each position, interpolated, (p, 9 c), and the coverage sum_c
-    w_c of each position, (p,). These are the two sums over c in the module's docstring. Texels are
-    in rows, and channels run fastest.
+    """Returns the interpolated values at the 3 x 3 places around each position, one texel apart,
+    (p, 9 c), and the coverage of each position, (p,). Places are in rows, and channels run fastest.
 
-    indices: texel indices (x, y), see `network.maps`. Positions that are outside by a texel or
-    more, infinite or NaN give zeros with zero gradient.
+    The coverage is the sum of the bilinear weights of the texels that exist. It is 1 away from the
+    border. indices: texel indices (x, y), see `network.maps`. Positions that are outside by a texel
+    or more, infinite or NaN give zeros with zero gradient.
     """
     height, width, channels = grid.shape
     size = jnp.asarray([width, height], indices.dtype)
@@ -162,8 +162,8 @@ def convolve_neighborhoods(
     dtype: Any = None,
 ) -> Float[Array, "n d"]:
     """Returns the convolution at n positions, (n, d): the kernel times each neighbourhood, plus the
-    bias times the coverage. Neighbourhoods may be means of several. The products are in `dtype`,
-    the result in the type of the coverages.
+    bias times the coverage. A neighbourhood and its coverage may also be means over several
+    positions. The products are in `dtype`, the result has the type of the coverages.
     """
     x, kernel = promote_dtype(neighborhoods, kernel, dtype=dtype)
     products = jnp.matmul(

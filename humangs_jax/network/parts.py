@@ -76,12 +76,12 @@ class HumanGSInputs:
     "normal".
     """
     relative_vertex_spacing: Float[Array, " n"] | None = None
-    """Distance between vertices, relative to that in the mesh with which the weights were trained,
-    (n,). None: 1 everywhere.
+    """Distance between neighbouring vertices, divided by their distance in the mesh with which the
+    weights were trained, (n,). None: 1 everywhere.
     """
     skinning_weights: Float[Array, "n j"] | None = None
-    """Skinning weights of the body, (n, j), for decoders whose Gaussians are not those of
-    vertices.
+    """Skinning weights of the body, (n, j), for decoders whose Gaussians do not belong to one
+    vertex each.
     """
     texels: Texels | None = None
     """The map of the body's surface, for parts that work on one, or None."""
@@ -115,8 +115,8 @@ class ForwardContext(NamedTuple):
 
     @property
     def tokens(self) -> TokenSelection:
-        """The selection of tokens that is used: the runtime's, or that of the conventions if it is
-        None.
+        """The selection of tokens that is used: `Runtime.tokens`, or if this is None
+        `Conventions.tokens`.
         """
         return self.runtime.tokens or self.conventions.tokens
 
@@ -159,11 +159,12 @@ class Shells:
     distances: Float[Array, " s"]
     """Distances of the points from the surface, (s,), normalised units."""
     colors: Float[Array, "n s 3"]
-    """Mean photo color, (n, s, 3), over the views in which the point is visible and in the
-    foreground, weighted by how much the posed normal faces the view. Grey without such a view.
+    """Mean photo color of each point, (n, s, 3). A view counts if the point is visible and in the
+    foreground there. Its weight is the cosine of the angle between the posed normal and the
+    direction to the camera. Grey if no view counts.
     """
     seen: Float[Array, "n s"]
-    """Sum of the weights of these views, divided by the number of all views, (n, s)."""
+    """Sum of the weights in `colors`, divided by the number of real views, (n, s)."""
     inside: Float[Array, "n s"]
     """Mean mask at the point over the views that contain it, (n, s). It is 1 if no view contains
     the point.
@@ -199,8 +200,9 @@ class HumanGSOutputs:
     gaussians: Gaussians
     """The Gaussians, metres. Without `skinning_weights` they are g = n * k, ordered by vertex."""
     tight_offsets: Float[Array, "n t 3"] | None = None
-    """Offsets of the tight Gaussians from their vertex, or of each Gaussian from its place, (n, t,
-    3), normalised units. The tightness loss keeps them small. None: that loss is 0.
+    """Offsets that the tightness loss keeps small, (n, t, 3), normalised units. They are the
+    offsets of the tight Gaussians from their vertex. In decoders without vertices they are the
+    offsets of all Gaussians from their places. None: the loss is 0.
     """
     skinning_offsets: Float[Array, "g j"] | None = None
     """Logits of the skinning head, (n * k, j), or None (see
@@ -215,8 +217,8 @@ class HumanGSOutputs:
     vertex each. None: the body's weights.
     """
     scene: PyTree = None
-    """The data from which a driver draws every target: the features, unless the decoder sets it.
-    None without a driver, unless the decoder sets it.
+    """The data from which a driver draws every target. If there is a driver and the decoder leaves
+    this None, it becomes the features.
     """
 
     @property
@@ -295,7 +297,7 @@ class TargetDecoder(Part, nn.Module):
     """
 
     def __call__(self, outputs: HumanGSOutputs, target: Target, ctx: ForwardContext) -> PyTree:
-        """Returns the outputs corrected for a target, or its image."""
+        """Returns the outputs, corrected for a target, or the image of the target."""
         raise NotImplementedError
 
     @nn.nowrap

@@ -44,7 +44,8 @@ from humangs_jax.network.parts import (
 from humangs_jax.network.upsampler import KAIMING
 
 DEPTH_EPSILON = 1e-6
-"""Number added to z before the division, as published."""
+"""Number that is added to the depth z of a vertex before x and y are divided by it, as published.
+"""
 DEPTH_TOLERANCE = 0.05
 """A vertex counts as seen if it lies less than this behind the rasterized surface, normalised
 units.
@@ -52,8 +53,8 @@ units.
 UNSEEN_COLOR = 0.5
 """Photo color of a vertex that no view sees."""
 WEIGHT_EPSILON = 1e-6
-"""Total weight of the views above which a point counts as seen. The weight of a view is the cosine
-of the angle at which the surface faces it.
+"""A point counts as seen if the sum of the weights of its views is above this. The weight of a view
+is the cosine of the angle between the normal and the direction to the camera.
 """
 
 
@@ -247,8 +248,8 @@ def photo_colors(
 
 
 def on_the_person(shells: Shells) -> Bool[Array, " n"]:
-    """Returns whether any photo shows the person at any distance along the normal of each vertex,
-    (n,). True also if no photo contains one of the points.
+    """Returns whether any photo shows the person at any of a vertex's points along the normal,
+    (n,). Also True if one of these points is in no photo.
     """
     return jnp.any(shells.inside > 0, axis=1)
 
@@ -264,12 +265,12 @@ def sample_shells(
     present: Bool[Array, " v"],
     grid: PixelGrid,
 ) -> Shells:
-    """Returns the colors and masks of the photos at `distances` from the posed vertices, over the
-    views that are `present`.
+    """Returns the colors and masks of the photos at points along the normals of the posed vertices,
+    averaged over the views that are `present`.
 
     images: in [0, 1]. foreground: pixels of the person or the body. depth_maps: rasterized z of the
     body, -1 on background. cameras, vertices: normalised units. normals: unit, of the posed body.
-    distances: ascending, normalised units.
+    distances: of the points from the vertices, ascending, normalised units.
     """
     steps = jnp.asarray(distances, vertices.dtype)
     count = vertices.shape[1]

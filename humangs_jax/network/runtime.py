@@ -161,18 +161,17 @@ class Conventions:
     tokens: TokenSelection = "all"
     """Patches that became tokens."""
     pixels: Literal["all", "person"] = "all"
-    """Pixels that count. "person": only those of the masks, if there are masks. A photo then does
-    not see the body where the body covers background. With shells, Gaussians of vertices that lie
-    off the person in all photos get opacity 0.
+    """Pixels that count. "person": if a photo has a mask, only the pixels of the mask count. Parts
+    of the body that cover background in a photo are then unseen there. With shells, Gaussians get
+    opacity 0 if their vertex lies off the person in all photos.
     """
     position_map: Literal["plain", "gouraud"] = "plain"
     """How position maps are drawn: canonical positions that are interpolated ("plain"), or lit by a
     point light as in the release ("gouraud").
     """
     ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
-    """How ray origins are normalized: they are divided by the unit of the subject once or twice.
-    The release divides camera centres by the unit, and divides ray origins that it takes from them
-    once more ("twice_normalized"), so that the moments of its rays fit no camera.
+    """How often ray origins are divided by the unit of the subject: once ("normalized") or twice
+    ("twice_normalized"). The release divides twice, so that the moments of its rays fit no camera.
     """
     pool: Literal["visible", "all"] = "visible"
     """Views that are averaged for a vertex: those that see the vertex ("visible", as in the paper),
@@ -193,8 +192,8 @@ class Conventions:
     light: bool = False
     """Whether other poses are drawn in the light of the photos (`Avatar.light`)."""
     pixel_footprint: Length | None = None
-    """Size that a pixel of the training images has on the person, metres, if the low-pass of the
-    images is to be part of the scales (`Gaussians.pixel_footprint`). None: only the renderer
+    """Size of a pixel of the training images on the person, metres. With a number, the blur of such
+    a pixel is part of the Gaussians' scales (`Gaussians.pixel_footprint`). None: only the renderer
     applies a low-pass.
     """
     body_vertices: Vertices | None = knob(

@@ -47,9 +47,9 @@ class UpConvolution(nn.Module):
     features).
 
     Output row 2i needs input rows i - 1 and i, under kernel rows 3 and 1. Output row 2i + 1 needs
-    input rows i and i + 1, under kernel rows 2 and 0. The same holds for columns. So it is computed
-    as one matrix product of all 2x2 neighbourhoods to 4 * features channels, which are then
-    interleaved. As a dilated convolution, or a 2x2 one, its backward pass on a CPU would take
+    input rows i and i + 1, under kernel rows 2 and 0. The same holds for columns. So one matrix
+    product takes each 2x2 neighbourhood to 4 * features channels, which are then interleaved. If
+    this were written as a dilated or a 2x2 convolution, the backward pass on a CPU would take
     twenty times as long.
 
     The kernel (4, 4, c, features) is stored unflipped: input pixel (i, j) adds kernel[a, b] to
@@ -59,7 +59,7 @@ class UpConvolution(nn.Module):
     features: int
     """Number of output channels."""
     dtype: Any = None
-    """Type of the arithmetic; None: that of input and parameters."""
+    """Type of the arithmetic; None: the type of input and parameters."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v 2*h 2*w features"]:
@@ -89,7 +89,7 @@ class Upsampler(nn.Module):
     config: UpsamplerConfig
     """Sizes of the upsampler."""
     dtype: Any = None
-    """Type of the arithmetic; None: that of input and parameters."""
+    """Type of the arithmetic; None: the type of input and parameters."""
     axis_name: str | tuple[str, ...] | None = None
     """Axes of `vmap` over which batch statistics are shared."""
 

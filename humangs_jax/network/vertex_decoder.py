@@ -72,8 +72,8 @@ class VertexDecoder(Decoder):
     skinning_joints: Count | None = None
     """Number of joints of the head that corrects skinning weights. None: no such head."""
     offset_scale: Spread | None = None
-    """Bound of the offsets, by tanh, normalised units. The distance that shells add is not bounded.
-    None leaves offsets unbounded, as published.
+    """Bound of each coordinate of an offset, normalised units. It is applied by tanh, before the
+    distance of the shells is added. None: offsets are unbounded, as published.
     """
     initial_log_scale: Bias = -3.0
     """Initial bias of the scales, before the softplus."""
@@ -300,8 +300,8 @@ def activate(
 
 
 def _mean(weights: Float[Array, "n k s"], values: Float[Array, " s"]) -> Float[Array, "n k"]:
-    """Returns the means (n, k) of values (s,) with weights (n, k, s). They are lengths, which an
-    accelerator must not round to 8 bits.
+    """Returns the sums of the values (s,), weighted with `weights`, (n, k). The product has full
+    precision, because values are lengths, which must not be rounded to bfloat16.
     """
     return jnp.matmul(weights, values, precision=EXACT)
 

@@ -50,18 +50,18 @@ def save_weights(
     config: HumanGSConfig,
     dtype: Literal["float32", "float16"] = "float32",
 ) -> None:
-    """Write variables and configuration to a weights file. If writing fails, the path stays as it
+    """Writes variables and configuration to a weights file. If writing fails, the path stays as it
     was.
 
     Args:
         path: the .safetensors file to write or replace.
-        variables: of the network.
-        config: of the network. Its `Runtime` is not written.
+        variables: variables of the network.
+        config: configuration of the network. Its `Runtime` is not written.
         dtype: type of the stored numbers. float16 halves the file.
 
     Raises:
-        ValueError: naming its key, if a tensor does not fit the configuration, is not finite, or
-            overflows float16.
+        ValueError: which names the key, if a tensor does not fit the configuration, is not finite,
+            or overflows float16.
 
     Examples:
         >>> hg.save_weights("mine.safetensors", variables, config, "float16")
@@ -93,18 +93,20 @@ def shipped_checksum() -> str:
 
 @checked_arguments
 def load_weights(path: str | os.PathLike[str] | None = None) -> tuple[Variables, HumanGSConfig]:
-    """Reads variables (float32) and configuration of a weights file, with default `Runtime`.
+    """Returns the variables, float32, and the configuration of a weights file, with the default
+    `Runtime`.
 
     Args:
         path: a .safetensors file of this package. None: the shipped weights.
 
     Returns:
-        The variables for `reconstruct`, and the network's configuration.
+        The variables, as `reconstruct` takes them, and the network's configuration.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: naming file and key: no weights file of this package; a tensor is missing,
-            unknown, of the wrong shape or not finite; the contents are not those of the checksum.
+        ValueError: which names file and key, if the file is no weights file of this package, if a
+            tensor is missing, unknown, of the wrong shape or not finite, or if the contents do not
+            fit the checksum.
 
     Examples:
         >>> variables, config = hg.load_weights()

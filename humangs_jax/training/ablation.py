@@ -37,8 +37,8 @@ BASE = "base"
 CONFIDENCE = 0.95
 DEFAULT_METRIC = "psnr_fg"
 LONGEST_NAME = 100
-"""Largest number of characters of a variant's name in a folder's name. File systems allow 255
-bytes.
+"""Largest length of the name of a variant's folder, in characters, before a checksum is added. File
+systems allow 255 bytes.
 """
 People = int | Sequence[str | Path] | SourceFactory
 
@@ -147,11 +147,11 @@ def ablate(
         variants: for each variant, by its name, the fields that change. They are values by path, as
             `vary` takes them.
         seeds: number of runs of the base and of each variant.
-        people: people to train on. This is a number of synthetic people, who are rendered during
-            training, or capture folders, or a function that makes a source.
-        validation: other people to compare on, in the same three forms. A source shows its first
-            eight people, and the other forms show everybody. Photos and targets are those of the
-            base for all variants.
+        people: people to train on. They are given as a number of synthetic people, who are rendered
+            during training, as capture folders, or as a function that makes a source.
+        validation: other people to compare on, in the same three forms. Of a function's source the
+            first eight people are used, of a number or of folders all. All variants are compared on
+            the photos and targets of the base.
         out: folder of the runs.
         metric: name of the metric of validations to compare, such as "psnr", "psnr_fg" or "ssim".
         body: body that the people's parameters belong to. None: the shipped one.
@@ -164,11 +164,12 @@ def ablate(
         intervals.
 
     Raises:
-        ValueError: before the first run, if a variant cannot be trained. It may be named "base",
-            change the seed, have a path that is no field, describe a network that cannot be made,
-            need a loss network that is missing, or lack people on disk that the base can use. Also
-            if there is no such metric, or `seeds` is below 1. Later, if a folder holds a run of
-            other settings, or if there is nobody to compare on.
+        ValueError: before the first run, if there is no such metric, `seeds` is below 1, or a
+            variant cannot be trained. A variant cannot be trained if it is named "base", changes
+            the seed, has a path that is no field, describes a network that cannot be made, needs a
+            loss network that is missing, or cannot use a person on disk that the base can use.
+            During the runs, if a folder holds a run of other settings, or if there is nobody to
+            compare on.
         TrainingInterrupted: after Ctrl-C. What is trained is kept.
 
     Examples:
@@ -299,9 +300,9 @@ def _unusable(make: SourceFactory, config: TrainConfig) -> dict[str, str]:
 def _folder_names(names: Sequence[str]) -> dict[str, str]:
     """Returns the name of a folder for each variant.
 
-    It is the variant's name, with `_` for characters that file systems dislike. A checksum is added
-    if the name is longer than `LONGEST_NAME` or has no other characters than `.`, `+` and `-`, or
-    if an earlier variant has that name, in upper or lower case.
+    The folder is named as the variant, with `_` for characters that file systems dislike. A
+    checksum is added in three cases: the name is longer than `LONGEST_NAME`, it has only the
+    characters `.`, `+` and `-`, or another folder already has the same name, regardless of case.
     """
     plain = {name: re.sub(r"[^\w.+-]+", "_", name) for name in names}
     unusable = [
@@ -322,8 +323,8 @@ def _folder_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def _compared(validation: People, body: BodyModel, base: TrainConfig) -> tuple[SourceFactory, int]:
-    """Returns the people that all runs are compared on, and the number of them that are
-    looked at.
+    """Returns a function that makes a source of the people on whom all runs are compared, and the
+    number of people to look at.
     """
     found, count = _source(validation, body, base, "validation", each_once=True), VALIDATED
     if isinstance(validation, int):

@@ -132,8 +132,9 @@ def augment_photos(
 ) -> tuple[Float[Array, "v h w 3"], Float[Array, "v h w"]]:
     """Returns photos on white with errors of exposure, tint and masks, and these masks.
 
-    A photo is m f + (1 - m) of its mask m and the person's color f. It becomes m' (m g f + (1 - m)
-    b) + (1 - m') with the gain g, the mask m' and the color b of a background.
+    A photo with the mask m and the person's color f has the color m f + (1 - m). Let g be the gain,
+    b the color of a random background, and m' the mask with errors. The result has the color m' (m
+    g f + (1 - m) b) + (1 - m').
     """
     choices = 2 * config.mask_pixels + 1
     radii = jnp.floor(choices * numbers["radii"]).astype(jnp.int32) - config.mask_pixels
@@ -146,8 +147,9 @@ def augment_photos(
 def _grown(
     masks: Float[Array, "v h w"], radii: Int[Array, " v"], most: int
 ) -> Float[Array, "v h w"]:
-    """Returns masks dilated by radii > 0 and eroded by radii < 0, in pixels. Squares grow to
-    squares. most: largest magnitude of a radius.
+    """Returns the masks, each dilated by its radius, or eroded if the radius is negative. The
+    structuring element is a square.
+    radii: pixels. most: largest magnitude of a radius.
     """
     for radius in range(1, most + 1):
         larger, smaller = _largest_near(masks), -_largest_near(-masks)

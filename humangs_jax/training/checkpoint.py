@@ -44,8 +44,8 @@ ADJUSTABLE = (
     "keep_checkpoints",
     "microbatch_size",
 )
-"""Settings that may change in the middle of a run without changing its numbers, except for batch
-statistics that subjects share.
+"""Settings that may change in the middle of a run. They do not change what the run computes, with
+one exception: `microbatch_size` decides which subjects share batch statistics.
 """
 
 
@@ -233,11 +233,12 @@ def _everywhere(value: Any) -> np.ndarray:
 
 
 def _checksum(state: TrainState) -> str:
-    """Returns a checksum of all arrays, 64 bits in hexadecimal. It is the sum of their words, each
-    times an odd number that depends on its place.
+    """Returns a checksum of all arrays, 64 bits in hexadecimal. It is a weighted sum of their
+    entries, read as unsigned integers. The weights are odd, and depend on an entry's array and
+    place.
 
-    If any one word changes, the checksum changes. It does not depend on how arrays lie on devices,
-    because each process adds the shards that it holds.
+    If any one entry changes, the checksum changes. It does not depend on how arrays are divided
+    among devices, because each process adds the shards that it holds.
     """
     total = 0
     for path, leaf in jax.tree_util.tree_leaves_with_path(_as_dict(state)):

@@ -116,9 +116,9 @@ class TrainConfig:
     optimizer: OptimizerConfig = OptimizerConfig()
     """The optimizer and its learning rate."""
     splat: SplatConfig = SplatConfig()
-    """How targets are drawn. Without `max_pairs`, a run on one device measures what the first
-    targets of a stage need, where measuring is worth it. Its buffers then have room for twice that,
-    see `training.room`.
+    """How targets are drawn. If `max_pairs` is None, a run on one device may measure how many pairs
+    the first targets of a stage need, and make room for twice that number. `training.room` says
+    when.
     """
     target_size: Side = 128
     """Side of the targets, pixels."""
@@ -198,8 +198,8 @@ class TrainConfig:
 
 
 def compiled_for(config: TrainConfig) -> TrainConfig:
-    """Returns the configuration with the values of `HOST_SETTINGS`. Runs whose results are equal
-    share their compiled programs.
+    """Returns the configuration with the values of `HOST_SETTINGS`. Runs that differ only in these
+    settings share their compiled programs.
     """
     return dataclasses.replace(config, **HOST_SETTINGS)
 
@@ -311,7 +311,8 @@ def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:
     """Returns the configuration without the losses whose networks are missing. A warning names
     them.
 
-    Structural dissimilarity replaces them: its weight becomes at least that of `LossConfig()`.
+    Structural dissimilarity replaces them. Its weight is raised to the default weight, that of
+    `LossConfig()`, unless it is larger already.
     """
     missing = missing_networks(config, networks)
     if not missing:

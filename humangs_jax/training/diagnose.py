@@ -1,9 +1,9 @@
 """Finds the stage of a training step in which numbers stopped being finite.
 
-Stages are the modules of the network, by their path, and the steps outside of modules that are a
-`parts.tap`. An interceptor of Linen keeps what each stage returns. It also adds zeros to what each
-stage takes and returns: the gradients with respect to these zeros are the gradients that pass back
-at that place.
+Stages are the modules of the network, named by their path, and the steps outside of modules that
+`parts.tap` marks. An interceptor of Linen keeps what each stage returns. It also adds zeros to what
+each stage takes and returns. The gradients with respect to these zeros are the gradients that pass
+back at that place.
 
 This runs in one process on one device. It needs the memory of a step that recomputes nothing.
 JAX_PLATFORMS=cpu helps if an accelerator has too little memory.
@@ -90,7 +90,7 @@ class StageReport:
     name: str = static_field()
     """The name of the stage."""
     values: Named
-    """What the stage returned, or the arrays that were stored there."""
+    """What the stage returned. In a report of stored arrays: the arrays."""
     taken: Named = dataclasses.field(default_factory=dict)
     """Gradients with respect to what the stage took."""
     returned: Named = dataclasses.field(default_factory=dict)
@@ -184,8 +184,9 @@ class Diagnosis:
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """All stored arrays that are not finite, then the stage to blame: the first stage forward,
-        or else the first stage backward.
+        """All stored arrays that are not finite, then at most one array of a stage. This is the
+        first result that is not finite in the forward pass. If all results are finite, it is the
+        first gradient that is not finite in the backward pass.
         """
         stored = [
             Fault("stored", part.name, leaf)
@@ -278,9 +279,10 @@ class Recorder:
     """An interceptor for `nn.intercept_methods` that records the stages of one traced computation,
     in the order in which they end.
 
-    `given` holds what each stage returned, by stage. probes: for each stage, the zeros that are
-    added to what the stage takes and the zeros that are added to what it returns. None: nothing is
-    added, and `shapes` gets the shapes of the zeros.
+    `given` holds the arrays that each stage returned, by the name of the stage.
+    probes: two dicts of zeros for each stage. The first is added to what the stage takes, the
+    second to what it returns. None: nothing is added, and `shapes` gets the shapes that these zeros
+    need.
     """
 
     def __init__(self, probes: dict[str, tuple[Named, Named]] | None = None):
@@ -343,9 +345,9 @@ def observe_subject(
     """Returns the loss of a subject (`subject_loss`) and a report of each stage, in the order in
     which the stages end.
 
-    Blocks are neither looped over nor recomputed, so that each can be watched, and all values are
-    kept. So this needs more memory than a step: the published network at 512 pixels and 4 views
-    keeps 2.4 GB.
+    It runs without `Runtime.scan` and `Runtime.remat`, so that each block can be watched. All
+    values are kept, so it needs more memory than a step of training. The published network keeps
+    2.4 GB at 512 pixels and 4 views.
     """
     config = dataclasses.replace(config, model=config.model.with_runtime(scan=False, remat="none"))
 

@@ -40,7 +40,9 @@ from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.sources import SourceFactory
 
 RASTERIZED = ("posed_vertices", "canonical_vertices", "position_maps", "depth_maps")
-"""Inputs that `prepare_inputs` computes. It copies the others."""
+"""Fields of the inputs that a diagnosis watches as the stage "position maps". `prepare_inputs`
+computes them from the body.
+"""
 
 
 def reconstruct_example(
@@ -63,9 +65,9 @@ def reconstruct_example(
 def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
     """Returns the network's configuration with the token capacity for a step of `views` photos.
 
-    The configured capacity is for the largest of `views.input_counts`, m. Fewer photos, n, get the
-    share (n + 1) / (m + 1) of it, because one photo may show more of a person than the others. More
-    photos get more in proportion.
+    The configured capacity is for m photos, the largest of `views.input_counts`. For n < m photos
+    it is multiplied by (n + 1) / (m + 1), not by n / m, because one photo may show more of a person
+    than the others. For n > m photos it is multiplied by n / m.
     """
     most, capacity = max(config.views.input_counts), config.model.runtime.token_capacity
     if views == most:
@@ -185,11 +187,11 @@ def as_validated(config: TrainConfig) -> TrainConfig:
 
 
 def compared_as(base: TrainConfig, make_source: SourceFactory) -> SourceFactory:
-    """Returns a function that makes a source of the people of `make_source`, with the photos and
-    targets that `base` is validated on.
+    """Returns a function that makes a source of the people of `make_source`, for validations of
+    variants of the run `base`.
 
-    It is for variants of the run `base`. A variant changes only the size of the photos that the
-    network sees.
+    All variants get the photos and targets that `base` is validated on. Only the size of the input
+    photos follows the variant's configuration.
     """
     own = as_validated(base.at(base.steps - 1))
 
@@ -211,9 +213,9 @@ def evaluate(
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
     """Returns the images of one example's targets, and their metrics.
 
-    Metrics are means of psnr, psnr_fg (both dB), ssim, semi_transparent, and lpips if its network
-    is there, and the sums dropped_tokens and overflow. semi_transparent is NaN where the network
-    draws pixels, because there is no alpha.
+    Means over the targets are psnr and psnr_fg (both dB), ssim, semi_transparent, and lpips if its
+    network is there. Counts are dropped_tokens, and overflow of all targets. semi_transparent is
+    NaN if the network draws pixels instead of Gaussians, because there is no alpha then.
     """
     drawn, outputs = predict(variables, body, example, config)
     images, masks = example.targets.images, example.targets.masks

@@ -286,7 +286,7 @@ DROPPED = {
     ),
     "overflow": "(splat, tile) pairs without room, mean: they were not drawn",
 }
-"""What it means if one of these numbers of a validation is not 0."""
+"""For two metrics of a validation, the text that explains a value other than 0."""
 
 
 class TrainingInterrupted(KeyboardInterrupt):
@@ -512,8 +512,8 @@ def _report(
 
 @contextlib.contextmanager
 def stop_requested() -> Generator[Callable[[int], bool], None, None]:
-    """Yields a function that takes the number of steps done, and returns whether to stop after
-    them, because of Ctrl-C or SIGTERM, or because the machine is taken away.
+    """Yields a function that takes the number of steps done and returns whether the run should stop
+    now. The reason is Ctrl-C, SIGTERM, or a machine that is taken away.
 
     All processes must call the function after every step. A single process checks its own signals,
     and a second signal has its usual effect. It receives signals in its main thread only. Several

@@ -27,16 +27,16 @@ MARGIN = 2.0
 they are trained.
 """
 WORTH = 1 << 16
-"""Number of pairs of a traced call from which on the need is measured. With fewer pairs a step
-takes milliseconds, and compiling a program that measures is not worth it.
+"""The need is measured if a traced call would have room for at least this many pairs. With fewer
+pairs a step takes milliseconds, and compiling a program that measures is not worth it.
 """
 MEASURED = 4
 """Number of subjects of a batch that are measured, one after the other."""
 
 
 def usual_room(config: TrainConfig, body: BodyModel) -> int:
-    """Returns the number of pairs that a step has room for if nothing was measured; 0 if the driver
-    draws pixels and no Gaussians. body: the body that carries the Gaussians.
+    """Returns the number of pairs that a step has room for if nothing was measured; 0 if the
+    network has a driver. body: the body that carries the Gaussians.
     """
     parts = config.model.architecture
     if parts.driver is not None:
@@ -88,7 +88,10 @@ def with_twice_the_room(config: TrainConfig, body: BodyModel) -> TrainConfig:
 def needed_room(
     variables: Variables, body: BodyModel, batch: Example, config: TrainConfig
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Returns the largest numbers of rows and of pairs that any target of a batch needs now."""
+    """Returns the numbers of (splat, row of tiles) pairs and of (splat, tile) pairs that the most
+    demanding target of a batch needs with these variables. Each number is the maximum over all
+    targets.
+    """
     size = jnp.asarray([config.target_size, config.target_size])
 
     def of(example: Example) -> tuple[Int[Array, " v"], Int[Array, " v"]]:

@@ -122,10 +122,10 @@ def mixed_people(parts: Sequence[SourceFactory], weights: Sequence[float | int])
 
 def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> SourceFactory:
     """Returns a function that makes a source of the people in a folder of captures, a scene list or
-    a data set (docs/datasets.md), whose body is `body`.
+    a data set (docs/datasets.md).
 
-    split: the split that all people of a synthetic set must belong to, see
-    `synthetic.writer.find_people`. None: any.
+    body: the body model that the people's parameters belong to. split: the split that all people of
+    a synthetic set must belong to, see `synthetic.writer.find_people`. None: any.
     Raises: ValueError if the folder holds none of these, or people of another split.
     """
     if (data / "capture.json").is_file() or any(data.glob("*/capture.json")):
@@ -143,9 +143,10 @@ def training_people(
     body: BodyModel,
     body_file: str | Path = DEFAULT_BODY,
 ) -> SourceFactory:
-    """Returns a function that makes a source of the people of `people_on_disk`, of `on_the_fly`
-    synthetic people who are rendered for every step, or of both, half and half.
+    """Returns a function that makes a source of people to train on.
 
+    They are the people of `people_on_disk`, or `on_the_fly` synthetic people who are rendered for
+    every step. If both are given, each makes half of the examples.
     One process makes the synthetic people once, into out/people.npz. Raises: ValueError if there is
     nobody, or if synthetic people are asked for with another body than the shipped one.
     """

@@ -85,7 +85,7 @@ def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
 
 
 def decayed(params: PyTree) -> PyTree:
-    """Returns True for each parameter that weight decay acts on, else False."""
+    """Returns a tree of bools, True for each parameter that weight decay acts on."""
     return jax.tree.map(lambda x: x.ndim >= 2, params)
 
 

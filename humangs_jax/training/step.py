@@ -34,7 +34,7 @@ shared along this axis.
 COUNTS = ("dropped_tokens", "overflow")
 """Metrics that are sums over a batch; all others are means."""
 AUGMENTED = 1
-"""Number that makes the key of a subject's augmentation from the key of its backgrounds."""
+"""Number that `jax.random.fold_in` adds to a subject's key, to make the key of its augmentation."""
 
 Seed = Shaped[Array, " n"] | Shaped[np.ndarray, " n"]
 """The numbers that `seed_numbers` returns."""
