@@ -207,7 +207,8 @@ FOOT = {
 class PlacedLandmark(NamedTuple):
     """A landmark whose place a fit may move. A left and a right landmark move together.
 
-    This is a plain tuple in code that uses it, because files of `jax.export` give back a tuple.
+    Code unpacks it as a plain tuple and does not read its fields by name, because `jax.export`
+    restores it from files as a plain tuple.
     """
 
     landmark: int
@@ -274,7 +275,9 @@ class LandmarkModel:
 
 
 LESS_CERTAIN = {"hip": 2.0, "shoulder": 1.5, "neck": 1.5, "mid_hip": 1.5, "ear": 1.5}
-"""Factors on the noise of the kinds of landmarks whose position annotators disagree on."""
+"""By kind of landmark, the factor by which its noise is larger than that of other landmarks,
+because annotators disagree on the position. The weight of its error is 1 / factor.
+"""
 
 
 def usual_certainty(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
@@ -386,7 +389,7 @@ def _rows(points: SurfacePoints, rows: Sequence[int]) -> SurfacePoints:
 
 
 def _joint_point(body: BodyModel, joint: int) -> SurfacePoints:
-    """Returns one joint as a point of the surface. The joint carries it alone."""
+    """Returns one joint as a point of the surface, with the skinning weight 1 for this joint."""
     row = body.joint_regressor[joint : joint + 1]
 
     def product(values):
@@ -412,8 +415,8 @@ class _Beside(NamedTuple):
 
 
 def _placed(body: BodyModel, place: _Beside) -> SurfacePoints:
-    """Returns one point beside the sources of a landmark. A shape moves it as it moves the sources
-    on average. The point turns with the joints of the place.
+    """Returns one point at an offset from the mean of the sources of a landmark. Shape coefficients
+    move the point as they move this mean. The point turns with the joints of the place.
     """
     every = surface_points(body)
     points = [
@@ -488,9 +491,9 @@ def _movers(
 ) -> tuple[int, ...]:
     """Returns the indices of the joints whose rotation moves a used joint or a point.
 
-    These are the joints that carry a point with a weight above 0.1, and all ancestors of them and
-    of used joints. A used joint itself is not among them for its own sake, because turning a joint
-    does not move it.
+    These are the joints that carry a point with a weight above 0.1, the ancestors of these joints,
+    and the ancestors of used joints. A used joint does not count itself, because a joint does not
+    move when it turns.
 
     Arguments: joints_used: whether a landmark uses each joint, (j,). point_weights: skinning
     weights of the points, (p, j).

@@ -114,15 +114,15 @@ def blend_leg_weights(
     reach: float,
 ) -> Float[Array, "g j"]:
     """Returns skinning weights (g, j) of points off the skin. Points between the legs get mean
-    weights of the body around them, instead of those of one vertex.
+    weights of the body around them, so that a hem does not tear when the legs part.
 
-    A hem that belongs to the vertices of one leg tears when the legs part. A point at a distance d
-    from its vertex has a mean of the weights of the vertices around it, by a normal kernel whose
-    standard deviation is d. The point keeps its weights if d is less than 3/4 of `reach`, or if one
-    of the legs has no share in that mean, so hair and sleeves stay as they are. It has the mean
-    weights from 5/4 of `reach` on, if each leg has a share of a tenth, and a mixture in between. At
-    most a quarter of the points change, those with the largest d. LHM diffuses weights through a
-    grid of voxels to the same end (https://arxiv.org/abs/2503.10625).
+    The mean for a point is taken over the vertices around it, with a normal kernel. The standard
+    deviation of the kernel is d, the distance of the point from its vertex. The weights move
+    towards the mean by a share, the product of two factors. The first rises from 0 at d = 3/4
+    `reach` to 1 at d = 5/4 `reach`. The second is ten times the share that the leg with the smaller
+    share has in the mean, at most 1. So hair and sleeves keep their weights. At most a quarter of
+    the points change, those with the largest d. LHM diffuses weights through a grid of voxels for
+    the same purpose (https://arxiv.org/abs/2503.10625).
 
     Arguments: points: in the rest pose, metres. distances: of each point from its vertex, metres.
     weights: of the vertex of each point. vertices, vertex_weights: of the body in the rest pose.
@@ -277,8 +277,8 @@ class BodyModel:
     name: str = static_field(default="body")
     """Name of the body in messages."""
     remesh_key: tuple | None = static_field(default=None)
-    """Sizes for which `data.views.gaussian_body` has made this body. None: a body as it was
-    read.
+    """Result of `data.views.remesh_key` for which `data.views.gaussian_body` has made this body.
+    None: that function has not made it.
     """
 
 
@@ -371,7 +371,7 @@ def expressed(
     """Returns the rest body with a pose's expression applied, and the pose without the expression.
     The expression's turns of joints are added to the rotations of the returned pose.
 
-    Raises: ValueError if the number of coefficients is not that of the body's expressions.
+    Raises: ValueError if the pose has another number of coefficients than the body has expressions.
     """
     if pose.expression is None:
         return rest, pose
@@ -416,7 +416,7 @@ def pose_body(body: BodyModel, rest: RestBody, pose: BodyPose) -> PosedBody:
     """Returns a shaped body in a pose. Expression, pose correctives, blend skinning and translation
     are applied in this order.
 
-    Raises: ValueError if the number of coefficients is not that of the body's expressions.
+    Raises: ValueError if the pose has another number of coefficients than the body has expressions.
     """
     rest, pose = expressed(body.expressions, rest, pose)
     vertices = rest.vertices

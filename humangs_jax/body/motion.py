@@ -18,8 +18,8 @@ from humangs_jax.io.reading import check_limit
 
 PELVIS = np.array([0.0, -0.35, 0.0])
 """Position of the root joint of SMPL-X and of the shipped body in T-pose, metres. Worlds are turned
-about this point. The root of another body lies elsewhere, which shifts its motion by a constant
-that `grounded` removes.
+about this point. The root of another body lies elsewhere. Its motion is then shifted by a constant,
+and `grounded` removes this shift.
 """
 
 
@@ -123,13 +123,13 @@ def _between(
 
 
 def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion:
-    """Moves a motion by a constant so that the root joint starts at x = z = 0, and the person
-    stands on y = 0 where the person is lowest.
+    """Returns a motion that is moved by a constant. The root joint then starts at x = z = 0, and
+    the lowest point of the person over all frames is at y = 0.
 
     Arguments:
-        rest: vertices and joints at rest of the body that will move. The lowest joint of the motion
-            decides the height. The sole is as far below it as it is below the lowest joint in
-            T-pose.
+        rest: vertices and joints of the body that will move, at rest. The lowest point is estimated
+            from the lowest joint over all frames. It is taken to be as far below this joint as the
+            sole is below the lowest joint at rest.
         parents: parents of the joints of that body.
     """
     moved = _on_the_floor(rest, parents, motion.rotations, motion.translations)

@@ -55,8 +55,8 @@ def split_long_edges(body: BodyModel, longest: float) -> tuple[BodyModel, sparse
     The original vertices stay first, in their order. Faces are cut into two, three or four along
     the midpoints of their long edges, consistently on both sides of an edge. Texture coordinates
     and decimation order are dropped, because they belong to the original mesh.
-    `relative_vertex_spacing` is the square root of the area around a vertex relative to its
-    original area: 1/2 where every edge has been halved.
+    `relative_vertex_spacing` is the square root of a ratio: the area around a vertex, divided by
+    its original area. It is 1/2 where every edge has been halved.
 
     Returns: the finer body, and a matrix (finer, n). The matrix maps values at the n original
     vertices to the vertices of the finer body, for any quantity that is linear. A midpoint gets the
@@ -181,7 +181,8 @@ def _cut(
 ) -> Int[np.ndarray, "finer 3"]:
     """Returns the faces (finer, 3) after a cut at the midpoints of their sides.
 
-    middles (f, 3): the vertex on side i to i + 1, -1 for a side that is not cut.
+    middles (f, 3): the midpoint of the side from corner i to corner i + 1, as the number of a
+    vertex; -1 for a side that is not cut.
     """
     count = (middles >= 0).sum(1)
     parts = [faces[count == 0]]
@@ -213,12 +214,12 @@ FLATNESS = 100.0
 edge.
 """
 HIDDEN = 0.01
-"""Factor on the cost of vertices that cannot be seen from outside: edges there count as ten times
-shorter.
+"""Factor on the cost of collapsing a vertex that cannot be seen from outside. With 0.01, its edges
+count as if they were ten times shorter.
 """
 RIM = 2
-"""Number of rings of hidden vertices next to visible ones that count as visible, because they hold
-lips and eyelids in place.
+"""Number of rings of hidden vertices next to visible vertices that are treated as visible, because
+they hold lips and eyelids in place.
 """
 VIEWS = 40
 CELL = 0.004
@@ -495,8 +496,8 @@ def _carry_uvs(
 ) -> tuple[Float[Array, "u 2"], Int[Array, "kept 3"]]:
     """Returns texture coordinates (u, 2) and texture faces (kept, 3) for the faces that remain.
 
-    A corner that moved onto another vertex takes the texture vertex of that vertex that is nearest
-    in the texture.
+    A corner whose vertex stays keeps its texture vertex. A corner that moved onto another vertex
+    takes one of the texture vertices there, the nearest in the texture.
     """
     uvs, uv_faces = np.asarray(body.uvs), np.asarray(body.uv_faces)
     # (vertex, texture vertex)

@@ -56,7 +56,7 @@ class Reading(NamedTuple):
     """The arguments of `load_motion` that readers need."""
 
     fps: float | None = None
-    """Frames per second in place of those in the file."""
+    """Frames per second that replace the rate in the file; None: the file's rate."""
     person: int | None = None
     """Number of the person, in a file of several."""
     clip: str | None = None
@@ -102,13 +102,13 @@ def load_motion(
 
     Args:
         path: None for the shipped walk; else a file or a folder of one of `data.formats.MOTIONS`.
-        up: axis of the file's world that points up ("y", "-y", "z" and so on); the motion is turned
-            so that y does. "auto": the format's own, or another one along which people stand on a
-            floor, which is logged as a warning (`rules.up_axis`).
-        fps: frames per second in place of those in the file.
-        rest_joints: joints in T-pose of the body that will move (`avatar.rest_joints`), metres.
-            Skeletons of other programs are converted to this body, and a motion of another number
-            of joints is refused. None: the shipped body.
+            up: axis that points up in the file's world ("y", "-y", "z" and so on). The motion is
+            turned so that y points up. "auto": the axis that is usual in the format, unless people
+            stand along another axis (`rules.up_axis`). A warning then names that axis.
+        fps: frames per second that replace the rate in the file.
+        rest_joints: joints of the body that will move, in T-pose, metres, such as
+            `avatar.rest_joints`. Skeletons of other programs are converted to this body. A motion
+            with another number of joints is refused. None: the shipped body.
         person: the number of the person, in a file of several people.
         clip: the name or number of the animation, in a GLB file of several. None: the first.
 

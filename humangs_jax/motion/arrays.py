@@ -211,8 +211,8 @@ def _part(
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
 ) -> _Rotations:
-    """Returns the rotations of one part of the body, (m, joints, 3). Hands in coefficients of a
-    model are 0, and a note is added.
+    """Returns the rotations of one part of the body, (m, joints, 3). If the file gives hands as
+    coefficients of a hand model, their rotations are 0, and a note is added.
 
     place: name of the part in `PLACES`. values: the array under the key. flat: the same array with
     one row for each frame.
@@ -241,10 +241,10 @@ def _all(
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
 ) -> _Rotations:
-    """Returns the rotations of a pose of which all joints are under one key, (m, joints, 3), from
-    the root on.
+    """Returns the rotations of poses whose joints are all under one key, (m, joints, 3), starting
+    with the root. Joints are in the order of SMPL-X; later joints may be missing.
 
-    Of SMPL's they are the joints of the body, and of SMPL-H's also those of the fingers. values,
+    SMPL's poses give the 22 joints of the body. Poses of SMPL-H also give the fingers. values,
     flat: as in `_part`.
 
     Raises: MotionError if no known layout has that many numbers.
@@ -520,9 +520,9 @@ def _of_frames(
 def _carried(
     places: Float[np.ndarray, "m s 3"], parents: tuple[int, ...]
 ) -> Float[np.ndarray, "m s 3 3"]:
-    """Returns rotations of the bones relative to the first frame, for a file that has none.
+    """Returns rotations of the bones relative to the first frame, for a file with points alone.
 
-    They are the smallest turns that move the bones from their directions in the first frame,
+    They are the smallest rotations that move the bones from their directions in the first frame,
     applied from the root down.
     """
     turns = np.tile(np.eye(3), (*places.shape[:2], 1, 1))

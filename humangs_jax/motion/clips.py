@@ -274,9 +274,8 @@ def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[st
 
 
 def _humanoid(content: dict[str, Any]) -> dict[int, str]:
-    """Returns the names of bones by node, which VRM files and their animations have.
-
-    Nodes themselves may have any names. Empty for other files.
+    """Returns the humanoid bone that a node is, by the number of the node. Only VRM and VRMA files
+    name these bones, and the nodes may have other names. Empty for other files.
     """
     extensions = content.get("extensions")
     if not isinstance(extensions, dict):
@@ -302,8 +301,8 @@ def _joints(
 ) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
     """Returns the nodes that are joints, and the matrices of the joints when the skin was bound.
 
-    The joints are those of the skin that has the most, or all nodes if there is no skin. The
-    matrices (4, 4) are by node, and empty if the skin has none.
+    If there are skins, the joints belong to the skin with most joints. Otherwise all nodes are
+    joints. The matrices (4, 4) are by node. The dict is empty if the skin has no matrices.
 
     Raises: InvalidFileError for a joint that is no node, or for numbers that are not finite.
     """

@@ -176,8 +176,8 @@ def _standing(
 
 
 def has_scores(path: Path) -> bool:
-    """Says whether a JSON file is one of scores. It is one even if some scores are no numbers,
-    which `read_scores` refuses.
+    """Returns whether a JSON file has scores of a face. Scores that are no numbers count, too, and
+    `read_scores` refuses them.
 
     Raises: FileNotFoundError; FileError if it is not JSON.
     """
@@ -228,11 +228,12 @@ def _frames_of(content: Any) -> list[dict[str, Any]] | None:
 
 
 def _scores_of(frame: Any, depth: int) -> dict[str, Any]:
-    """Returns the scores of one frame by ARKit's names, as the file has them; empty if there are
-    none.
+    """Returns the scores of one frame by ARKit's names, with values as in the file; empty if there
+    are no scores.
 
     The scores may be an object of numbers by name or a list of categories, at most `_DEEPEST`
-    levels down. At least one of them is a number: other files have texts or lists by these names.
+    levels down. At least one value must be a number, because other files have texts or lists under
+    these names.
     """
     if depth > _DEEPEST:
         return {}

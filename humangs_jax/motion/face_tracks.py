@@ -84,8 +84,8 @@ def arkit_name(name: str) -> str | None:
 
 
 def of_preset(name: str) -> dict[str, float] | None:
-    """Returns the weight of each of ARKit's shapes that a name stands for: a shape of ARKit or a
-    preset of VRM. None for another name.
+    """Returns the weights of ARKit's shapes that a name stands for, by shape. The name may be a
+    shape of ARKit, with the weight 1, or a preset of VRM. None for another name.
     """
     own = arkit_name(name)
     if own is not None:

@@ -211,11 +211,11 @@ def _limbs(
 
 
 def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
-    """Returns the joints where the two long consecutive bones of a limb begin, meet and end, and
-    the next joint if there is one.
+    """Returns three joints of a limb, where its two main bones begin, meet and end, and the next
+    joint if there is one.
 
-    Of all pairs of consecutive bones, these have the longest shorter bone. None: the limb has fewer
-    than two bones, or they have no length.
+    The main bones are consecutive. Among all pairs of consecutive bones they are the pair whose
+    shorter bone is longest. None: the limb has fewer than two bones, or they have no length.
     """
     bones = lengths[path[1:]]
     if len(bones) < 2:
@@ -321,9 +321,11 @@ def _match_head(source: dict[str, int], plain: Sequence[str], parents: Sequence[
 
 
 def _match_spine(source: dict[str, int], parents: Sequence[int]) -> None:
-    """Adds the spine: our three joints are the first, the middle and the last of the file's.
+    """Adds the spine. Our three joints become the first, the middle and the last joint between the
+    file's pelvis and neck.
 
-    Spines of files have one to five joints, with different names in every program.
+    Files have one to five joints there, with different names in every program. If there are fewer
+    than three, the last one is our third joint, and the first of two is our first.
     """
     chain = []
     if "neck" in source:

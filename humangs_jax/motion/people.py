@@ -321,8 +321,9 @@ def _tracked(image: Mapping[str, Any]) -> list[Person]:
 def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
     """Returns the people of each frame: (name of the frame's file, people).
 
-    If all names of files have at least two numbers, and the last but one differs between files, a
-    file has one person in one frame. Otherwise a file has one frame.
+    The names of files may end in two numbers, of the frame and of the person. This is assumed if
+    all names have at least two numbers and the last but one is not the same in all. Otherwise a
+    file has all people of one frame.
 
     Raises: MotionError or InvalidFileError for a file that is no such frame.
     """

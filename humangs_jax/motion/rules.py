@@ -89,9 +89,10 @@ SIDED = {
 }
 """For each of our joints that has a side, its names in other programs: CMU (cgspeed), Mixamo,
 LaFAN, MotionBuilder, Biovision, Biped, SMPL, Unreal, Unity, VRM, Bandai-Namco, Xsens, SOMA, Rigify,
-Daz, Advanced Skeleton. Names are without the side, and have lower-case letters and digits only. A
-joint of the file is taken once, by the first match: "shoulder" is the upper arm if no other name
-is, else the collar."""
+Daz, Advanced Skeleton. Names are without the side, and have lower-case letters and digits only.
+Each joint of the file is used once, for the first of our joints that it fits. So "shoulder" is the
+upper arm if no better name of the upper arm is there, else the collar.
+"""
 MIDDLE = {
     "pelvis": ("hips", "hip", "pelvis"),
     "neck": ("neck", "neck1", "neck01", "necklower"),
@@ -163,7 +164,7 @@ EXPECTED_NAMES = (
     " a person"
 )
 FEW = 5
-"""Least number of names at which a beginning that all of them share is removed."""
+"""A beginning that all names share is removed if there are at least this many names."""
 
 # Decisions
 # --------------------------------------------------------------------------------------------------
@@ -171,8 +172,9 @@ FEW = 5
 STANDING = -0.5
 """A rest pose is one to stand in if the cosine between legs and spine is less than this."""
 BETTER_TILT = np.radians(10)
-"""Angle in radians. The joints that carry the hips give the rotation of the pelvis if their mean
-angle to the trunk is smaller by this much than that of the pelvis's joint.
+"""Angle, radians. In some files the hips hang on other joints than the pelvis. These joints give
+the rotation of the pelvis if their mean angle to the trunk is smaller than the mean angle of the
+pelvis's joint, by more than this.
 """
 LARGEST_BEND = np.radians(60)
 """Largest mean angle between pelvis and lowest spine over the frames, radians. If it is larger, the
@@ -188,13 +190,13 @@ STILL = (0.1, 0.3)
 most the second number times the mean speed of all joints.
 """
 ON_THE_FLOOR = 0.5
-"""An axis has a floor if a joint rests on it in at least this share of the frames. Another axis
-then has none if its share is smaller than this, and at most half as large as that of the first
-axis.
+"""An axis has a floor below if the lowest joint rests there in at least this share of the frames.
+Between two axes, only the one with the larger share has a floor, if the other share is below this
+number and at most half as large.
 """
 TREADMILL = 0.8
-"""Where nothing rests on a floor, an unusual axis has a floor if the lowest joint is at one height
-in at least this share of the frames.
+"""Share of the frames. If nothing rests on a floor along either axis, the unusual axis has a floor
+if the lowest joint is at one height in at least this share.
 """
 MOST_FRAMES = 1000
 """Largest number of pairs of successive frames, evenly spread, in which a floor is looked for."""
@@ -261,10 +263,12 @@ def up_axis(
 def _floors(
     points: Float[np.ndarray, "pairs s 3"], axes: Sequence[str], fps: float | int
 ) -> list[float]:
-    """Returns the share of frames with a joint on a floor, for the usual axis and for another one.
+    """Returns the shares of frames in which the lowest joint is on a floor, for the usual axis and
+    for another axis.
 
-    The joint has to rest there. If that is rare for both axes, as on a treadmill, it only has to be
-    at one height, and the other axis needs a share of at least TREADMILL. points: as in `up_axis`.
+    The joint has to rest at its usual height. If it rarely rests for both axes, as on a treadmill,
+    it only has to be at this height. A share of the other axis that is below TREADMILL then becomes
+    0. points: as in `up_axis`.
     """
     moves = np.linalg.norm(points[1::2] - points[::2], axis=-1) * fps
     limit = max(STILL[0], STILL[1] * float(moves.mean()))

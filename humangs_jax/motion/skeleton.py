@@ -235,8 +235,10 @@ def _pelvis_turns(
 ) -> Float[np.ndarray, "m 3 3"]:
     """Returns the rotations of the pelvis from the rest pose to the frames, (m, 3, 3).
 
-    They are those of the pelvis's joint, or of the joints that carry the hips if these agree better
-    with the trunk. They are then turned so that the line of the hips is the file's.
+    They are the rotations of the pelvis's joint. If the hips hang on other joints and these agree
+    better with the trunk, the mean rotation of these joints is used. A pelvis that bends far from
+    the trunk is turned after the lowest joint of the spine. In all cases the line between the hips
+    points as in the file.
     """
     pelvis, left, right = (source[name] for name in ("pelvis", "left_hip", "right_hip"))
     rest_line, line = clip.rest[left] - clip.rest[right], places[:, left] - places[:, right]
@@ -245,11 +247,11 @@ def _pelvis_turns(
         return smallest_turns(unit(candidate @ rest_line), unit(line)) @ candidate
 
     def tilts(candidate, top):
-        """Returns the angles about the line of the hips that the candidate rotations miss, (m,),
-        radians.
+        """Returns the angles, (m,), radians, by which candidate rotations have to be turned about
+        the line of the hips to follow the trunk.
 
-        They go from the direction of a joint above the pelvis, turned by the candidate from the
-        rest pose, to its direction in the frame.
+        The candidate turns the direction from the pelvis to the joint `top` out of the rest pose.
+        The angle leads from there to the direction in the frame.
         """
         axis = unit(line)
 
@@ -340,8 +342,8 @@ def _feet(source: _Source) -> list[list[str]]:
 
 
 def _soles(clip: Clip, source: _Source, joints: Float[np.ndarray, "j 3"]) -> dict[str, float]:
-    """Returns the height of each joint of the file's feet above the lowest of them, in metres of
-    our body. The rest pose has to be one in which people stand.
+    """Returns the heights of the joints of the feet above the lowest of them, in the rest pose, by
+    our names. They are metres of our body. People have to be able to stand in the rest pose.
     """
     axis, _ = nearest_axis(_spine(clip, source))
     scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.rest, source), 1e-9)
@@ -357,8 +359,8 @@ def _steps(
 
     The floor is where the feet are lowest over all frames.
 
-    soles: the height of each joint of the feet when the foot stands. None: the height of its kind
-    of joint in the frame where that is lowest.
+    soles: the height of each joint of the feet when the foot stands, by our names. None: for both
+    ankles, the lowest height of any ankle over all frames, and the same for the toes.
     """
     if soles is None:
         lowest = [
@@ -375,9 +377,10 @@ def _steps_of_body(
     moves: Float[np.ndarray, "m 3"],
     source: _Source,
 ) -> Float[np.ndarray, " m"]:
-    """Returns the height of the lower foot of our body, (m,), metres. A joint of a foot is at
-    height 0 where it would be if the body stood in T-pose with its lowest joint of the feet at y =
-    0.
+    """Returns the height of the lower foot of our body in each frame, (m,), metres.
+
+    The height of a joint is measured from its height in the T-pose, when the lowest joint of the
+    feet is at y = 0.
     """
     places = {0: moves}
 

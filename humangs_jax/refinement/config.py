@@ -27,7 +27,7 @@ each iteration gains.
 """
 
 HEAD = ("head", "jaw", "eye")
-"""Parts of the names of the head's joints."""
+"""Words in the names of the head's joints."""
 HEAD_STEPS = 500
 """Default number of steps on the head. They take 4 s of one core, for photos of 512 pixels."""
 
@@ -35,8 +35,8 @@ HEAD_STEPS = 500
 @configuration
 class LearningRates:
     """How far a step of Adam moves each parameter, in the space in which the parameter is
-    optimised. `refine` lowers all rates by a cosine during a run, and in long runs after iterations
-    (`RefineConfig.full_steps`).
+    optimised. `refine` lowers all rates by a cosine during a run. In a long run that follows
+    iterations, all rates are also multiplied by a factor below 1 (`RefineConfig.full_steps`).
     """
 
     means: Spread = 2e-4
@@ -67,14 +67,14 @@ class RefineConfig:
     )
     """Limit of the optimizer's steps. None: no limit.
 
-    0: iterations, and steps on the head alone. Both are always finished.
+    0: only the iterations and the steps on the head are made, and `seconds` does not limit them.
     """
     seconds: Annotated[float, Range(1e-6, 1e6)] | None = knob(
         5.0, cost="blur at few", gain="time", measured=MEASURED
     )
     """Limit of the run's seconds, without compilation. With `steps`, the lower limit counts. None:
-    no limit. Before the first step, the seconds become a number of steps, by the time that a few
-    steps take. This number is `Refinement.planned`, which repeats the run.
+    no limit. A few steps are timed first, to turn the seconds into a number of steps. With this
+    number (`Refinement.planned`) as `steps`, `refine` repeats the run.
     """
     head_steps: RefineSteps = knob(
         HEAD_STEPS,
@@ -82,21 +82,22 @@ class RefineConfig:
         gain="detail of faces",
         measured="benchmarks/quality.md",
     )
-    """Number of steps on the head alone, after all others. They are made if the longer side of the
-    photos, at most `image_size`, has 512 pixels or more, if cameras are calibrated or each of
-    several photos has a pose, and if `seconds` is None or `steps` is 0. They move the Gaussians of
-    the head by crops of the photos around it, and hold back what grows beyond the masks (see
-    `head.py`).
+    """Number of steps on the head alone, after all others. They compare crops of the photos around
+    the head, move only its Gaussians, and penalise alpha beyond the masks (see `head.py`). They are
+    made under three conditions. The longer side of the photos, at most `image_size`, has 512 pixels
+    or more. Cameras are calibrated, or there are several photos and each has its pose. `seconds` is
+    None or `steps` is 0.
     """
     region: tuple[str, ...] = HEAD
-    """Parts of the names of the joints whose Gaussians the `head_steps` move. `("left_wrist",
+    """Words in the names of the joints whose Gaussians the `head_steps` move. `("left_wrist",
     "left_index")` is a hand.
     """
     image_size: PhotoSide | None = knob(
         None, cost="detail of the photos", gain="time of a step", measured=MEASURED
     )
     """Largest longer side of the photos, pixels. Larger photos are reduced to it. None: photos keep
-    their size. The photos of `head_steps` have another size, by the size of heads.
+    their size. For `head_steps` the photos have another size, which depends on how large the heads
+    are.
     """
     structural: Weight = 0.2
     """Weight of the structural dissimilarity beside the L1 distance of colors."""
@@ -107,19 +108,22 @@ class RefineConfig:
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     """How far a step moves each parameter."""
     full_steps: Steps = 100
-    """After iterations, a run of more steps than this takes smaller steps in proportion, because
-    Gaussians that move further overfit to the photos.
+    """After iterations, a run of n steps has its learning rates multiplied by `full_steps` / n if n
+    is larger than this, because Gaussians that move further overfit to the photos.
     """
     visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
-    """Weight on a pixel of a photo from which on steps move a Gaussian at the full rate. Gaussians
-    with a smaller largest weight move more slowly, and those that no photo shows stay.
+    """Least weight of a Gaussian on some pixel of a photo with which it moves at the full rate, in
+    [0, 1]. A Gaussian with a smaller largest weight moves more slowly, in proportion. Gaussians
+    that no photo shows stay.
     """
     held_out: Share = 0.05
-    """Share of the pixels that no iteration and no step sees, in square blocks, with fewer photos
-    than `search.HELD_OUT_PHOTOS`. The state with the highest PSNR on these pixels is kept. With as
-    many photos or more, any share above 0 means that trials leave out one whole photo each. Its
-    PSNR decides whether the iterations and how many of the steps are kept; then all photos are
-    fitted. Trials take a third of the steps. 0: nothing is held out, and the last state is kept.
+    """With fewer photos than `search.HELD_OUT_PHOTOS`: share of the pixels, in square blocks, that
+    no iteration and no step sees. The state with the highest PSNR on these pixels is kept.
+
+    With as many photos or more, any share above 0 has the same effect: trials leave out one whole
+    photo each, and take a third of the steps. The PSNR on that photo decides whether the iterations
+    are kept, and how many of the steps. Then all photos are fitted. 0: nothing is held out, and the
+    last state is kept.
     """
     checks: Count = 5
     """How many times the PSNR is measured during a run of steps."""
@@ -127,9 +131,9 @@ class RefineConfig:
     """The seed of the order of the photos and of the blocks."""
 
     def __post_init__(self):
-        """Check that the settings fit together.
+        """Checks that the settings fit together.
 
-        Raises: ValueError naming the settings that do not.
+        Raises: ValueError, which names the settings that do not.
         """
         if self.steps is None and self.seconds is None:
             raise ValueError(

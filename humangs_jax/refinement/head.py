@@ -51,7 +51,7 @@ LOOK = 1024
 photos of at most twice this side.
 """
 SIDES = 32
-"""Sides of the crops are multiples of it, pixels."""
+"""The sides of the crops are multiples of this number of pixels."""
 SIMILAR = 1.25
 """Photos are reduced again if the heads in them are smaller or larger than wanted by more than this
 factor.
@@ -101,7 +101,7 @@ def sharpened(
     """Returns the avatar after `config.head_steps` steps on its head. A call with 0 steps compiles
     all programs that calls with more steps need.
 
-    avatar: has the low-pass of the photos. trust: see `RefineState`.
+    avatar: its scales contain the low-pass of the photos. trust: see `RefineState`.
     """
     count, settings = config.head_steps, dataclasses.replace(config, **HOST_SETTINGS)
     # the Gaussians that the crops show; no step is made yet, all programs are compiled
@@ -259,8 +259,9 @@ _projected = jax.jit(project)
 def _squares(
     pixels: Float[np.ndarray, "v g 2"], views: SubjectViews
 ) -> tuple[Int[np.ndarray, " s"], Float[np.ndarray, "v 2"], int]:
-    """Returns the views that show the points, (s,), the middle (y, x) of the points in each view,
-    (v, 2), pixels, and the side of the largest square that the points fill in these views, pixels.
+    """Returns the numbers of the views that show the points, (s,); the middle (y, x) of the points
+    in each view, (v, 2), pixels; and the side of a square, pixels, that contains the points in each
+    of the s views.
 
     A view shows the points if their middle lies in the image and their square is no larger than the
     image. `OUTLIERS` percent of the points at each side are ignored.

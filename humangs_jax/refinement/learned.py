@@ -59,8 +59,8 @@ PERSON = 8000.0
 to it, so that the size of the photos does not matter.
 """
 SEEN = 0.02
-"""Largest weight on a pixel from which on a Gaussian counts fully as seen in a photo. A smaller
-weight counts in proportion.
+"""A Gaussian counts fully as seen in a photo if its weight on some pixel is at least this. With a
+smaller largest weight it counts in proportion.
 """
 TYPICAL_LOG_SCALE = -4.5
 MOST_PHOTOS = 6
@@ -180,7 +180,8 @@ def neighbor_mean(values: Float[Array, "g c"], neighbors: Neighbors) -> Float[Ar
     """Returns the mean of the values of each point's neighbours, (g, c). It is 0 for a point
     without neighbours.
 
-    Since the graph is symmetric, the gradient gathers as well; scattering is slow on a CPU.
+    The gradient is written as a gather, too, which the symmetric graph allows, because scattering
+    is slow on a CPU.
     """
     return jnp.sum(values[neighbors.index] * neighbors.share[..., None], axis=1)
 

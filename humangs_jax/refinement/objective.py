@@ -40,8 +40,8 @@ from humangs_jax.rendering.splatting import Rendering, render
 Image = tuple[Float[Array, "h w 3"], Float[Array, "h w"]]
 """Colors and alpha."""
 FASTER_COMPILATION = {"xla_backend_optimization_level": 1}
-"""Options of the compiler on a CPU. Programs compile in 0.8 to 0.9 of the time of level 3, and run
-in the same time. At level 0 programs take eight times as long.
+"""Options of the compiler on a CPU. Compared with optimization level 3, programs compile in 0.8 to
+0.9 of the time and run as fast. At level 0 they would run eight times as long.
 """
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -214,8 +214,8 @@ class Comparison:
     loss: Float[Array | np.ndarray, "*v"]
     """The loss, see `image_loss`."""
     squared: Float[Array | np.ndarray, "*v"]
-    """The sum over the pixels that count of the squared error, which is a mean over the three
-    colors.
+    """The sum of the squared errors over the pixels that count. The squared error of a pixel is the
+    mean over its three colors.
     """
     pixels: Float[Array | np.ndarray, "*v"]
     """The number of pixels that count."""

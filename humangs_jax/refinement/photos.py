@@ -97,9 +97,10 @@ def windows(
     cameras: Camera,
     boxes: Sequence[Sequence[Sequence[int]]],
 ) -> tuple[Float[Array, "v rows columns 3"], Float[Array, "v rows columns"], Camera]:
-    """Returns the images, masks and cameras of windows of one size, one around the box of each
-    view. The largest box fits in, with `MARGIN` on all sides unless the image ends there. boxes:
-    ((top, bottom), (left, right)) of each view, pixels.
+    """Returns the images, masks and cameras of windows, one around the box of each view. All
+    windows have one size: the largest box fits in, with `MARGIN` on all sides unless the image ends
+    there.
+    boxes: ((top, bottom), (left, right)) of each view, pixels.
     """
     height, width = masks.shape[1:]
     rows, columns = (

@@ -75,26 +75,27 @@ sees. With fewer, blocks of pixels are held out of each photo.
 TRIAL = 1 / 3
 """Share of all steps that are made in trials."""
 ALLOWED_LOSS = 0.5
-"""Decibels that steps may lose on a photo that is held out. The loss is allowed because steps on
-all photos learn from this photo, too. With six validation people, steps lose up to 0.4 on it, and
-steps on all photos gain at least 0.1 in other views of that pose.
+"""Decibels that steps may lose on a photo that is held out. Losing a little there is allowed,
+because the final steps use this photo, too. With six validation people, steps lose up to 0.4 on the
+photo, and steps on all photos gain at least 0.1 in other views of that pose.
 """
 ALLOWED_LOSS_OF_ITERATIONS = 1.0
 """Decibels that the learned update may lose on a photo that is held out. One of eight test people
 loses 0.2 on it, and gains 2.1 by iterations on all photos.
 """
 SUSPICIOUS = 1.5
-"""Ratio of the largest loss of a photo to the median loss, before refinement, from which on
-iterations without steps need trials. With right poses and masks, the ratio is 1.0 to 1.3 for eight
-of nine people, and 1.55 for one. Half a mask makes 1.6, and a body that is turned by 10 degrees
-makes 2.1.
+"""Iterations without steps need trials if the largest loss of a photo before refinement is at least
+this many times the median loss. With right poses and masks, the ratio is 1.0 to 1.3 for eight of
+nine people, and 1.55 for one. Half a mask makes 1.6, and a body that is turned by 10 degrees makes
+2.1.
 """
 STILL = 1.1e-3
-"""Distance from which on photos are moved, as a share of the person's height. It is the median over
-the photos of the distance (`misplaced`) between a photo and its image after iterations on all
-photos. Photos of one moment leave up to 0.0010 (ten synthetic people; loose clothes leave most).
-Bodies that are off by 1 cm in the mean leave 0.0002 to 0.0020, and by 2 cm 0.0009 to 0.0037. If
-photos of one moment are moved, they lose up to 2 dB (`experiments misaligned`).
+"""Photos are moved if their distance from the avatar exceeds this share of the person's height. The
+distance is the median over the photos of `misplaced`, between a photo and its image after
+iterations on all photos. Photos of one moment have up to 0.0010 (ten synthetic people; loose
+clothes have most). Bodies that are off by 1 cm in the mean have 0.0002 to 0.0020, and by 2 cm
+0.0009 to 0.0037. If photos of one moment are moved, they lose up to 2 dB (`experiments
+misaligned`).
 """
 TIMED_STEPS = 3
 """Steps that are timed to plan how many a run has."""

@@ -61,7 +61,8 @@ class RefineState:
     moments: PyTree
     """The optimizer's state."""
     overflow: Int[Array, ""]
-    """The number of (splat, tile) pairs that did not fit, in the last step (in `head`, in several).
+    """The number of (splat, tile) pairs that did not fit in the last step. In steps on the head:
+    the sum over the last steps, see `head._steps`.
     """
     splat: SplatConfig
     """How photos are drawn, with buffers."""
