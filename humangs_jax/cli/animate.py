@@ -93,7 +93,7 @@ class Animate:
     ] = True
     """Let the camera follow the person."""
     fps: Annotated[float | None, _RATE] = None
-    """Frames per second of the video. The motion keeps its speed. Default: those of the motion."""
+    """Frames per second of the video. The motion keeps its speed. Default: the motion's rate."""
     start: float = 0.0
     """Begin at this second of the motion."""
     stop: float | None = None
@@ -211,8 +211,8 @@ class Render:
     pose: Literal["t", "a"] = "t"
     """T-pose, or A-pose with the arms down. Not with --capture."""
     views: Annotated[int | None, at_least(1)] = None
-    """Number of cameras on the circle. Default: 8, or for a video as many as a turn of 4 seconds
-    has.
+    """Number of cameras on the circle. Default: 8. For a video, the default makes the turn last 4
+    seconds.
     """
     fps: Annotated[float, _RATE] = 24.0
     """Frames per second of a video."""

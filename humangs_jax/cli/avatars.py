@@ -467,7 +467,7 @@ class Tune:
     frame_ms: float | None = None
     """Longest time of a frame, milliseconds. 33 is 30 frames per second."""
     memory_mb: float | None = None
-    """Most memory that this may add to the process, MiB."""
+    """Most memory that the work may add to the process, MiB."""
     size: Side = 512
     """Side of the frames in pixels."""
     weights: Path | None = None

@@ -80,9 +80,8 @@ class MaskFit:
     """
     fixed_cameras: bool = False
     """Leave cameras as they are.
-
-    Otherwise a fit to keypoints turns back cameras that the keypoints show to be turned, and
-    --to-masks moves all cameras, if the views determine how.
+    Otherwise a fit to keypoints corrects cameras if the keypoints show that they are turned.
+    --to-masks corrects all cameras, if the views determine how.
     """
     tight_clothes: bool = False
     """With --to-masks, let the body fill the masks, to measure a body in tight clothes or none.

@@ -132,7 +132,7 @@ class OutputPath:
     folder: bool = False
     """Whether a name without suffix is a folder."""
     avatar: bool = False
-    """Whether the file may replace an existing file only if that is an avatar."""
+    """Whether an existing file may be replaced only if it is an avatar."""
 
 
 AVATAR = OutputPath((".npz",), avatar=True)

@@ -38,7 +38,9 @@ class ScanViews:
     2.
     """
     factors: tuple[float, float] = (1.0, 1.75)
-    """Range of the camera's distance in bounding radii, from which it is drawn uniformly."""
+    """Range of the distances of the cameras, in bounding radii. Distances are drawn uniformly from
+    it.
+    """
     train: Annotated[int, at_least(0)] = 2300
     """Number of scans in the training list, which are the first of the published shuffle."""
     test: Annotated[int, at_least(0)] = 145
@@ -194,7 +196,7 @@ class Train:
     validation: Path | None = None
     """Other people to evaluate on now and then: anything that DATA accepts."""
     steps: Annotated[int | None, at_least(1)] = None
-    """Number of steps of the run. Default: that of the configuration.
+    """Number of steps of the run. Default: the number in the configuration.
 
     A finished run goes on if the number is larger.
     """

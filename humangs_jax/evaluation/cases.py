@@ -40,7 +40,7 @@ HELD_OUT = "held_out"
 """
 DEFAULT_INPUTS = 4
 MOST_TARGETS = 2000
-"""The most views of one person of a data set that are compared, since all are in memory
+"""Largest number of views of one person of a data set that are compared. The views are in memory
 together.
 """
 Indices = Mapping[str, Mapping[str, Sequence[int]]]
@@ -114,20 +114,21 @@ def find_people(
         source: a capture folder or a folder of them; a scene list or a data set of
             `data.formats.DATASETS`; a capture; cases; or a `Source`, whose examples give inputs and
             targets.
-        body: the model that the parameters belong to, or its file. None: capture folders name their
-            own, and for data sets and sources it is the one that comes with the package. A
-            `Capture` and cases have their own in any case.
-        inputs: the number of photos that are inputs, see `spread_views`. None: 4, but all views of
-            the first view's frame if a capture with a folder held_out has fewer of them. For a
-            `Source`: 4 if it has examples with 4 inputs, else its first number.
+        body: the body model that the parameters belong to, or its file. None: the body that a
+            capture folder names; for data sets and a `Source` the body that comes with the package.
+            It is ignored for a `Capture` and for cases, which contain their body.
+        inputs: the number of photos that are inputs, see `spread_views`. None: 4. There are two
+            exceptions. If a capture with a folder held_out has fewer than 4 views of the first
+            view's frame, all of these are inputs. If a `Source` has no examples with 4 inputs, its
+            first number of inputs is taken.
         indices: the inputs and targets of each person of captures and data sets, in place of
             `inputs`.
-        reconstructs: whether the method needs inputs. One that does not, and is given neither
-            `inputs` nor `indices`, is compared with every view of a capture that has nothing held
-            out.
+        reconstructs: whether the method needs inputs. If it does not, and neither `inputs` nor
+            `indices` is given, it is compared with all views of a capture that has no folder
+            held_out.
 
-    Raises: ValueError naming what is wrong; TypeError for cases that are no `Case`; CaptureError
-    when a capture is loaded.
+    Raises: ValueError, which names what is wrong; TypeError for cases that are no `Case`;
+    CaptureError when a capture is loaded.
     """
     if indices is not None and not isinstance(source, Capture | str | Path):
         raise ValueError(
@@ -237,9 +238,9 @@ def choose_views(
     choice: Choice = ANY,
 ) -> tuple[list[int], list[int]]:
     """Returns the numbers of the views that are inputs, and of the views to compare with. name: the
-    person, as in the indices.
+    name of the person, as `Choice.indices` has it.
 
-    Raises: ValueError naming the person.
+    Raises: ValueError, which names the person.
     """
     count, (inputs, indices, reconstructs) = len(frames), choice
     if indices is not None:
@@ -265,8 +266,8 @@ def spread_views(
     name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int
 ) -> list[int]:
     """Returns the numbers of `count` views that show the first view's frame, in ascending order.
-    The views of this frame are put in their order around the person, beginning with the first view.
-    Of this order, `count` evenly spaced places are taken, the first among them.
+    The views of this frame are sorted by their azimuth around the person, beginning with the first
+    view. In this order, views at even distances are taken, again beginning with the first.
 
     Raises: ValueError if too few views show this frame.
     """
@@ -518,8 +519,8 @@ _photo_colors = jax.jit(functools.partial(photo_colors, grid="half_pixel"))
 def _seen(
     body: BodyModel, rest: RestBody, pose: BodyPose, camera: Camera
 ) -> tuple[Float[Array, "n 2"], Bool[Array, " n"]]:
-    """Returns the pixels at which a camera shows the vertices of a posed body, and which of them it
-    sees.
+    """Returns the pixels at which a camera shows the vertices of a posed body, (n, 2), and whether
+    it sees each vertex, (n,).
     """
     vertices = pose_body(body, rest, pose).vertices
     pixels, depths = project_vertices(camera, vertices)
@@ -529,8 +530,8 @@ def _seen(
 
 
 def calls_of_painted_body(inputs: Capture, views: Capture) -> Iterator[Call]:
-    """Yields a call of each jitted function that draws: one that `painted_body` makes, and one that
-    `draw_painted_body` makes.
+    """Yields a call of each of the two jitted functions that draw, as `painted_body` and
+    `draw_painted_body` call them.
     """
     body = inputs.body
     rest = shape_body(body, from_host(inputs.betas))

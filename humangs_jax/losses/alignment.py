@@ -27,11 +27,13 @@ from humangs_jax.losses.losses import LARGEST_PSNR
 REACH = 0.02
 """Largest move, as a share of the person's height in the photo. It is 3.5 cm for a grown-up."""
 WINDOW = 0.08
-"""Side of a window, as a share of the person's height. It is about a hand's. Smaller windows fit
-too much.
+"""Side of a window, as a share of the person's height. It is about the size of a hand. Smaller
+windows adapt to too much.
 """
 RELUCTANCE = 2e-4
-"""Squared error by which the largest move has to be better, so that windows without detail stay."""
+"""The longest move is made only if it lowers the variance in the window by this much, and a shorter
+move if it lowers the variance by less. So windows without detail stay.
+"""
 SMOOTHNESS = 0.04
 """Standard deviation of the weights that make moves smooth, as a share of the person's height."""
 LARGEST = 128
@@ -188,12 +190,13 @@ def reduced(image: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray,
 
 
 def photos_agree(gains: Iterable[float], least: float) -> bool:
-    """Returns whether something new is kept: whether most of the photos that are asked gain at
+    """Returns whether something new should be kept. It should be if most of the photos gain at
     least `least`.
 
-    A photo whose pose is off loses by what is right, so it takes two of `ASKED` photos to say no.
-    But no photo gains a lot by what is wrong, so a single photo that gains `CLEAR` more than
-    `least` is enough. Without any gains the result is False.
+    A photo whose pose is off may lose by a change that is right, so one photo alone cannot reject
+    the change: it takes two of `ASKED`. But no photo gains a lot by a change that is wrong, so a
+    single photo that gains `CLEAR` more than `least` is enough to accept it. Without any gains the
+    result is False.
 
     Args:
         gains: the new score minus the old score of one photo after the other, decibels. They are

@@ -62,8 +62,8 @@ Tensors = dict[str, np.ndarray]
 
 @pytree_dataclass
 class LossNetworks:
-    """The networks that are available. Others are None. It is a pytree, to be passed to a training
-    step.
+    """The networks of the losses, with None for each network that is not available. It is a pytree,
+    to be passed to a training step.
     """
 
     perceptual: Vgg19 | None = None
@@ -260,7 +260,9 @@ def _which_net(tensors: Tensors) -> str:
 
 
 def _is_layer(key: str) -> bool:
-    """Returns whether a tensor's name is that of a layer of a backbone, and not of a classifier."""
+    """Returns whether a tensor belongs to a layer of a backbone, and not to a classifier, by its
+    name.
+    """
     return LAYER.fullmatch(key) is not None and "classifier" not in key
 
 

@@ -311,7 +311,9 @@ class SsimWindow:
 
     @property
     def covariance_factor(self) -> float:
-        """Factor on covariances, which are computed as if they were divided by N."""
+        """Factor on covariances, 1 unless `sample` is set. Covariances are computed with the
+        divisor N, and the factor makes the divisor N - 1.
+        """
         if self.sample:
             return self.size**2 / (self.size**2 - 1)
         return 1.0

@@ -100,8 +100,9 @@ Slices = tuple[tuple[Layer, ...], ...]
 
 
 def vgg(depths: tuple[int, ...], feature: tuple[int, ...], average: bool = False) -> Slices:
-    """Returns a VGG whose block b has `depths[b]` convolutions, up to the last map that is
-    compared. The map behind convolution `feature[b]` of the block (counted from 1) is compared.
+    """Returns the slices of a VGG whose block b has `depths[b]` convolutions. In each block, the
+    map after convolution `feature[b]`, counted from 1, is compared. Layers after the last compared
+    map are left out.
     average: whether pools take means.
     """
     slices: list[tuple[Layer, ...]] = []

@@ -102,7 +102,7 @@ def load_motion(
 
     Args:
         path: None for the shipped walk; else a file or a folder of one of `data.formats.MOTIONS`.
-            up: axis that points up in the file's world ("y", "-y", "z" and so on). The motion is
+        up: axis that points up in the file's world ("y", "-y", "z" and so on). The motion is
             turned so that y points up. "auto": the axis that is usual in the format, unless people
             stand along another axis (`rules.up_axis`). A warning then names that axis.
         fps: frames per second that replace the rate in the file.
