@@ -31,7 +31,7 @@ FORMAT = "humangs-face-1"
 STEP = 1e-5
 """Step of offsets in files, metres. int16 then spans +-0.33 m."""
 EYES = ("left_eye", "right_eye")
-"""Joints that the eyes turn with."""
+"""Names of the joints that turn the eyes."""
 PARTS = ("upper_teeth", "lower_teeth", "tongue", "left_lid", "right_lid", "mouth")
 """Names of the parts that `FaceParts.parts` numbers; "mouth" is the skin inside of it."""
 KEYS = (

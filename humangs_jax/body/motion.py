@@ -114,8 +114,9 @@ def _between(
     next_translations: Float[Array, "m 3"],
     share: Float[Array, " m"],
 ) -> tuple[Float[Array, "m j 3"], Float[Array, "m 3"]]:
-    """Returns the rotations (m, j, 3) and translations (m, 3) between frames and the next ones.
-    share: of the next frame, (m,), 0 to 1. Where it is 0, the frame itself is returned.
+    """Returns poses that are interpolated between frames and the next frames: rotations (m, j, 3)
+    and translations (m, 3).
+    share: weight of the next frame, (m,), 0 to 1. Where it is 0, the frame itself is returned.
     """
     turned = quaternion.interpolate(rotations, next_rotations, share[:, None])
     moved = translations + share[:, None] * (next_translations - translations)

@@ -423,7 +423,9 @@ def _drawn_by(shot: FrameSettings, preset: Preset | None, config: Path | None) -
 def _pruned(
     avatar: "Avatar", poses: "BodyPose", cameras: "Camera", shot: FrameSettings
 ) -> "Avatar":
-    """Removes Gaussians that no image shows, if --prune is given, and prints their number."""
+    """Returns the avatar without the Gaussians that no image shows, if --prune is given, and prints
+    their number.
+    """
     from humangs_jax.avatar.frames import splatting_of, without_unseen
 
     if not shot.prune:

@@ -45,7 +45,7 @@ class Export:
     html: Annotated[Path | None, OutputPath((".html",))] = None
     """The HTML viewer to write: one file that needs no network (docs: viewer)."""
     mesh: bool = False
-    """Write the body instead of the Gaussians. A .glb then has its skin, and --motion as
+    """Write the body instead of the Gaussians. A .glb file then has a skin, and --motion as an
     animation.
     """
     motion: Path | None = None

@@ -90,7 +90,7 @@ class Predicted(NamedTuple):
     images: Float[np.ndarray, "v h w 3"]
     """The images of v of the views, (v, h, w, 3), in [0, 1]."""
     alpha: Float[np.ndarray, "v h w"] | None
-    """Their coverage, (v, h, w); None: not known."""
+    """Coverage by the person in these images, (v, h, w); None: not known."""
     views: tuple[int, ...]
     """The numbers of these views in the case."""
     missing: tuple[str, ...] = ()

@@ -21,7 +21,7 @@ BLOCKS = 20
 
 
 class Scored(NamedTuple):
-    """An image's place and scores."""
+    """The scores of one image, and which image it is."""
 
     person: str
     """The name of the person."""

@@ -45,7 +45,7 @@ NOBODY = 1e-3
 ASKED = 3
 """Largest number of photos that are compared. Two that agree are enough."""
 CLEAR = 1.0
-"""Gain beyond the needed gain at which a single photo is enough, decibels."""
+"""A single photo is enough if its gain exceeds the needed gain by this, decibels."""
 
 
 def _aligned_errors(

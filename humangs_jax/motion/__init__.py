@@ -49,7 +49,9 @@ OTHERS = {
 
 
 class MotionError(FileError):
-    """An error of one line about a motion file: file, key, and what was expected."""
+    """An error about a motion file. Its message is one line with the file, the key, and what was
+    expected.
+    """
 
 
 class Reading(NamedTuple):

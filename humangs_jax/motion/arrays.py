@@ -45,7 +45,7 @@ _NO_HANDS = "hands of {} numbers are principal coefficients of a model: left fla
 _MISSING_RATE = (
     "missing: how many frames are a second? expected --motion-fps (in Python fps=), or this key"
 )
-"""The problem that the error of a file without a rate names."""
+"""What the error about a file without a frame rate says."""
 
 
 def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
@@ -127,7 +127,7 @@ def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
 
 
 def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
-    """Returns the person of a number, or the only person.
+    """Returns the person with this number, or the only person.
 
     Raises: MotionError, which lists the people, if the number is missing or fits no person.
     """
@@ -311,8 +311,8 @@ def _placed(
 ) -> Float[np.ndarray, "m 3"]:
     """Returns the translations (m, 3), metres.
 
-    Where the file has cameras that move, the translations and the root's rotations become those in
-    the world. The root's rotations are changed in place.
+    If the file has moving cameras, translations and the root's rotations are converted from the
+    cameras to the world. The root's rotations are changed in place.
 
     Raises: MotionError if the positions are missing or wrong.
     """
@@ -500,10 +500,11 @@ def _clip_of_points(file: Any, fps: float) -> Clip:
 def _of_frames(
     file: Any, key: str, shape: tuple[int, ...], count: int | None = None
 ) -> Float[np.ndarray, "m ..."]:
-    """Reads an array that has numbers of a given shape for each frame.
+    """Reads an array that has values of a given shape for each frame, and returns it with frames as
+    its first axis.
 
-    A single frame may lack the axis of frames, and an axis of one person is removed. count: number
-    of frames. None: any.
+    The array of a single frame may lack the axis of frames. An axis of length 1 for the person is
+    removed. count: number of frames. None: any.
 
     Raises: the file's error, which names the key, if the shape is another.
     """

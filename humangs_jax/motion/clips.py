@@ -206,9 +206,9 @@ def _posed(
 
 
 def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
-    """Reads the moving skeleton of a GLB file, with its face.
+    """Returns the moving skeleton of a GLB file, with its face, or poses with a face alone.
 
-    An animation that turns no joint, but moves a face, gives poses with the face alone.
+    There are poses if the animation moves a face and turns no joint.
 
     Raises: OSError; InvalidFileError, and what damaged numbers raise.
     """
@@ -367,7 +367,7 @@ def _tracks(
 def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
     """Returns evenly spaced times of frames (m,), seconds, and their rate in frames per second.
 
-    The rate is that of the track with most times.
+    The rate is taken from the track with the most times.
 
     Raises: InvalidFileError if tracks have very different lengths.
     """

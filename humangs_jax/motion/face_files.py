@@ -48,7 +48,7 @@ _FEWEST = 5
 _MOST_COLUMNS = 1000
 """Largest number of names in a file."""
 _DEEPEST = 5
-"""Largest number of objects and lists within each other around the scores of a frame."""
+"""Largest depth at which the scores of a frame may lie inside of objects and lists."""
 
 
 # Tables

@@ -170,7 +170,9 @@ FEW = 5
 # --------------------------------------------------------------------------------------------------
 
 STANDING = -0.5
-"""A rest pose is one to stand in if the cosine between legs and spine is less than this."""
+"""People can stand in a rest pose if the cosine of the angle between legs and spine is less than
+this.
+"""
 BETTER_TILT = np.radians(10)
 """Angle, radians. In some files the hips hang on other joints than the pelvis. These joints give
 the rotation of the pelvis if their mean angle to the trunk is smaller than the mean angle of the
@@ -233,8 +235,8 @@ def up_axis(
     The axis is the usual one of the format, with two exceptions. In the first, the person stands
     along another axis and there is a floor below: the lowest joint stays at one height and rests
     there. Lying, crawling and upside-down people also stand along other axes, but rest on no floor
-    below. In the second, the person stands along an axis in `also`, the floor does not contradict,
-    and the person is not upside down on the hands.
+    below. In the second, the person stands along an axis in `also`, no clear floor below the usual
+    axis contradicts this, and the person is not upside down on the hands.
 
     points: joints in space, metres, in the frames of `sampled_frames`. stands: the axis along which
     the person stands on average; None: there is none. usual: the axis of the format. fps: frames

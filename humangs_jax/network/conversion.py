@@ -41,7 +41,7 @@ SKINNING_WEIGHTS = "tpose_lbs_weights"
 in `Converted`; the network does not use them.
 """
 UNSUPPORTED = "target_pose_tokenizer.1.weight"
-"""Tensor of a variant of the network (canonical target maps) that does not exist here."""
+"""Name of a tensor of a network variant that this package does not have (canonical target maps)."""
 
 StateDict = dict[str, np.ndarray]
 

@@ -69,8 +69,8 @@ class PixelAlignedReader(Reader):
     None: no convolution.
     """
     sample_rgb: bool = False
-    """Whether vertices also read their mean photo color over the views that see them, and the
-    fraction of such views.
+    """Whether vertices also read their mean photo color over the views that see them, and the share
+    of the views that see them.
     """
     shells: tuple[Spread, ...] = ()
     """Ascending distances along the vertex normals at which vertices also read the photos,

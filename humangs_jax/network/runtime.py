@@ -87,8 +87,8 @@ class Runtime:
         gain="detail where photos have more than the vertices of the body",
         measured="refinement.md",
     )
-    """Length to which edges of the body are split, beyond what the weights were trained with,
-    metres. None: no further splitting.
+    """Largest length of the body's edges, metres. Longer edges are split, in addition to the
+    splitting that the weights were trained with. None: no further splitting.
     """
     body_vertices: Vertices | None = knob(
         None,
@@ -159,7 +159,7 @@ class Conventions:
     )
     """Side of the photos, pixels. The network takes any multiple of the patch size."""
     tokens: TokenSelection = "all"
-    """Patches that became tokens."""
+    """Patches that became tokens: "all", or those that the "foreground" touches."""
     pixels: Literal["all", "person"] = "all"
     """Pixels that count. "person": if a photo has a mask, only the pixels of the mask count. Parts
     of the body that cover background in a photo are then unseen there. With shells, Gaussians get
@@ -209,7 +209,9 @@ class Conventions:
         gain="detail where the body is coarse",
         measured="evaluation.md",
     )
-    """Length to which edges of bodies are split after decimation, metres. None: no splitting."""
+    """Largest length of the edges of bodies, metres. Longer edges are split, after decimation.
+    None: no splitting.
+    """
     renamed_fields: ClassVar[dict[str, str]] = {
         "skinning_reach": "leg_blend_distance",
         "low_pass": "pixel_footprint",

@@ -45,8 +45,8 @@ THINNER = 1.2
 third, so that silhouettes are sharp.
 """
 OBLIQUE = (0.36, 0.48, 0.8)
-"""A unit vector along no axis of a body. Where normals are opposite to it, frames turn quickly
-between vertices.
+"""A unit vector that is parallel to no axis of a body. Frames change quickly between neighbouring
+vertices where normals point in the opposite direction.
 """
 
 
@@ -61,16 +61,18 @@ class VertexDecoder(Decoder):
     hidden: Width = 256
     """Width of the hidden layers."""
     tight: Annotated[int, Range(0, 256)] = 1
-    """Gaussians per vertex whose offsets a loss keeps small; K = tight + free."""
+    """Number of tight Gaussians per vertex. A loss keeps their offsets small. K = tight + free."""
     free: Annotated[int, Range(0, 256)] = knob(
         4,
         cost="detail: K = tight + free",
         gain="drawing in proportion to K",
         measured="evaluation.md",
     )
-    """Number of Gaussians per vertex without such a loss."""
+    """Number of Gaussians per vertex whose offsets no loss keeps small."""
     skinning_joints: Count | None = None
-    """Number of joints of the head that corrects skinning weights. None: no such head."""
+    """Number of joints whose skinning weights a head of the network corrects. None: there is no
+    such head.
+    """
     offset_scale: Spread | None = None
     """Bound of each coordinate of an offset, normalised units. It is applied by tanh, before the
     distance of the shells is added. None: offsets are unbounded, as published.
@@ -93,7 +95,7 @@ class VertexDecoder(Decoder):
 
     @property
     def gaussians_per_vertex(self) -> int:
-        """K, the Gaussians of a vertex."""
+        """K, the number of Gaussians of a vertex."""
         return self.tight + self.free
 
     @nn.compact

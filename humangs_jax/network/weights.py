@@ -82,8 +82,8 @@ def save_weights(
 
 
 def shipped_checksum() -> str:
-    """Returns the SHA-256 of the shipped weights file, in hexadecimal. "none" if the installation
-    has none.
+    """Returns the SHA-256 of the shipped weights file, in hexadecimal, or "none" if the file is not
+    installed.
     """
     with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:
         if shipped.exists():

@@ -84,11 +84,11 @@ class Crops(NamedTuple):
 
 
 def shows_heads(capture: Capture, config: RefineConfig) -> bool:
-    """Returns whether the photos are large enough for steps on the head, and show heads where the
-    poses and cameras have them.
+    """Returns whether the photos are large enough for steps on the head, and whether heads are
+    where poses and cameras place them.
 
-    If the cameras were found from the person and all photos share one pose, heads are centimetres
-    off. That blurs a face, and the steps would fit the blur. A pose for each photo avoids this.
+    If the cameras were found from the person and all photos share one pose, heads are off by
+    centimetres. Steps would then fit a blurred face. A pose for each photo avoids this.
     """
     longest = max(capture.images.shape[1:3])
     in_place = capture.calibrated or capture.frame_count >= capture.view_count > 1
@@ -234,8 +234,8 @@ def head_crops(avatar: Avatar, photos: PreparedCapture, config: RefineConfig) ->
 
 
 def _power(number: int) -> int:
-    """Returns the smallest power of two that is not below `number`. Fewer different numbers need
-    fewer programs.
+    """Returns the smallest power of two that is not below `number`. With few different sizes, few
+    programs are compiled.
     """
     return 1 << max(0, number - 1).bit_length()
 

@@ -112,8 +112,8 @@ def compiled(function: Callable[P, T]) -> Compiled[P, T]:
 
 
 PullBack = Callable[[Image], tuple[UnconstrainedGaussians, Float[Array, " g"]]]
-"""A function from the gradient with respect to an image to the gradients with respect to the
-parameters and to the brightness of each Gaussian.
+"""A function that takes the gradient with respect to an image. It returns the gradients with
+respect to the parameters and to the brightness of each Gaussian.
 """
 
 

@@ -98,7 +98,7 @@ clothes have most). Bodies that are off by 1 cm in the mean have 0.0002 to 0.002
 misaligned`).
 """
 TIMED_STEPS = 3
-"""Steps that are timed to plan how many a run has."""
+"""Number of steps that are timed, to plan the number of steps of a run."""
 OVERRUN = 1.5
 """A run ends early once it has taken this many times its seconds. Such a run cannot be repeated
 exactly.
@@ -220,8 +220,8 @@ class Task(NamedTuple):
     avatar: Avatar
     """The avatar with the low-pass of the photos."""
     fresh: Avatar
-    """The avatar with the scales that the learned update was trained with. The low-pass that the
-    avatar came with is replaced by that of `Task.avatar`.
+    """The avatar from which the learned update starts. Its scales contain the low-pass of
+    `Task.avatar` instead of the low-pass that the avatar came with.
     """
     given: list[Photo]
     """The photos as they were given, with all their pixels. They say whether a state is better."""

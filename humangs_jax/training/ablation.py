@@ -55,8 +55,8 @@ class AblationRow(NamedTuple):
     difference: float
     """The mean difference from the base, over the seeds for which both have a score."""
     interval: float | None
-    """Half of the 95 % interval of `difference`, by Student's t over paired seeds. None with fewer
-    than two pairs.
+    """Half the width of the 95 % confidence interval of `difference`, by Student's t over paired
+    seeds. None with fewer than two pairs.
     """
 
     @property
@@ -234,7 +234,7 @@ def _checked_variants(
 ) -> dict[str, TrainConfig]:
     """Returns the configuration of each variant, by name.
 
-    Raises: ArgumentError, which names a variant that cannot be trained.
+    Raises: ArgumentError if a variant cannot be trained. The error names the variant.
     """
     runs = {}
     for name, changes in variants.items():

@@ -24,24 +24,27 @@ from humangs_jax.geometry.camera import Camera
 
 @configuration
 class Augmentation:
-    """Standard deviations of the errors. They are normally distributed unless a field says
-    otherwise, and drawn for each photo or for each example.
+    """Standard deviations of random errors. The errors are normally distributed unless a field says
+    otherwise. They are drawn for each photo or for each example.
     """
 
     share: Share = 0.0
     """Share of the examples that have all errors. Other examples have errors of exposure and tint
-    only. 0: there are no errors at all, and no computation.
+    only. 0: no example has errors, and nothing is computed for them.
     """
     exposure: Spread = 0.08
     """Standard deviation of the natural logarithm of each photo's gain."""
     tint: Spread = 0.03
-    """Standard deviation of the natural logarithm of the gain of each channel of a photo."""
+    """Standard deviation of a further gain, for each channel of each photo, as a natural logarithm.
+    """
     mask_pixels: Annotated[int, Range(0, 64)] = 2
     """Largest number of pixels by which masks are eroded or dilated. The number is uniformly
     distributed. Where a mask grows, a random background color appears.
     """
     camera_degrees: Annotated[float, Range(0, 360)] = 0.25
-    """Standard deviation of the turn of a camera about the person, for each axis, degrees."""
+    """Standard deviation of the angle by which a camera is turned about the person, for each axis,
+    degrees.
+    """
     camera_metres: Spread = 0.002
     """Standard deviation of the shift of a camera along each axis, metres."""
     pose_degrees: Annotated[float, Range(0, 360)] = 0.15

@@ -268,8 +268,8 @@ def _weighted_sum(shard: Any, shape: tuple[int, ...]) -> int:
 
 
 def _without_score(folder: Path) -> list[Path]:
-    """Returns the folders of the checkpoints whose score cannot be read. Orbax would raise for the
-    first of them.
+    """Returns the folders of the checkpoints whose score cannot be read. Orbax would raise an error
+    for the first of them.
     """
     found = []
     for step in sorted(
@@ -296,8 +296,8 @@ def _set_aside(steps: list[Path]) -> None:
 
 
 def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> None:
-    """Writes out/config.json, after a check against the file that is there. write: False only
-    checks.
+    """Writes out/config.json, after a check against the file that is there. write: whether to write
+    the file, or only to check.
 
     The settings `ADJUSTABLE` may differ from the file. A finished run may get more steps. It then
     continues with the learning rate of the longer run.

@@ -32,7 +32,7 @@ from humangs_jax.training.augmentation import Augmentation
 
 logger = logging.getLogger(__name__)
 Decay = Annotated[float, Range(0, 0.999_999)]
-"""Decay of a running mean. At 1 it would never forget."""
+"""Decay of a running mean. With a decay of 1 the mean would never change."""
 HOST_SETTINGS = {
     "seed": 0,
     "log_every": 1,
@@ -94,7 +94,7 @@ STAGED = {
     "target_size": "target_size",
     "batch_size": "batch_size",
 }
-"""Path in a `TrainConfig` that each field of a stage changes."""
+"""For each field of a stage, the path of the setting in a `TrainConfig` that it changes."""
 
 
 @configuration
@@ -182,10 +182,11 @@ class TrainConfig:
         return config
 
     def spans(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """Returns the ranges (first, end) of steps in which the configuration stays the same.
+        """Returns the ranges (first, end) of steps in which the configuration stays the same, in
+        order.
 
-        Together they are the steps from `start` up to `stop`, without `stop`. Each is without its
-        `end`.
+        A range contains `first`, but not `end`. Together the ranges contain all steps from `start`
+        to `stop` - 1.
         """
         inner = [stage.start for stage in self.stages if start < stage.start < stop]
         if start < stop:

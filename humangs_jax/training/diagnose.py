@@ -165,7 +165,7 @@ class Diagnosis:
     """
 
     step: int
-    """Steps done before this one."""
+    """Number of steps that were done before the step that is diagnosed."""
     subject: int
     """The row of the subject in the batch."""
     loss: float

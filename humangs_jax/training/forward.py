@@ -114,8 +114,8 @@ def draw_targets(
 def draw_posed(
     posed: Gaussians, targets: SubjectViews, backgrounds: Float[Array, "v 3"], config: TrainConfig
 ) -> Drawn:
-    """Returns the images of Gaussians that are posed for each target (leading axis v), from the
-    target's camera.
+    """Returns images of Gaussians, one for each target, from the target's camera.
+    posed: the Gaussians in the pose of each target, with a leading axis v.
     """
     splat = dataclasses.replace(config.splat, distortion=bool(config.loss.distortion))
 

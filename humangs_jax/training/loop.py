@@ -144,7 +144,7 @@ class RunLog:
             )
 
     def event(self, done: int, event: str, message: str, **details: float | list[str]) -> None:
-        """Logs an event as a line, and shows `message` beside the progress bar."""
+        """Writes a line about an event to the log, and shows `message` beside the progress bar."""
         self._write({"step": done, "event": event} | details)
         if self._recording:
             say(f"step {done}: {message}")
@@ -179,7 +179,8 @@ class Watch:
     def __call__(
         self, done: int, metrics: dict[str, Any], bad_samples: Callable[[], list[str]] = list
     ) -> None:
-        """Reads the metrics of the step before, and keeps those of the step that was just begun.
+        """Reads the metrics of the step before, and keeps the metrics of the step that was just
+        begun for the next call.
 
         done: number of steps, this one included. bad_samples: called if the step failed; it returns
         a line for each bad sample, see `sources`.

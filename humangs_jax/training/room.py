@@ -23,8 +23,8 @@ from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.forward import reconstruct_example
 
 MARGIN = 2.0
-"""Room relative to the measured need. Other people and poses need more, and Gaussians change while
-they are trained.
+"""Factor by which the room exceeds the measured need. Other people and poses need more, and
+Gaussians change while they are trained.
 """
 WORTH = 1 << 16
 """The need is measured if a traced call would have room for at least this many pairs. With fewer

@@ -22,8 +22,8 @@ from humangs_jax.training.state import TrainState
 
 AXES = ("data", "fsdp")
 SMALLEST_DIVIDED = 1 << 10
-"""Number of elements of the smallest array that is divided. For smaller ones messages cost more
-than the memory.
+"""Number of elements of the smallest array that is divided. Every device keeps a copy of smaller
+arrays, because messages would cost more than the memory is worth.
 """
 
 T = TypeVar("T")
@@ -93,8 +93,8 @@ def replicated(mesh: Mesh) -> NamedSharding:
 
 
 def place(tree: T, shardings: PyTree) -> T:
-    """Makes global arrays from host or local arrays, which have to be equal in all processes.
-    shardings: a tree of shardings, or one for all leaves.
+    """Returns global arrays made from host or local arrays, which have to be equal in all
+    processes. shardings: a tree of shardings, or one for all leaves.
     """
     if isinstance(shardings, NamedSharding):
         shardings = jax.tree.map(lambda _: shardings, tree)
@@ -107,10 +107,10 @@ def place(tree: T, shardings: PyTree) -> T:
 
 
 def whole(tree: T, mesh: Mesh) -> T:
-    """Copies arrays that are divided among devices to this process's default device, as whole
-    arrays.
+    """Returns whole arrays on this process's default device, made from arrays that are divided
+    among devices.
 
-    All processes must call it.
+    All processes must call this function.
     """
     return jax.tree.map(lambda x: x.addressable_data(0), _replicate(mesh)(tree))
 
@@ -121,8 +121,8 @@ def _replicate(mesh: Mesh) -> Callable[[PyTree], PyTree]:
 
 
 def gather(params: PyTree, specs: PyTree) -> PyTree:
-    """Gathers whole parameters from the parts on the devices. Only for use inside `shard_map`.
-    specs: PartitionSpec of every leaf.
+    """Returns whole parameters, gathered from the parts on the devices. Only for use inside
+    `shard_map`. specs: PartitionSpec of every leaf.
     """
 
     def one(part, spec):

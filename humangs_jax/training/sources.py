@@ -35,7 +35,7 @@ from humangs_jax.training.sharding import batch_sharding
 logger = logging.getLogger(__name__)
 
 SYNTHETIC = "humangs_jax.synthetic"
-"""Package of synthetic people, which a run without them does not import."""
+"""Name of the package of synthetic people. A run without synthetic people does not import it."""
 SourceFactory = Callable[[TrainConfig], Source]
 """Function that takes the configuration of a stage, and returns a source of examples of its
 sizes.
@@ -62,11 +62,11 @@ def stage_loader(
 
 
 def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list[str]:
-    """Returns a line for each sample of this process in a step whose numbers are not finite, or
-    whose colors or masks are beyond [0, 1].
+    """Returns a line for each bad sample of this process in a step. A sample is bad if it has
+    numbers that are not finite, or colors or masks beyond [0, 1].
 
-    batch: the batch of that step, on one device. None: it is made again, because a loader is a pure
-    function; a run then need not keep its batches.
+    batch: the batch of that step, on one device. None: the batch is made again. A run need not keep
+    its batches for this, because a loader is a pure function.
     """
     found, kinds = [], {"images": UNIT, "masks": UNIT}
     for i, row in enumerate(loader.rows):
