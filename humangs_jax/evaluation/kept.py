@@ -34,16 +34,16 @@ people apart.
 """
 
 CaseKey = Callable[[Case], str]
-"""A function that takes a case. It returns a text that changes with everything that the case's
-prediction depends on, except for the case itself.
+"""A function that takes a case, and returns a key of what the prediction of this case alone depends
+on, besides the case: an avatar or images. The key is "" if there is nothing of this kind.
 """
 
 
 class KeptScores:
     """Keeps the scores of an evaluation in a folder.
 
-    method: key of the predictions, see `CaseKey`. ordered: whether the results of a person also
-    depend on the people before, as they do if a page with the worst images is made.
+    method: returns a key for each case, see `CaseKey`. ordered: whether the results of a person
+    also depend on the people before, as they do if a page with the worst images is made.
     Raises: CaptureError if the folder has scores that were made with other settings.
     """
 
@@ -147,8 +147,8 @@ def method_key(
     method: Method | None,
 ) -> tuple[str, CaseKey]:
     """Returns two keys of the method that `choose_method` would return. The first is a short text
-    that changes with everything that the predictions of all people depend on. The second is a
-    function that returns such a text for one case.
+    that changes with what the predictions of all people depend on, such as weights. The second is a
+    `CaseKey`, for what the prediction of one case depends on, such as images.
 
     A `method` is known by its name and source alone, not by the values of variables that it reads.
     """

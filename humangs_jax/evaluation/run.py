@@ -534,7 +534,7 @@ def _score_person(
 
 def _without_nobody(case: Case, predicted: Predicted) -> Predicted:
     """Returns the predictions without the views whose true mask is empty. These views would compare
-    white with white, which would raise the mean.
+    background with background, which would raise the mean.
     """
     empty = set(empty_views(case.truth.masks)) & set(predicted.views)
     if not empty:

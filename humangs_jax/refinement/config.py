@@ -122,8 +122,8 @@ class RefineConfig:
 
     With as many photos or more, any share above 0 has the same effect: trials leave out one whole
     photo each, and take a third of the steps. The PSNR on that photo decides whether the iterations
-    are kept, and how many of the steps. Then all photos are fitted. 0: nothing is held out, and the
-    last state is kept.
+    are kept, and how many of the steps. Then all photos are fitted. 0: nothing is held out.
+    Iterations are kept if they lower the loss, and the last of the steps is kept.
     """
     checks: Count = 5
     """How many times the PSNR is measured during a run of steps."""

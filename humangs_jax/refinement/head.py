@@ -74,7 +74,9 @@ class Crops(NamedTuple):
     moved: Bool[np.ndarray, " g"]
     """Which Gaussians belong to the head, (g,)."""
     drawn: Int[np.ndarray, " d"]
-    """The indices of the Gaussians that the crops show, (d,)."""
+    """The indices of the Gaussians that are drawn, (d,), ascending. These are all that the crops
+    show, all of the head, and so many others that d is a power of two, or all Gaussians.
+    """
     views: SubjectViews
     """The crops."""
     finer: bool

@@ -53,7 +53,9 @@ CLUSTER_LEVELS = 9
 NEAREST_CLUSTERS = 4
 """The number of clusters that each Gaussian reads."""
 CLUSTER_BLUR = 0.01
-"""Metres. A Gaussian that is this close to the centre of a cluster reads mostly that cluster."""
+"""Length that is added to the distance between a Gaussian and a cluster before the weight, 1 /
+distance, is computed, metres.
+"""
 PERSON = 8000.0
 """The number of pixels that a person covers in the photos of training. Sums over pixels are scaled
 to it, so that the size of the photos does not matter.

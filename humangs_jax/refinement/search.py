@@ -3,10 +3,10 @@ the learned update, and by how many steps.
 
 With `HELD_OUT_PHOTOS` photos or more, trials come first. A trial leaves one photo out. The PSNR on
 this photo then says whether the iterations help, whether they help without the photo that fits
-least, and how many of the steps help. Then all photos are fitted as the trials say. Iterations
-without steps are tried only if one photo fits much less than the others. Several photos are left
-out in turn, see `photos_agree`. The photos that the avatar explains best before it is refined come
-first, so that a photo that misleads is never the first.
+least, and how many of the steps help. Then all photos are fitted as the trials say. If there are no
+steps, there are trials of the iterations only if one photo fits much less than the others. Several
+photos are left out in turn, see `photos_agree`. The photos that the avatar explains best before it
+is refined come first, so that a photo that misleads is never the first.
 
 With fewer photos, blocks of pixels are held out instead, and there are no trials. PSNR is measured
 after small moves, see `losses.alignment`, because photos are seldom of one moment.
@@ -226,7 +226,8 @@ class Task(NamedTuple):
     given: list[Photo]
     """The photos as they were given, with all their pixels. They say whether a state is better."""
     photos: list[Photo]
-    """The photos that are fitted, with all their pixels. They are those given, or moved by `align`.
+    """The photos that are fitted, with all their pixels. They are `given`, or `given` after `align`
+    has moved them.
     """
     seen: list[Photo]
     """The photos that are fitted, without the pixels that are held out."""
