@@ -311,8 +311,8 @@ def _placed(
 ) -> Float[np.ndarray, "m 3"]:
     """Returns the translations (m, 3), metres.
 
-    If the file has moving cameras, translations and the root's rotations are converted from the
-    cameras to the world. The root's rotations are changed in place.
+    If the file has cameras, translations and the root's rotations are converted from the axes of
+    the camera to the world. The root's rotations are changed in place.
 
     Raises: MotionError if the positions are missing or wrong.
     """

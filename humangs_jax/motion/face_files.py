@@ -176,8 +176,8 @@ def _standing(
 
 
 def has_scores(path: Path) -> bool:
-    """Returns whether a JSON file has scores of a face. Scores that are no numbers count, too, and
-    `read_scores` refuses them.
+    """Returns whether a JSON file has scores of a face, of which at least one is a number.
+    `read_scores` refuses the file if others are no numbers.
 
     Raises: FileNotFoundError; FileError if it is not JSON.
     """

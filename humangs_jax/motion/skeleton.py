@@ -343,7 +343,8 @@ def _feet(source: _Source) -> list[list[str]]:
 
 def _soles(clip: Clip, source: _Source, joints: Float[np.ndarray, "j 3"]) -> dict[str, float]:
     """Returns the heights of the joints of the feet above the lowest of them, in the rest pose, by
-    our names. They are metres of our body. People have to be able to stand in the rest pose.
+    our names. Heights are scaled to our body, metres. People have to be able to stand in the rest
+    pose.
     """
     axis, _ = nearest_axis(_spine(clip, source))
     scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.rest, source), 1e-9)
@@ -355,7 +356,8 @@ def _soles(clip: Clip, source: _Source, joints: Float[np.ndarray, "j 3"]) -> dic
 def _steps(
     heights: Float[np.ndarray, "m s"], source: _Source, soles: dict[str, float] | None
 ) -> Float[np.ndarray, " m"]:
-    """Returns the height of the lower foot above the floor in each frame, (m,).
+    """Returns the height of the lower foot above the floor in each frame, (m,), in the unit of
+    `heights`.
 
     The floor is where the feet are lowest over all frames.
 

@@ -85,8 +85,8 @@ def apply_humangs(
     subjects, give the vmap's `axis_name` to share the statistics over the batch. Without it each
     subject has separate statistics, which the caller has to average.
 
-    Raises: ValueError if images and cameras differ in size, the patch size does not divide it, or
-    inputs lack normals that the configuration needs.
+    Raises: ValueError if images and cameras differ in size, the sides of images are no multiples of
+    the patch size, or inputs lack normals that the configuration needs.
     """
     statistics, ctx = variables.get("batch_stats", {}), config.forward_context(train, axis_name)
     if not (train and statistics):

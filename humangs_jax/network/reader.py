@@ -54,7 +54,7 @@ UNSEEN_COLOR = 0.5
 """Photo color of a vertex that no view sees."""
 WEIGHT_EPSILON = 1e-6
 """A point counts as seen if the sum of the weights of its views is above this. The weight of a view
-is the cosine of the angle between the normal and the direction to the camera.
+is the cosine of the angle between the normal and the direction to the camera, times the mask.
 """
 
 
@@ -265,8 +265,8 @@ def sample_shells(
     present: Bool[Array, " v"],
     grid: PixelGrid,
 ) -> Shells:
-    """Returns the colors and masks of the photos at points along the normals of the posed vertices,
-    averaged over the views that are `present`.
+    """Returns what the photos show at points along the normals of the posed vertices. Only views
+    that are `present` count.
 
     images: in [0, 1]. foreground: pixels of the person or the body. depth_maps: rasterized z of the
     body, -1 on background. cameras, vertices: normalised units. normals: unit, of the posed body.
