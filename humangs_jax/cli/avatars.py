@@ -292,8 +292,8 @@ class Refine:
     out: Annotated[Path, AVATAR] = Path("refined.npz")
     """The avatar file to write or replace."""
     refine: str = "15s"
-    """How long to refine, without compilation: 15s (or 15), 100steps, or 0steps for iterations
-    only.
+    """How long to refine, without compilation: 15s (or 15), 100steps, or 0steps for iterations and
+    steps on the head only.
     """
     iterations: Annotated[int, Range(0, 16)] = ITERATIONS
     """Iterations of the learned optimizer before the steps."""

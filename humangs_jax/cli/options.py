@@ -369,7 +369,7 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
 def refine_limits(text: str) -> dict[str, Any]:
     """Parses --refine into fields of `RefineConfig`.
 
-    text: "15s", "15" (seconds), "100steps", or "0steps" (iterations only).
+    text: "15s", "15" (seconds), "100steps", or "0steps" (iterations and steps on the head only).
 
     Raises: UsageError for another text.
     """

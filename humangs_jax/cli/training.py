@@ -126,8 +126,8 @@ class LossNetworkFiles:
     lpips_backbone: Path | None = None
     """Weights of the network of LPIPS.
 
-    Default: the weights of the extra `lpips`, if it is installed and the loss has LPIPS. Otherwise
-    there is no LPIPS in validation, and SSIM takes its place in the loss.
+    Default: the weights of the extra `lpips`, if it is installed and the loss has LPIPS or VGG-16.
+    Otherwise there is no LPIPS in validation, and SSIM replaces both in the loss.
     """
     lpips_heads: Path | None = None
     """The linear heads of LPIPS, if the backbone's file does not have them."""
@@ -364,7 +364,8 @@ class LpipsFiles:
     installed.
     """
     lpips_alex: tuple[Path, ...] = ()
-    """LPIPS with the backbone alex."""
+    """LPIPS with the backbone alex. Default: the weights of the extra `lpips`, if it is installed.
+    """
     lpips_squeeze: tuple[Path, ...] = ()
     """LPIPS with the backbone squeeze."""
 
