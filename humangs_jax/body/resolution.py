@@ -414,9 +414,9 @@ def collapse_sequence(
 
     Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3): faces of the texture, whose
     seams are kept closed; None: no texture.
-    Returns: order (n,), 0 for the vertex that stays longest and n - 1 for the one that collapses
-    first; into (n,), the vertex that each one moves onto, or its own number if it can never
-    collapse.
+    Returns: order, (n,), the rank of each vertex. 0 stays longest, n - 1 collapses first. into,
+    (n,), the vertex that each vertex moves onto. A vertex that can never collapse has its own
+    number.
     """
     # what is hidden costs less, but for a few rings beside what is seen
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)

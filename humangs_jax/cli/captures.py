@@ -129,7 +129,7 @@ class ImportCameras:
         Positional[Path], arg(help=f"File or folder with the calibration: {CAMERAS.listed()}.")
     ]
     images: Path
-    """Folder of the photos, or of one video per camera (CAMERA.mp4), all of which begin at the same
+    """Folder of the photos, or of one video per camera (CAMERA.mp4). All videos begin at the same
     moment.
     """
     out: Path

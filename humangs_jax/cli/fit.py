@@ -75,8 +75,8 @@ class MaskFit:
     to_masks: bool = False
     """Improve cameras, shape and poses by masks and keypoints.
 
-    Keypoints are those of the earlier fit, or --keypoints. The result is never worse than the
-    start.
+    Keypoints are taken from --keypoints, or from the earlier fit. The result is never worse than
+    the start.
     """
     fixed_cameras: bool = False
     """Leave cameras as they are.

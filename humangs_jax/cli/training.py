@@ -42,9 +42,9 @@ class ScanViews:
     it.
     """
     train: Annotated[int, at_least(0)] = 2300
-    """Number of scans in the training list, which are the first of the published shuffle."""
+    """Number of scans in the training list. They are the first of the published shuffle."""
     test: Annotated[int, at_least(0)] = 145
-    """Number of scans in the test list, which follow those of the training list."""
+    """Number of scans in the test list. They follow the scans of the training list."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -111,9 +111,9 @@ def find_people(
     """Returns the people of a source.
 
     Arguments:
-        source: a capture folder or a folder of them; a scene list or a data set of
-            `data.formats.DATASETS`; a capture; cases; or a `Source`, whose examples give inputs and
-            targets.
+        source: a capture folder, or a folder of capture folders; a scene list, or a data set of
+            `data.formats.DATASETS`; a `Capture`; cases; or a `Source`. The examples of a `Source`
+            give inputs and targets.
         body: the body model that the parameters belong to, or its file. None: the body that a
             capture folder names; for data sets and a `Source` the body that comes with the package.
             It is ignored for a `Capture` and for cases, which contain their body.
@@ -424,8 +424,9 @@ def _predictions_of(case: Case, root: Path, people: int) -> Path:
 
 
 def prediction_files(root: Path, case: Case, people: int) -> dict[str, Path | None]:
-    """Returns the image file of each view of a case in a folder of predictions, by the name of the
-    view; None where there is no file.
+    """Returns the file of the predicted image for each view of a case, by the name of the view;
+    None where there is no file.
+    root: folder of predictions.
     """
     place = _predictions_of(case, root, people)
     return {name: _prediction(place, name, i) for i, name in enumerate(case.truth.names)}

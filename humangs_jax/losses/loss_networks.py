@@ -267,7 +267,7 @@ def _is_layer(key: str) -> bool:
 
 
 def _is_head(key: str) -> bool:
-    """Returns whether a tensor's name is that of a head of LPIPS."""
+    """Returns whether a tensor is a head of LPIPS, by its name."""
     return HEAD.fullmatch(key) is not None
 
 

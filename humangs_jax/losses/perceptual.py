@@ -144,7 +144,7 @@ BACKBONES: dict[str, Slices] = {"vgg": VGG16, "alex": ALEXNET, "squeeze": SQUEEZ
 
 
 def convolutions(slices: Slices) -> Iterator[Conv]:
-    """Yields all convolutions of a network, including those of the fire modules."""
+    """Yields all convolutions of a network, also in its fire modules."""
     for layer in itertools.chain.from_iterable(slices):
         if isinstance(layer, Fire):
             yield from layer.convolutions
@@ -200,9 +200,9 @@ def feature_maps(
     Everything is computed in the dtype of the weights.
 
     size: height and width of the image without padding, if it was padded below and right so that
-    images of several sizes share a program. The maps are then those of the image without padding,
-    padded with zeros, and the returned sizes say where they end. None: the image is not padded, and
-    the returned sizes are None.
+    images of several sizes share a program. The maps are then equal to the maps of the image
+    without padding, with zeros beyond them, and the returned sizes say where they end. None: the
+    image is not padded, and the returned sizes are None.
     Raises: ValueError for an image that is too small for the network.
     """
     height, width, _ = image.shape
@@ -316,8 +316,8 @@ def lpips_distances(
     target: Float[Array, "h w 3"],
     size: Int[Array, "2"] | None = None,
 ) -> Float[Array, " _"]:
-    """Returns the distances of two images at the depths of the backbone, of which vgg and alex have
-    five and squeeze seven. Their sum is `lpips`.
+    """Returns the distance of two images at each depth of the backbone, (depths,). vgg and alex
+    have five depths, squeeze has seven. The sum is `lpips`.
     """
     maps = [lpips_features(weights, image, size) for image in (predicted, target)]
     return _distances(weights, *maps)
@@ -369,7 +369,7 @@ def lpips(
         d = sum over slices of the mean over pixels of sum_c w_c (x_c / |x| - y_c / |y|)^2
 
     size: height and width of the images without padding, if both were padded below and right, see
-    `feature_maps`. The distance is that of the images without padding.
+    `feature_maps`. The padding does not change the distance.
     Raises: ValueError for images that are too small (16 pixels a side for vgg, 31 for alex, 25 for
     squeeze).
     """
@@ -419,9 +419,9 @@ def perceptual_errors(
 
     Colors enter as 255 * rgb - (123.68, 116.779, 103.939). The weights of the original VGG-19
     expect this. They are in MatConvNet's file and in the released checkpoint. torchvision's weights
-    expect other scales, and would make another loss. The features are those after the second ReLU
-    of each block. No gradient flows into the target. Raises: ValueError for images under 16 pixels
-    a side.
+    expect other scales, and would make another loss. Features are taken after the second ReLU of
+    each block. No gradient flows into the target. Raises: ValueError for images under 16 pixels a
+    side.
     """
     target = jax.lax.stop_gradient(target)
     images = [255 * image for image in at_least_float32((predicted, target))]

@@ -39,7 +39,7 @@ _HEAD = JOINT_NAMES.index("head")
 _Rotations = Float[np.ndarray, "m n 3"]
 """Axis-angles of n joints in m frames, radians."""
 _SOMA_JOINTS = 77
-"""Number of joints of Kimodo's skeleton, which is not that of SMPL-X."""
+"""Number of joints of Kimodo's skeleton, which differs from SMPL-X's skeleton."""
 _NO_HANDS = "hands of {} numbers are principal coefficients of a model: left flat"
 """The note about hands in a form that is not read."""
 _MISSING_RATE = (
@@ -168,7 +168,7 @@ def _frames(person: Person) -> int:
 def _posed(file: "_MotionFile", form: ArrayKeys) -> _Rotations:
     """Returns the rotations of all joints (m, 55, 3), from the keys of the parts of the body.
 
-    The number of frames m is that of the first key.
+    The array under the first key decides the number of frames m.
 
     Raises: MotionError if an array is wrong.
     """

@@ -106,7 +106,7 @@ def of_preset(name: str) -> dict[str, float] | None:
 def as_arkit(track: FaceTrack) -> tuple[FaceTrack | None, tuple[str, ...]]:
     """Converts a track to ARKit's shapes.
 
-    Returns: the track, or None if none of its names is known; and the names that are neither those
+    Returns: the track, or None if none of its names is known; and the names that are neither shapes
     of ARKit nor presets.
     """
     values = np.zeros((len(track.values), len(ARKIT)))

@@ -161,8 +161,8 @@ def _path(joint: int, children: list[list[int]], reach: np.ndarray) -> list[int]
 def _limbs(
     plain: Sequence[str], parents: Sequence[int], lengths: np.ndarray, posed: _Places
 ) -> dict[str, int] | None:
-    """Finds the joints of arms, legs and pelvis by the tree. Returns None if the tree is not that
-    of a person.
+    """Finds the joints of arms, legs and pelvis by the tree. Returns None if the tree does not look
+    like a person.
 
     lengths: of the bone above each joint. posed: places in the first frame, (s, 3).
     """

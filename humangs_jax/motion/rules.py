@@ -130,7 +130,7 @@ UNDER = (
     ("shoulder", "elbow"),
     ("elbow", "wrist"),
 )
-"""Pairs of joints of which the second must hang below the first."""
+"""Pairs of joints. The second joint of a pair must hang below the first."""
 LIKE = 0.15
 """Largest difference between bones of two limbs of a pair, as a share of the longest bone."""
 SIDES = ("left", "right")
@@ -175,12 +175,12 @@ this.
 """
 BETTER_TILT = np.radians(10)
 """Angle, radians. In some files the hips hang on other joints than the pelvis. These joints give
-the rotation of the pelvis if their mean angle to the trunk is smaller than the mean angle of the
-pelvis's joint, by more than this.
+the rotation of the pelvis if they agree better with the trunk: if their mean angle to it is smaller
+than the mean angle of the pelvis's joint by more than this.
 """
 LARGEST_BEND = np.radians(60)
-"""Largest mean angle between pelvis and lowest spine over the frames, radians. If it is larger, the
-rotation of the pelvis's joint is not that of a pelvis.
+"""Largest mean angle between pelvis and lowest spine over the frames, radians. If the angle is
+larger, the pelvis's joint does not turn as a pelvis does.
 """
 RATE_ROUNDING = 1e-4
 """Relative error of a frame rate. Some BVH files give the time of a frame in only four digits."""
@@ -188,8 +188,8 @@ RATE_ROUNDING = 1e-4
 FLOOR_BAND = 0.05
 """The lowest joint is on the floor if it is within this distance of its usual height, metres."""
 STILL = (0.1, 0.3)
-"""A joint rests on the floor if its speed is at most the first number, in metres per second, or at
-most the second number times the mean speed of all joints.
+"""Two limits of the speed of a joint that rests on the floor. The first is in metres per second.
+The second is a share of the mean speed of all joints. The larger limit counts.
 """
 ON_THE_FLOOR = 0.5
 """An axis has a floor below if the lowest joint rests there in at least this share of the frames.
@@ -300,7 +300,7 @@ def joint_places(
 
 
 def page_rules() -> dict[str, Any]:
-    """Returns the tables of this module, and those of formats, as the page gets them in JSON."""
+    """Returns the tables of this module and of the formats, as the page gets them in JSON."""
     names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE NOISE ENDS UNDER LIKE SIDES NEXT
     NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING
     FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS ORTHONORMAL NO_RATE NO_PLACES"""

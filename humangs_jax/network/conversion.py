@@ -326,9 +326,9 @@ def load_checkpoint(path: str | os.PathLike[str], head_width: int | None = None)
     """Returns a released checkpoint as float32 variables, with the configuration that its shapes
     show.
 
-    head_width: see `infer_config`. Raises: OSError; ValueError, which names file and tensor, if the
-    file cannot be read or asks for more than tensors, or if a tensor of the network is missing,
-    unknown, of the wrong shape or not finite.
+    head_width: see `infer_config`. Raises: OSError; ValueError, which names file and tensor. It is
+    raised if the file cannot be read or holds more than tensors, or if a tensor of the network is
+    missing, unknown, of the wrong shape or not finite.
     """
     with reading(path, "checkpoint of the published network"):
         return _load_checkpoint(path, head_width)

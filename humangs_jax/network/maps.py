@@ -211,8 +211,8 @@ _convolve_on_cpu.defvjp(lambda x, kernel: (_convolve(x, kernel), (x, kernel)), _
 
 
 class Convolution(nn.Module):
-    """A 3x3 convolution with a bias, from (v, h, w, c) to (v, h, w, features). Its parameters are
-    those of `nn.Conv`.
+    """A 3x3 convolution with a bias, from (v, h, w, c) to (v, h, w, features). It has the
+    parameters of `nn.Conv`.
     """
 
     features: int

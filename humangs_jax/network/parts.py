@@ -144,7 +144,9 @@ class Encoding:
     dropped_tokens: Int[Array, ""]
     """Number of foreground patches for which the token capacity had no room."""
     packing: Packing | None = None
-    """The patches of which the maps have features. None: all patches."""
+    """The patches that became tokens, if the maps have features of these patches only. None: the
+    maps have features of all patches.
+    """
     patch_size: int = static_field(default=1)
     """Side of a patch, pixels."""
 

@@ -76,10 +76,10 @@ class Runtime:
     remat: Literal["none", "full", "dots"] = knob(
         "none", cost="a third more arithmetic", gain="memory of training", measured="performance.md"
     )
-    """What a block recomputes in the backward pass instead of keeping it: nothing ("none"),
-    everything ("full"), or everything but the results of attention and of products with weights
-    ("dots"). On a CPU this works only with `scan`, because outside of loops XLA merges what is
-    computed twice.
+    """What a block recomputes in the backward pass, instead of keeping it: nothing ("none") or
+    everything ("full"). With "dots" it keeps the results of attention and of products with weights,
+    and recomputes the rest. On a CPU this works only with `scan`, because outside of loops XLA
+    merges what is computed twice.
     """
     max_edge_length: Edge | None = knob(
         None,

@@ -149,8 +149,8 @@ def variables_from_tensors(
 ) -> Variables:
     """Returns float32 variables made from tensors by path. where: name of the file, for errors.
 
-    Raises: ValueError, which names the key, unless the tensors are exactly those of the
-    configuration.
+    Raises: ValueError, which names the key, unless the tensors have exactly the names and shapes
+    that the configuration needs, and are finite.
     """
     expected = expected_variables(config)
     arrays = _check(tensors, expected, where)
@@ -160,8 +160,8 @@ def variables_from_tensors(
 
 
 def _check(tensors: dict[str, Any], variables: Variables, where: str) -> dict[str, np.ndarray]:
-    """Returns the tensors as numpy arrays in the order of the leaves, after a check that they have
-    exactly the names and shapes of the variables and are finite.
+    """Returns the tensors as numpy arrays, in the order of the leaves of `variables`. They are
+    checked first: names and shapes must be exactly as in `variables`, and all numbers finite.
 
     Raises: ValueError, which names the tensor.
     """

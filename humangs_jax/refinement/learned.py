@@ -182,8 +182,7 @@ def neighbor_mean(values: Float[Array, "g c"], neighbors: Neighbors) -> Float[Ar
     """Returns the mean of the values of each point's neighbours, (g, c). It is 0 for a point
     without neighbours.
 
-    The gradient is written as a gather, too, which the symmetric graph allows, because scattering
-    is slow on a CPU.
+    Because the graph is symmetric, the gradient is a gather, too. A scatter would be slow on a CPU.
     """
     return jnp.sum(values[neighbors.index] * neighbors.share[..., None], axis=1)
 

@@ -44,7 +44,8 @@ class Refinement:
     them.
     """
     steps: int
-    """Steps of the optimizer, including those of the trials."""
+    """Number of steps of the optimizer, trials included. Steps on the head alone are not included.
+    """
     seconds: float
     """The time of the run without compilation, seconds."""
     compile_seconds: float
@@ -155,7 +156,7 @@ def refine_with_report(
     """Fits an avatar as `refine` does, and returns it with the number of steps, the seconds and the
     gain.
 
-    Arguments and errors are those of `refine`. A run with a given number of steps can be repeated
+    Arguments and errors are as in `refine`. A run with a given number of steps can be repeated
     exactly on the same machine. If the run was limited by seconds, see `Refinement.planned`.
     """
     config = config or RefineConfig()

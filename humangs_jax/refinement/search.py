@@ -565,8 +565,8 @@ def avatar_comparison(
 
 
 def psnr_of(task: Task, found: Candidate, photos: Sequence[Photo]) -> float:
-    """Returns the mean `aligned_psnr` of a state, dB, over the photos of which some pixels count.
-    It is `LARGEST_PSNR` if no pixel counts.
+    """Returns the mean `aligned_psnr` of a state, dB, over the photos that have pixels that count.
+    It is `LARGEST_PSNR` if no photo has any.
 
     photos: as they were given. If `align` has moved the photos, each is moved here to what the
     state draws, because a photo that was moved to the start would favour the start.

@@ -55,7 +55,7 @@ class RefineState:
     parameters: UnconstrainedGaussians
     """The parameters of the Gaussians."""
     start: UnconstrainedGaussians
-    """The parameters before the first step, towards which those in `PULLED` are pulled."""
+    """The parameters before the first step. Steps pull the parameters in `PULLED` towards them."""
     trust: Float[Array, " g"]
     """Factor of the rates for each Gaussian, (g,), in [0, 1]."""
     moments: PyTree
@@ -146,9 +146,10 @@ def refine_views(
     and the number of (splat, tile) pairs that did not fit. This is `refine` without its decisions,
     for `jax.jit` and `jax.vmap`.
 
-    Static arguments: config, of which only the loss, the optimizer, the rates and `visible` are
-    used; splat, with `max_pairs` (see `plan_buffers`); steps. Batch over people whose arrays have
-    the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
+    Static arguments are `config`, `splat` and `steps`. Only the loss, the optimizer, the rates and
+    `visible` of the configuration are used. `splat` needs `max_pairs` (see `plan_buffers`). Batch
+    over people whose arrays have the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None,
+    None))`.
     """
     avatar, photos = with_pixel_footprint_of(avatar, views), photos_of(views)
     parameters = parameters_of(avatar.gaussians)

@@ -312,8 +312,8 @@ def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:
     """Returns the configuration without the losses whose networks are missing. A warning names
     them.
 
-    Structural dissimilarity replaces them. Its weight is raised to the default weight, that of
-    `LossConfig()`, unless it is larger already.
+    Structural dissimilarity replaces them. Its weight is raised to the default of `LossConfig`,
+    unless the weight is larger already.
     """
     missing = missing_networks(config, networks)
     if not missing:

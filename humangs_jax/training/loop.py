@@ -258,7 +258,7 @@ def forget_after(path: Path, step: int) -> None:
 
 @contextlib.contextmanager
 def _naming(path: Any) -> Generator[None]:
-    """Turns an OSError, such as that of a full disk, into one that names the file."""
+    """Turns an OSError, as from a full disk, into an OSError that names the file."""
     try:
         yield
     except OSError as error:

@@ -88,7 +88,7 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Returns the sharding of arrays of which every device has a copy."""
+    """Returns the sharding of arrays that every device has as a whole."""
     return NamedSharding(mesh, PartitionSpec())
 
 

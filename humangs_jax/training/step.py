@@ -257,12 +257,13 @@ def update(
 ) -> tuple[TrainState, Metrics]:
     """Returns the state after one more step, and metrics.
 
-    Metrics are the loss and its terms, psnr, grad_norm, learning_rate, skipped and nonfinite (steps
-    so far), and dropped_tokens and overflow (what did not fit its buffers in this step).
+    Metrics are the loss and its terms, psnr, grad_norm and learning_rate. skipped and nonfinite
+    count the steps so far that were skipped or not finite. dropped_tokens and overflow count what
+    did not fit its buffers in this step.
 
     Arguments: batch: an `Example` with a leading axis of subjects. body: decimated already.
-    networks: those of the losses that need them. seed: from `seed_numbers`. config: static, of one
-    stage. mesh: static; with a mesh, state, batch, body and networks lie on it, see `sharding`.
+    networks: networks of the losses that need one. seed: from `seed_numbers`. config: static, of
+    one stage. mesh: static; with a mesh, state, batch, body and networks lie on it, see `sharding`.
     Raises: ValueError if parameters have fewer than 32 bits, if the subjects of a device cannot be
     divided into microbatches, or if the network of a loss is missing.
     """
