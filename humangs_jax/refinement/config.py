@@ -108,8 +108,9 @@ class RefineConfig:
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     """How far a step moves each parameter."""
     full_steps: Steps = 100
-    """If a run with iterations has n steps, more than this, its learning rates are multiplied by
-    `full_steps` / n. Otherwise Gaussians would move further and overfit to the photos.
+    """Largest number of steps at the full learning rates, after iterations. A longer run has its
+    rates multiplied by this number divided by its number of steps. Otherwise Gaussians would move
+    further and overfit to the photos.
     """
     visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
     """Least weight of a Gaussian on some pixel of a photo with which it moves at the full rate, in
