@@ -43,7 +43,9 @@ KEYS = (
 
 @pytree_dataclass
 class Expressions:
-    """The expressions of a body of j joints: e directions, in which m of its vertices move."""
+    """The expressions of a body: e directions, in which m of its vertices move. Its j joints may
+    move and turn, too.
+    """
 
     vertices: Int[Array, " m"]
     """Indices of the vertices that move, increasing."""

@@ -30,8 +30,8 @@ def posed_tree(
 
 
 def bones_of(joints: Float[np.ndarray, "j 3"], parents: Sequence[int]) -> Float[np.ndarray, "j 3"]:
-    """Returns the vector from its parent to each joint of a rest pose, (j, 3); for a root its
-    position.
+    """For each joint, returns the vector from its parent in the rest pose, (j, 3). For a root,
+    returns its position.
     """
     above = np.asarray(parents)
     return np.where(above[:, None] < 0, joints, joints - joints[above])

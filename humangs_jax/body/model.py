@@ -35,8 +35,8 @@ EXACT = transform.EXACT
 
 
 def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
-    """Returns arrays (j,) of the index of every joint's parent, then of its second, fourth, eighth
-    ... ancestor. The index is j where there is no such ancestor.
+    """Returns arrays of indices, (j,) each: of every joint's parent, then of its second, fourth,
+    eighth ... ancestor. The index is j where there is no such ancestor.
 
     Raises: ValueError unless all joints descend from one root (-1).
     """
@@ -259,11 +259,11 @@ class BodyModel:
     its own number. None: as for `collapse_order`.
     """
     relative_vertex_spacing: Float[Array, " n"] | None = None
-    """Distance to neighbouring vertices relative to the mesh before subdivision, (n,), see
+    """Distance to neighbouring vertices, divided by this distance before subdivision, (n,), see
     `body.resolution`. None: the mesh was not subdivided.
     """
     texels: Texels | None = None
-    """The point of the surface that each texel of a map shows, for networks that work on one:
+    """The point of the surface that each texel of a map shows, for networks that work on a map, see
     `network.parts`.
     """
     expressions: Expressions | None = None

@@ -88,7 +88,7 @@ class Predicted(NamedTuple):
     """The images that a method predicts for views of a case."""
 
     images: Float[np.ndarray, "v h w 3"]
-    """The images of v of the views, (v, h, w, 3), in [0, 1]."""
+    """The predicted images of v views, (v, h, w, 3), in [0, 1]."""
     alpha: Float[np.ndarray, "v h w"] | None
     """Coverage by the person in these images, (v, h, w); None: not known."""
     views: tuple[int, ...]
@@ -98,7 +98,8 @@ class Predicted(NamedTuple):
 
 
 Method = Callable[[Case, float], Predicted]
-"""A method: called with a case and the grey value of the background, returns its predictions."""
+"""A function that takes a case and the grey value of the background, and returns its predictions.
+"""
 
 
 def find_people(

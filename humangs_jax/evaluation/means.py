@@ -49,8 +49,8 @@ class Mean(NamedTuple):
 
 
 def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
-    """Returns the mean of each score over some images or people. A score that one of them lacks is
-    None.
+    """Returns the mean of each score over some images or people. If one of them lacks a score, the
+    mean of this score is None.
     """
     listed = list(rows)
     lacking = {name for name in listed[0] for row in listed if row.get(name) is None}
@@ -111,8 +111,8 @@ def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
 
 
 def bootstrap(values: Sequence[float], seed: int = 0) -> tuple[float | None, float | None]:
-    """Returns the ends of the percentile interval of the mean of some values under resampling
-    (Efron, 1979); (None, None) for one value.
+    """Returns the ends of a confidence interval of the mean of some values, by percentiles of the
+    bootstrap (Efron, 1979). (None, None) for one value.
     """
     if len(values) < 2:
         return None, None

@@ -63,7 +63,9 @@ INPUT_SIDE = 128
 QUALITY = 88
 """The quality of the JPEGs."""
 LARGEST_ERROR = 0.25
-"""Mean absolute difference of the channels that is shown in the last color of the error scale."""
+"""Error that is shown in the last color of the error scale. The error of a pixel is the mean
+absolute difference of its channels.
+"""
 _MARK = re.compile(r"\{\{(\w+)\}\}")
 
 

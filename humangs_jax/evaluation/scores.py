@@ -61,7 +61,7 @@ class Crop(Protocol):
         """Returns the part of the image. Crops that add pixels give them the value `background`, 0
         or 1.
 
-        mask: has pixels above a half.
+        mask: at least one of its pixels is above a half.
         """
         ...
 
@@ -234,7 +234,9 @@ STRIDE = 32
 LEAST_FOREGROUND = 0.5
 """Share of a patch that the foreground must exceed for the patch to count."""
 PATCHES_AT_ONCE = 16
-"""Patches whose LPIPS is computed at once: as many pixels as one image of 256 x 256."""
+"""Number of patches whose LPIPS is computed at once. They have as many pixels as one image of 256 x
+256.
+"""
 
 Networks = Mapping[str, Lpips]
 """LPIPS networks by name."""
@@ -417,8 +419,8 @@ def score_names(protocol: EvaluationProtocol) -> tuple[str, ...]:
 def missing_reasons(
     protocol: EvaluationProtocol, networks: Networks, masks: bool, alpha: bool
 ) -> dict[str, str]:
-    """Returns the reasons why scores of all images are missing, by the name of the score. masks:
-    whether the truth has masks. alpha: whether predictions have alpha.
+    """Returns, by the name of a score, why this score is missing in all images. masks: whether the
+    truth has masks. alpha: whether predictions have alpha.
     """
     reasons = {}
     for name in score_names(protocol):

@@ -173,7 +173,7 @@ def _person_height(mask: Float[np.ndarray, "h w"]) -> int:
 
 
 def sizes(height: float) -> tuple[int, int]:
-    """Returns the largest move and the side of the windows, pixels. height: of the person,
+    """Returns the largest move and the side of the windows, pixels. height: height of the person,
     pixels.
     """
     return max(1, round(REACH * height)), max(3, round(WINDOW * height))

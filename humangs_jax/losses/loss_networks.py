@@ -272,7 +272,7 @@ def _is_head(key: str) -> bool:
 
 
 def expected_tensors(network: str) -> dict[str, tuple[int, ...]]:
-    """Returns the names and shapes of the torch tensors of one of `NETWORKS` that are needed here.
+    """Returns the shapes of the torch tensors that one of `NETWORKS` needs here, by name.
 
     {"0.weight": (out, in, rows, columns), "0.bias": (out,), ...}
     """

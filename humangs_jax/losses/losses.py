@@ -68,7 +68,7 @@ class LossConfig:
     opaque: Weight = 0.0
     """4 o (1 - o) of the opacities o, which is largest for half-transparent Gaussians."""
     random_background: Share = 0.5
-    """Share of the targets that are seen against one random color instead of white, so that white
+    """Share of the targets that are drawn on a random color instead of white, so that white
     Gaussians differ from missing Gaussians.
     """
 

@@ -436,8 +436,8 @@ def perceptual_errors(
 def perceptual_loss(
     vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
 ) -> Scalar:
-    """Returns the published perceptual loss: the sum of `perceptual_errors` over `DIVISORS`,
-    divided by 255.
+    """Returns the published perceptual loss: the sum of `perceptual_errors`, each divided by its
+    entry of `DIVISORS`, divided by 255.
     """
     errors = perceptual_errors(vgg, predicted, target)
     return jnp.sum(errors / jnp.asarray(DIVISORS, errors.dtype)) / 255

@@ -413,8 +413,8 @@ class _MotionFile(ArrayFile):
         return next((key for key in keys if key in self.values), keys[0])
 
     def rate(self, form: ArrayKeys) -> float:
-        """Returns the frames per second that the user gave, or else the file's, or else the
-        format's default.
+        """Returns the frames per second that the user gave. If there are none, returns the rate of
+        the file, or else the default of the format.
 
         Raises: MotionError if there is none of these, or if the file's rate is not positive.
         """

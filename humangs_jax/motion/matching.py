@@ -37,8 +37,8 @@ def matched(
 ) -> dict[str, int]:
     """Returns, for each of our joints that the file has, the index of the file's joint.
 
-    names, parents: of the file's joints. rest, posed: their places in the rest pose and in the
-    first frame, (s, 3).
+    names, parents: names and parents of the file's joints. rest, posed: places of these joints in
+    the rest pose and in the first frame, (s, 3).
 
     Raises: InvalidFileError if neither names nor the tree show all joints that are needed.
     """

@@ -344,7 +344,9 @@ def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
 
 
 def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
-    """Joins the people of each frame, (name of the frame, people), into people of all frames."""
+    """Returns the people of a motion, each with the values of all frames.
+    frames: for each frame, its name and its people.
+    """
     people: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
     for i, (_, found) in enumerate(frames):
         for person in found:

@@ -50,7 +50,7 @@ NO_PLACES = "the file has no positions ({}): people stay in place"
 def _finger(finger: str, i: int) -> tuple[str, ...]:
     """Returns the known names of joint i of a finger, counted from 1 at the palm.
 
-    Names of Biped have the number of the finger, counted from 0 at the thumb.
+    In the names of Biped, fingers have numbers, counted from 0 at the thumb.
     """
     number = ("thumb", "index", "middle", "ring", "pinky").index(finger)
     words = (finger, "little") if finger == "pinky" else (finger,)

@@ -68,7 +68,7 @@ class Clip:
 
 
 def bytes_of_clip(frames: int, joints: int) -> int:
-    """Returns the approximate number of bytes that a clip takes. frames, joints: their numbers."""
+    """Returns the approximate number of bytes that a clip of so many frames and joints takes."""
     return 96 * frames * joints
 
 

@@ -92,8 +92,8 @@ def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p pixel
 
 
 def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
-    """Returns which patch each of `capacity` slots gets: the foreground patches in their order.
-    Patches beyond the capacity are left out.
+    """Returns the foreground patches in their order, one for each of `capacity` slots. Patches
+    beyond the capacity are left out.
     """
     indices = jnp.nonzero(foreground, size=capacity, fill_value=foreground.shape[0])[0]
     return Packing(indices, jnp.minimum(jnp.sum(foreground), capacity))

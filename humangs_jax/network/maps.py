@@ -40,8 +40,8 @@ REACH = KERNEL // 2 + 1
 map, and the kernel reads the neighbours of these texels.
 """
 OUTSIDE = -4.0
-"""A texel index outside of every map, together with its neighbourhood. Reading there gives zeros,
-and the gradient costs nothing.
+"""A texel index that lies outside of every map, as its 3 x 3 neighbourhood does. Reading there
+gives zeros, and the gradient costs nothing.
 """
 PixelGrid = Literal["half_pixel", "mixed"]
 

@@ -16,8 +16,8 @@ SHELLS = (0.0, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18)
 
 
 def published() -> HumanGSConfig:
-    """Returns the configuration of the authors' release: 99 M parameters, with its quirks. It
-    computes in bfloat16 (`Runtime.dtype`).
+    """Returns the configuration of the authors' release: 99 M parameters, and conventions that only
+    the release has. It computes in bfloat16 (`Runtime.dtype`).
     """
     return HumanGSConfig(
         conventions=Conventions(

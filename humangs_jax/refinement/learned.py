@@ -274,8 +274,8 @@ class Refiner(nn.Module):
         return values + moves * LARGEST_MOVES, features
 
     def from_clusters(self, features: Float[Array, "g w"], graph: Graph) -> Float[Array, "g w"]:
-        """Returns the features of the clusters around each Gaussian, (g, w). Before, the clusters
-        have exchanged messages with their neighbours and with the mean of all clusters.
+        """Returns the features of the clusters around each Gaussian, (g, w). First the clusters
+        exchange messages with their neighbours, and with the mean of all clusters.
         """
 
         def dense(name):
@@ -300,9 +300,9 @@ class Refiner(nn.Module):
 
 
 def _relative_errors(values: Float[Array, "g 14"], signals: Signals) -> Float[Array, "v g 14"]:
-    """Returns the gradients relative to a Gaussian's weight on the pixels, squashed into (-3, 3).
-    Lengths are relative to the Gaussian's longest axis. Gradients of color logits become gradients
-    of colors.
+    """Returns the gradients divided by a Gaussian's weight on the pixels, and squashed into (-3,
+    3). Gradients with respect to lengths are multiplied by the Gaussian's longest axis. Gradients
+    of color logits become gradients of colors.
     """
     colors = nn.sigmoid(values[:, 11:])
     longest = jnp.exp(jnp.max(values[:, 7:10], axis=-1, keepdims=True))

@@ -118,8 +118,8 @@ respect to the parameters and to the brightness of each Gaussian.
 
 
 def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """Returns the parameters that refinement moves. The low-pass is taken out of their scales.
-    `gaussians_of` makes the Gaussians again, with the limits of `unconstrain`.
+    """Returns the parameters of Gaussians that refinement moves. The low-pass is removed from the
+    scales. `gaussians_of` makes the Gaussians again, with the limits of `unconstrain`.
 
     Raises: ValueError for harmonics or deformations.
     """

@@ -127,8 +127,8 @@ def windows(
 
 
 def held_out_blocks(shape: tuple[int, ...], share: float, seed: int) -> Bool[np.ndarray, "v h w"]:
-    """Returns which pixels of v photos are held out, (v, h, w). They are random blocks, which are
-    about the share `share` of all pixels. shape: (v, h, w).
+    """Returns which pixels of v photos are held out, (v, h, w). They are random blocks that cover
+    about `share` of all pixels. shape: (v, h, w).
     """
     v, height, width = shape
     blocks = (

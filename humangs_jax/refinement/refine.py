@@ -61,8 +61,8 @@ class Refinement:
     interrupted: bool = False
     """Whether Ctrl-C ended the run."""
     planned: int | None = None
-    """Number of steps that were planned. `refine` with the same configuration and `steps=planned`
-    repeats a run that was limited by seconds, exactly. None: the run was cut short.
+    """Number of steps that were planned. If a run was limited by seconds, `refine` with the same
+    configuration and `steps=planned` repeats it exactly. None: the run was cut short.
     """
     left_out: tuple[str, ...] = ()
     """Names of photos that contradict the others, and were not fitted."""

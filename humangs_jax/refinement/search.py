@@ -407,8 +407,9 @@ def _search_by_blocks(
 def _search_by_photo(
     task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
 ) -> Iterator[Candidate]:
-    """Yields the states of trials without one photo, then the states of a fit of all photos that
-    does what helped in the trials. losses: the loss of the start on each photo.
+    """Yields the states of trials, which each leave one photo out, then the states of a fit to all
+    photos. The fit has the iterations and the steps that helped in the trials. losses: the loss of
+    the start on each photo.
     """
     config, clock, everybody = task.config, task.clock, np.arange(len(losses))
     # iterations alone need no trial, unless one photo contradicts the others

@@ -106,7 +106,7 @@ class StageReport:
     @property
     def spoils(self) -> Leaf | None:
         """The first gradient of the stage that is not finite, if all gradients that came back to
-        the stage are finite. Else None.
+        the stage are finite. None: the stage did not spoil a gradient.
         """
         if _first_bad(self.returned):
             return None
@@ -160,7 +160,7 @@ class Fault:
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """The diagnosis of one subject of a step. It is the first subject with a fault, or else the one
+    """The diagnosis of one subject of a step: the first subject with a fault, or else the subject
     with the largest gradient.
     """
 

@@ -88,7 +88,7 @@ def draw_targets(
     backgrounds: Float[Array, "v 3"],
     config: TrainConfig,
 ) -> Drawn:
-    """Returns the Gaussians drawn in the pose and from the camera of every target.
+    """Returns images of the Gaussians, in the pose and from the camera of every target.
 
     inputs: the photos from which the Gaussians were made.
     """

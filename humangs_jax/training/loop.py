@@ -291,8 +291,8 @@ DROPPED = {
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """The error of `train` when Ctrl-C, SIGTERM or the loss of a machine asks it to stop. The state
-    is saved, and the same call continues the run.
+    """`train` raises this after Ctrl-C or SIGTERM, or if the machine is taken away. The state is
+    saved, and the same call continues the run.
 
     It is a KeyboardInterrupt, so that a loop of several runs stops, too. state: the saved state.
     """

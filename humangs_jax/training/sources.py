@@ -114,8 +114,8 @@ def _cached_people(cache: PeopleCache) -> SourceFactory:
 
 
 def mixed_people(parts: Sequence[SourceFactory], weights: Sequence[float | int]) -> SourceFactory:
-    """Returns a function that makes a source of several sources, `parts`. weights: the share of
-    each, see `examples.Mixture`.
+    """Returns a function that makes a source that draws its examples from several sources, `parts`.
+    weights: the share of each part, see `examples.Mixture`.
     """
     return lambda config: Mixture(tuple(part(config) for part in parts), tuple(weights))
 

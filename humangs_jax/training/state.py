@@ -172,7 +172,7 @@ class Joined(NamedTuple):
 
 
 def join(tree: PyTree) -> Joined:
-    """Returns the entries of a tree, in the order of its arrays."""
+    """Returns the entries of all arrays of a tree, joined in the order of the arrays."""
     leaves = jax.tree.leaves(tree)
 
     def entries(wanted: bool) -> Array:
