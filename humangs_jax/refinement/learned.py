@@ -301,7 +301,7 @@ class Refiner(nn.Module):
 
 def _relative_errors(values: Float[Array, "g 14"], signals: Signals) -> Float[Array, "v g 14"]:
     """Returns the gradients divided by a Gaussian's weight on the pixels, and squashed into (-3,
-    3). Gradients with respect to lengths are multiplied by the Gaussian's longest axis. Gradients
+    3). Gradients with respect to the means are multiplied by the Gaussian's longest axis. Gradients
     of color logits become gradients of colors.
     """
     colors = nn.sigmoid(values[:, 11:])
