@@ -323,7 +323,7 @@ def _folder_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def _compared(validation: People, body: BodyModel, base: TrainConfig) -> tuple[SourceFactory, int]:
-    """Returns a function that makes a source of the people on whom all runs are compared, and the
+    """Returns a function that makes a source of the people that all runs are compared on, and the
     number of people to look at.
     """
     found, count = _source(validation, body, base, "validation", each_once=True), VALIDATED
