@@ -13,14 +13,14 @@ from jax.core import Tracer
 from humangs_jax.core.array_types import Int
 
 SMALL = 1 << 16
-"""Largest number of entries of an array that is brought from an accelerator and back in less time
-than a program takes to compile.
+"""Arrays of at most this many entries are indexed on the host. Their way from an accelerator and
+back takes less time than compiling a program.
 """
 
 
 def from_host(array: Any, dtype: Any = None) -> Any:
     """Returns an array of JAX with the numbers of a list or of an array of numpy. An array of JAX
-    is returned with the dtype changed. dtype: None keeps numpy's or JAX's type.
+    is returned, too, converted to `dtype`. dtype: None keeps the type.
 
     `jnp.asarray` gives the same result, but compiles a program for each shape.
     """
@@ -44,8 +44,10 @@ def taken(array: Any, index: Any) -> Any:
     """Returns `array[index]`, for arrays of numpy and of JAX.
 
     An array of JAX is indexed by numpy if it is small or if numpy can read it at once, see
-    `on_host`. The result is then an array of JAX again. Raises: IndexError for an integer out of
-    range, unless the index is traced: JAX would clamp it.
+    `on_host`. The result is then an array of JAX again.
+
+    Raises: IndexError for an integer out of range. If the index is traced, there is no error, and
+    JAX clamps it.
     """
     if isinstance(index, Tracer) or isinstance(array, np.ndarray):
         return array[index]

@@ -37,7 +37,9 @@ NUMBERS = (int, float, complex, bool)
 numpy and JAX are accepted, too.
 """
 SEQUENCES = {list: Sequence, Sequence: Sequence, Iterable: Iterable, os.PathLike: os.PathLike}
-"""The class that is checked for each generic class of an annotation. Its items are not checked."""
+"""Generic classes that may be checked in annotations -> the class that a value must have. Items of
+sequences are not checked.
+"""
 HINTS = {
     ("Gaussians", "Avatar"): "animate(avatar, pose) poses them",
     ("Avatar", "Gaussians"): "an Avatar has what they need to be posed",
@@ -53,20 +55,23 @@ HINTS = {
     ("Sequence", "Capture"): "a list of captures",
     ("HumanGSConfig", "tuple"): "load_weights returns (variables, config)",
 }
-"""Advice by the class that is expected and the class that was given."""
+"""Advice in an error message, by the names of the expected class and of the given class."""
 
 
 def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """Decorates a function so that each call checks the classes of its arguments, and the shapes of
     the arrays in them.
 
-    A parameter is checked if its annotation allows only plain classes and sequences, or only
-    arrays; None may be allowed, too. So numbers and callables are not checked. Of an array, only
-    the number of axes is checked.
-    Raises: TypeError, of one line, for an argument of another class, for a name that the function
-    does not have, and for a missing argument. ValueError for an array with another number of axes,
-    for a pytree that does not fit its annotations (`shape_fault`), and for a batch where the
-    function takes one example (`one_at_a_time`).
+    A parameter is checked if its annotation consists of plain classes and sequences, or of arrays,
+    besides None. Parameters for numbers and callables are not checked. For an array, only the
+    number of axes is checked.
+
+    Raises:
+        TypeError: of one line, for an argument of another class, for a name that is no parameter,
+            and for a missing argument.
+        ValueError: for an array with another number of axes, for a pytree that does not fit its
+            annotations (`shape_fault`), and for a batch where the function takes one example
+            (`one_at_a_time`).
     """
     # annotations are read once, when the function is defined
     signature = inspect.signature(function)
@@ -122,8 +127,8 @@ def _arrays(annotation: Any) -> tuple[Any, ...]:
 
 
 def _no_array(options: tuple[Any, ...], value: Any) -> str | None:
-    """Returns a text that says why a value is not the expected array, or None if it is one. Only
-    the number of axes is compared. Numbers count as arrays without axes.
+    """Returns a text that says why a value is not the expected array. Returns None if the value
+    fits. Only the number of axes is compared. A number counts as an array without axes.
     """
     if value is None and type(None) in options:
         return None
@@ -247,14 +252,17 @@ def check_values(
     owner: str,
     arrays: Mapping[str, tuple[Shaped[Array, "..."] | Shaped[np.ndarray, "..."] | None, Values]],
 ) -> None:
-    """Checks that the numbers in arrays are finite and in their ranges.
+    """Checks that the numbers in arrays are finite and in their ranges. Nothing is checked if one
+    of the arrays is traced.
 
-    Arguments: owner: the function that was called, for the message. arrays: by name (for the
-    message too), each with the values that it may have; None and empty arrays pass. Arrays of JAX
-    on an accelerator are reduced together there, by one program and one transfer of two numbers
-    each; others are checked on the host, without a copy.
-    Raises: ValueError that names the first array with other values, says how many they are, and
-    where the first one is. Nothing is checked if one of the arrays is traced.
+    An accelerator reduces all its arrays of JAX by one program, and only two numbers for each are
+    transferred. Other arrays are checked on the host, without a copy.
+
+    Arguments: owner: the function that was called, for the message. arrays: by its name in the
+    message, each array and the values that its entries may have. None and empty arrays pass.
+
+    Raises: ValueError, which names the first array with wrong entries, their number, and the place
+    of the first one.
     """
     given = {
         name: (array, values)

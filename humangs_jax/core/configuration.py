@@ -84,7 +84,7 @@ Chunk = Annotated[int, Range(1, 65_536)]
 """Number of items that are processed at once."""
 Iterations = Annotated[int, Range(0, 1000)]
 RefineSteps = Annotated[int, Range(0, 100_000)]
-"""Number of steps of a refinement, which takes some hours at most."""
+"""Number of steps of a refinement. The largest number takes some hours."""
 Steps = Annotated[int, Range(1, 100_000_000)]
 Seed = Annotated[int, Range(0, (1 << 32) - 1)]
 Share = Annotated[float, Range(0, 1)]
@@ -103,7 +103,8 @@ Gaussians.
 
 
 def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
-    """Returns a field that trades accuracy or memory for speed. Each is a row of docs/knobs.md.
+    """Returns a field that trades accuracy or memory for speed. docs/knobs.md has a row for each
+    such field.
 
     cost, gain: what a change costs and gains, in a few words. measured: the page of docs/ with the
     measurement.
@@ -273,8 +274,8 @@ _PARTS: dict[str, type] = {}
 
 
 def part(cls: type[T]) -> type[T]:
-    """Registers a subclass of `Part`, so that files may name it. Its fields are checked as those of
-    a `configuration`.
+    """Registers a subclass of `Part`, so that files may name it. Its fields are checked when an
+    instance is made, see `configuration`.
 
     Raises: ValueError if another module has a part of this name.
     """
@@ -326,8 +327,8 @@ def vary(config: T, changes: Mapping[str, Any]) -> T:
 
 
 def field_paths(config: Any, before: str = "") -> dict[str, Any]:
-    """Returns the value of each field by its path, such as "loss.squared". Nested configurations
-    are included, themselves and their fields.
+    """Returns the value of each field by its path, such as "loss.squared". A nested configuration
+    has an entry, and each of its fields has one, too.
 
     before: text that begins each path.
     """
@@ -348,10 +349,10 @@ def _varied(config: Any, names: list[str], value: Any) -> Any:
 
 
 def check_range(cls: type, name: str, value: Any, path: str) -> None:
-    """Checks that a number of a field, or each number in its tuple, is in the range of the
-    annotation. path: names the field in the message.
+    """Checks that the number in a field, or each number of a tuple in it, is in the range of the
+    field's annotation. path: names the field in the message.
 
-    Raises: ValueError if one is not, or if the tuple is too long.
+    Raises: ValueError if a number is out of range, or if the tuple is longer than `MOST_ITEMS`.
     """
     ranges = _ranges(cls).get(name, ())
     values = value
@@ -393,10 +394,10 @@ def config_to_json(config: Any, indent: int | None = None) -> str:
 
 
 def _plain(value: Any, kind: bool = False) -> Any:
-    """Returns a configuration as dicts, lists and values that JSON has. kind: whether the class
-    must be named.
+    """Returns a configuration as dicts and lists that JSON can hold. kind: whether to add the name
+    of the class.
 
-    Raises: ValueError if the class must be named but is no registered part.
+    Raises: ValueError if the name is to be added, but the class is no registered part.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         annotations = typing.get_type_hints(type(value))
@@ -440,8 +441,8 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
     become tuples, and integers become floats. A value that cannot be converted is returned
     unchanged, and the caller checks it.
 
-    path: names the value in messages. Raises: ValueError for an object that is no such
-    configuration, and for a tuple with a wrong item.
+    path: names the value in messages. Raises: ValueError if a configuration cannot be made of an
+    object, or if an item of a tuple is wrong.
     """
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     # a part names its class, a dataclass is known by the annotation

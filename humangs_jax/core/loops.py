@@ -1,9 +1,9 @@
 """Runs a function for things that do not depend on each other: the photos, targets and images of
 one subject.
 
-A CPU runs them one after the other. So memory is needed for one at a time, and the loops over tiles
-and faces end when the work of one image is done. An accelerator would then wait for thousands of
-small operations, so it runs them side by side.
+A CPU runs them one after the other. It then needs memory for one at a time, and the loops over
+tiles and faces end when the work of one image is done. An accelerator runs them side by side.
+Otherwise it would wait for thousands of small operations, one after the other.
 """
 
 from collections.abc import Callable
@@ -15,9 +15,9 @@ from humangs_jax.core.array_types import PyTree
 
 T = TypeVar("T", bound=PyTree)
 PIXELS_AT_ONCE = 1 << 22
-"""Pixels of the images that an accelerator works on side by side for one subject: sixteen of 512 x
-512, so that four photos or targets of the published size are worked on together. Images with more
-pixels are worked on in several parts.
+"""Number of pixels that an accelerator works on side by side for one subject. They are those of
+sixteen images of 512 x 512, or of four photos or targets of the published size. Images that have
+more pixels together are worked on in several parts.
 """
 
 
@@ -33,8 +33,9 @@ def over(function: Callable[[PyTree], T], xs: PyTree, pixels: int = 1) -> T:
     Args:
         function: a pure function of one element.
         xs: arrays with one leading axis.
-        pixels: pixels of an element's image. An accelerator works on elements of up to
-            `PIXELS_AT_ONCE` pixels side by side, and on at least one.
+        pixels: number of pixels in an element's image. An accelerator works on several elements
+            side by side, with at most `PIXELS_AT_ONCE` pixels together, and on at least one. The
+            parts have equal numbers of elements.
     """
     if one_after_the_other():
         return jax.lax.map(function, xs)

@@ -12,10 +12,10 @@ from humangs_jax.core.array_types import Array, Float, PyTree
 
 
 def at_least_float32(tree: PyTree) -> PyTree:
-    """Returns the tree with arrays of less precision in float32: bfloat16, float16, integers and
-    booleans. Wider floating-point arrays are unchanged.
+    """Returns the tree with all arrays of bfloat16, float16, integers and booleans converted to
+    float32. Floating-point arrays that are at least as precise as float32 are unchanged.
 
-    Gradients come back in the narrow type.
+    Gradients have the types of the given arrays.
     """
 
     def widen(a):

@@ -99,11 +99,11 @@ def undisturbed() -> Generator[None]:
 
 @contextlib.contextmanager
 def started_deaf() -> Generator[None]:
-    """Keeps Ctrl-C, which reaches all processes of a terminal, from processes that are started in
-    the block. The starting process decides when they end.
+    """Makes the processes that are started in the block ignore Ctrl-C. A terminal sends Ctrl-C to
+    all of its processes, but the starting process is to decide when the others end.
 
-    Otherwise Ctrl-C would end processes that are still importing, with tracebacks. On Windows,
-    which has no masks of signals, this still happens.
+    Without this, Ctrl-C ends processes that are still importing, with tracebacks. This still
+    happens on Windows, which has no masks of signals.
     """
     with undisturbed():
         if not hasattr(signal, "pthread_sigmask"):
@@ -127,14 +127,16 @@ def in_processes(
     prepare: Callable[..., object],
     *given: Any,
 ) -> Iterator[tuple[K, T]]:
-    """Yields (name, work(*arguments)) for each named task, in the order in which the tasks end.
-    Several processes of one thread each run them, on the CPU.
+    """Yields (name, work(*arguments)) for each named task, in the order in which the tasks end. The
+    tasks run in several processes, each with one thread, on the CPU.
+
+    If the caller stops, by Ctrl-C or otherwise, or if a task fails, unfinished tasks are dropped
+    and these processes end. Other processes of the caller go on.
 
     Arguments: work: a function. tasks: the arguments of `work` by name. workers: largest number of
     processes. prepare: called as prepare(*given) when a process starts. All of these are pickled.
-    If the caller stops, by Ctrl-C or otherwise, unfinished tasks are dropped and the processes end;
-    other processes of the caller go on. Raises: OSError if a process is killed; anything that
-    `work` raises.
+
+    Raises: OSError if a process is killed; anything that `work` raises.
     """
     import concurrent.futures.process
 
@@ -159,7 +161,9 @@ def in_processes(
 
 
 def _begin(prepare: Callable[..., object], given: tuple[Any, ...]) -> None:
-    """Prepares a worker process. It gets one thread, because the processes are the parallelism."""
+    """Prepares a worker process. XLA gets one thread in it, because the processes run side by
+    side.
+    """
     import signal
 
     import jax
@@ -177,8 +181,8 @@ def end_with_parent() -> None:
     """Makes a worker process end as soon as the process that started it has ended, for any reason.
     Call it in the worker.
 
-    If the process of a pool is killed, its workers would otherwise wait for work for ever, because
-    their queue stays open in each other.
+    Without it, the workers of a pool would wait for work for ever if the pool's process is killed.
+    They would not notice, because each worker keeps the others' queue open.
     """
     parent = multiprocessing.parent_process()
     if parent is None:
@@ -206,8 +210,8 @@ not used for longest. JAX's own limit needs the package `filelock`.
 
 QUICKEST_OF_JAX = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 QUICKEST = 0.1
-"""Shortest compilation after which a program is kept on disk, seconds. With JAX's default of a
-second, most programs of a command are compiled again each time.
+"""A program is kept on disk if its compilation takes at least this long, seconds. JAX's default is
+a second, with which most programs of a command are compiled again each time.
 """
 
 
@@ -216,12 +220,14 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
     processor.
 
     Programs call it once, before the first computation; the library never does. JAX is not imported
-    here: it finds the folder in its environment variable, as do the programs that this one starts.
-    A cache that JAX already has (`JAX_COMPILATION_CACHE_DIR`) stays in use, also with
-    `HUMANGS_COMPILE_CACHE=0`, with which nothing is done.
+    here. It finds the folder in its environment variable, and so do the programs that this one
+    starts.
+
+    If JAX already has a cache (`JAX_COMPILATION_CACHE_DIR`), this cache stays in use and nothing
+    changes. `HUMANGS_COMPILE_CACHE=0` does not turn it off.
 
     Args:
-        folder: the folder that holds the caches. None: what the environment variable
+        folder: the folder that holds the caches. None: the folder that the environment variable
             `HUMANGS_COMPILE_CACHE` names, else `humangs_jax` in the user's cache folder
             (`XDG_CACHE_HOME`, or what the platform has in its place).
 
@@ -314,11 +320,16 @@ CPU_COMPILER_OPTIONS = {
 }
 """Compiler options of `jax.jit` for a program that draws on a CPU. They work from jax 0.10 to 0.12.
 
-Wide vectors make the loops over pixels up to a third faster where there is AVX-512. XLA no longer
-divides its small kernels, of tens of microseconds each, among several threads; this took twice the
-CPU time and gained nothing. Barriers are kept, so that tables are stored before they are gathered
-from. The loops of tiny images must then not become single kernels, which know no barriers. Eager
-calls use these options; pass `compiler_options()` to your own jitted functions.
+The first option sets the width of vectors: with AVX-512, wide ones make the loops over pixels up to
+a third faster.
+
+The second option turns off three passes of XLA. The first pass would divide kernels of tens of
+microseconds among several threads, which took twice the CPU time and gained nothing. The second one
+would remove barriers, which make sure that tables are stored before they are gathered from. The
+third one would make single kernels of the loops of tiny images, and single kernels know no
+barriers.
+
+Eager calls use these options. Pass `compiler_options()` to your own jitted functions.
 """
 
 
@@ -343,8 +354,9 @@ def compiler_options() -> dict[str, Any] | None:
 def compile_ahead(program: Any, *arguments: Any) -> threading.Thread:
     """Compiles a jitted function in a thread, beside other work, and returns the thread.
 
-    A call with such arguments waits until the compilation is done, and compiles nothing itself. An
-    error of the compilation is ignored here, and raised where the function is called.
+    If the function is then called with arguments of these shapes, the call waits until the
+    compilation is done, and compiles nothing itself. An error of the compilation is ignored here,
+    and raised where the function is called.
 
     Args:
         program: a function that `jax.jit` returned.
@@ -367,11 +379,11 @@ Call = tuple[Any, tuple[Any, ...]]
 
 
 def spare_cores() -> int:
-    """Returns the number of the machine's cores less two, at least 0. A command's work keeps two
-    cores busy with the threads of Python and XLA.
+    """Returns the number of the machine's cores minus two, at least 0. Two cores are busy with the
+    threads of Python and XLA that do a command's work.
 
-    Measured on two cores: compiling one program ahead, or two at once, made the demo 15 s slower
-    the first time, since each program and the work beside it took longer.
+    Measured on two cores: compiling one program ahead, or two at once, made the demo's first run 15
+    s slower, since each program and the work beside it took longer.
     """
     return max(0, (os.cpu_count() or 1) - 2)
 
@@ -383,13 +395,13 @@ class Ahead:
             ahead.add(calls_of_fit(body, kind, views))
             ...
 
-    A program that is never called has cost time, nothing else. After the end of the block no
+    If a program is never called, its compilation has only cost time. After the end of the block no
     further compilation begins.
 
     Args:
         at_once: number of programs that are compiled at the same time, each of which takes up to a
-            gigabyte. With 0 nothing is compiled ahead. None: one where the machine has a core to
-            spare, two where it has more.
+            gigabyte of memory. With 0 nothing is compiled ahead. None: as many as `spare_cores`,
+            at most two.
     """
 
     def __init__(self, at_once: int | None = None) -> None:

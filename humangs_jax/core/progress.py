@@ -63,8 +63,8 @@ def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
 TICK = 0.2
 """Seconds between two updates of the line."""
 LONG = 10.0
-"""Seconds after which the name of a running stage is printed, and between two updates of a bar, if
-stderr is no terminal.
+"""Seconds between two updates of a bar, and seconds after which the name of a running stage is
+printed. Both apply only if stderr is no terminal.
 """
 CLEAR = "\r\033[K"
 """Text that puts the cursor of a terminal at the beginning of an empty line."""
@@ -77,8 +77,8 @@ class Progress:
     ticking: bool = False
     """Whether a line on stderr counts the seconds of a stage while it runs."""
     naming: bool = False
-    """Whether an outermost stage longer than `LONG` leaves its name on stderr, where that is no
-    terminal.
+    """Whether the name of an outermost stage is printed on stderr if the stage takes longer than
+    `LONG`. `begin` sets this if stderr is no terminal.
     """
     lines: bool = False
     """Whether each outermost stage leaves a line with its seconds, even where stderr is no
@@ -95,7 +95,7 @@ class Progress:
     next: list[str] = dataclasses.field(default_factory=list)
     """Lines about what the user may do next, for the program that called `begin`."""
     paused: bool = False
-    """Whether a bar is shown in place of the line."""
+    """Whether the line of the stage is hidden, because a bar is shown in its place."""
 
 
 _current = Progress()
@@ -231,13 +231,13 @@ def compiling(program: Hashable = None) -> Generator[None]:
 def bar(
     iterable: Iterable[Any] | None = None, *, shown: bool = True, first: str = "", **how: Any
 ) -> Any:
-    """Returns a bar of tqdm. While it runs, it takes the place of the line of the stage around it.
+    """Returns a bar of tqdm. On a terminal, it takes the place of the stage's line until a stage
+    begins or ends.
 
-    Where stderr is no terminal (a log, a notebook) the bar moves every `LONG` seconds.
+    Where stderr is no terminal (a log, a notebook), the bar moves every `LONG` seconds.
 
-    Arguments: shown: whether the caller of the library asked for bars; a program may still hide all
-    of them. first: text that the bar shows until the first item is there. how: further options of
-    tqdm.
+    Arguments: shown: whether a bar is wanted; a program may still hide all bars, see `begin`.
+    first: text that the bar shows until the first item is there. how: further options of tqdm.
     """
     from tqdm import tqdm
 
@@ -284,7 +284,9 @@ def watched() -> bool:
 
 
 def _name(current: Progress, stop: threading.Event, _: float) -> None:
-    """Names a stage in a log, if it takes long."""
+    """Prints the names of the running stages in a log if the outermost one takes longer than
+    `LONG`.
+    """
     if not stop.wait(LONG) and current.names:
         say(f"{_named(current)} ...", error=True)
 
@@ -297,7 +299,7 @@ def _named(current: Progress) -> str:
 
 
 def _tick(current: Progress, stop: threading.Event, started: float) -> None:
-    """Counts the seconds of a stage on a terminal."""
+    """Updates the line of a stage with its seconds on a terminal, until `stop` is set."""
     while not stop.wait(TICK):
         if not current.paused and current.names:
             sys.stderr.write(f"{CLEAR}{_named(current)} ... {time.perf_counter() - started:.0f} s")

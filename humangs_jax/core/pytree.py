@@ -250,7 +250,8 @@ def shape_fault(tree: Any) -> str | None:
     The rules:
 
     - Axes with one name have one size.
-    - A batch has further axes in front. Their number is the one that most of the arrays have.
+    - In a batch, arrays have further axes in front. Their number is the most frequent one among
+      the arrays. Arrays without batch axes are allowed, too.
     - An array that is annotated as floating-point numbers holds no integers.
     - A static field that is an `int` holds a whole number.
     """
@@ -338,8 +339,8 @@ def _shown_shape(axes: Sequence[str | int]) -> str:
 
 @functools.cache
 def _annotated_fields(cls: Any) -> dict[str, _Field]:
-    """Returns the annotations of the fields that are not static, by name. Arrays annotated with any
-    shape are left out.
+    """Returns the annotations of the fields that are not static, by name. Arrays are left out if
+    their annotation allows any shape.
     """
     found = {}
     for field in dataclasses.fields(cls):

@@ -1,10 +1,11 @@
-"""Checks records by the annotations of their fields.
+"""Checks records by the annotations of their fields. For example:
 
     opacities: Annotated[Float[Array, " g"], UNIT]
 
-says that an array has one axis, as long as those that other fields call g, and numbers in [0, 1].
-Floating-point arrays without such a mark hold finite numbers. A record that is a field of another
-one is checked, too, if a mark names its batch axes: `Annotated[Camera, Batch("v")]`.
+The array has one axis, its numbers are in [0, 1], and all axes that are named g have one size.
+Without a mark such as UNIT, numbers of floating-point arrays only have to be finite. A record may
+be a field of another one. It is checked, too, if a mark names its batch axes: `Annotated[Camera,
+Batch("v")]`.
 """
 
 import dataclasses
@@ -21,10 +22,12 @@ from humangs_jax.core.pytree import annotated_axes, is_floating, types_and_marks
 
 
 class Part(NamedTuple):
-    """A mark of an annotation that names a part of the array. The part is checked separately."""
+    """A mark in the annotation of an array. It names a part of the array that has to hold other
+    values than the rest.
+    """
 
     words: str
-    """What an error calls the part, after the name of the array."""
+    """Name of the part in an error, which stands after the array's name."""
     take: Callable[[np.ndarray], np.ndarray]
     """Function that returns the part of an array on the host."""
     values: Values
@@ -41,7 +44,7 @@ class Batch(NamedTuple):
 
 
 class ArrayField(NamedTuple):
-    """The content of an array's annotation."""
+    """What the annotation of a field says about the field's array."""
 
     axes: tuple[str | int, ...] | None
     """Names and sizes of the axes. None: any axes."""
@@ -50,14 +53,14 @@ class ArrayField(NamedTuple):
     checked.
     """
     parts: tuple[Part, ...]
-    """Parts that are checked by themselves."""
+    """Parts of the array that are checked in addition."""
 
     def shape(self, array: Any, sizes: dict[str, int]) -> tuple[int | str, ...]:
-        """Returns the shape that an array should have. It has the name of an axis whose size is not
-        known.
+        """Returns the shape that an array should have. If the size of an axis is not known, the
+        axis's name is in its place.
 
         sizes: the known sizes of axes by name. If the array has as many axes as expected, the sizes
-        of its other axes are added to it.
+        of its axes that were not known are added to it.
         """
         own = np.shape(array)
         if self.axes is None:
@@ -83,8 +86,9 @@ class ArrayField(NamedTuple):
 
 @functools.cache
 def array_fields(record: Any) -> dict[str, ArrayField]:
-    """Returns what a class of records says of its arrays, by name: "images", "cameras.K". The
-    arrays of a record in it are included if a `Batch` marks its field.
+    """Returns the annotations of all arrays in a class of records, by names such as "images" and
+    "cameras.K". If a field holds another record and is marked by a `Batch`, the arrays of that
+    record are included.
     """
     found = {}
     for field in dataclasses.fields(record):
@@ -114,7 +118,7 @@ def record_values(
     `check_values`.
 
     Arguments: record: a dataclass, or None, which has no arrays. name: name of the record in
-    errors. on_host: whether to bring all arrays to the host, which suits few numbers.
+    errors. on_host: whether to bring all arrays to the host first. This is faster for small arrays.
     """
     found: dict[str, tuple[Any, Values]] = {}
     if record is None:

@@ -18,19 +18,20 @@ FOLDER = ""
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """One kind of files. Tables that say more of each kind use a subclass."""
+    """One format of files. Tables with further columns use a subclass."""
 
     about: str
     """Whose files these are, in a few words. `--help` and the docs show it."""
     code: str | Callable[..., Any]
     """The function that reads or writes such files, or its name as "package.module:function"."""
     suffixes: tuple[str, ...] = ()
-    """Suffixes of such files, in lower case, with the dot; FOLDER for a folder. Empty: names do not
-    tell.
+    """Suffixes of such files, in lower case, with the dot; FOLDER for a folder. Empty: files of
+    this format cannot be told by their names.
     """
     recognizes: str | Callable[[Path], bool] | None = None
-    """A function that says whether a path with such a suffix is of this format, or its name as
-    text. It is needed where formats share a suffix. None: every path with such a suffix is.
+    """A function that says whether a path with one of the suffixes is of this format, or the
+    function's name as "package.module:function". It is needed where formats share a suffix. None:
+    every path with one of the suffixes is of this format.
     """
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:

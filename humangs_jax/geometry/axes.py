@@ -19,8 +19,8 @@ UPRIGHT = {
 }
 """The rotation that turns an axis to +y, a quaternion (wxyz), by the axis's name."""
 CLEARLY_UP = 0.5
-"""Least mean cosine between the up direction of a person's pelvis and an axis of the world at which
-the person stands along that axis.
+"""A person stands along an axis of the world if the cosine between this axis and the y axis of the
+pelvis is at least this on average.
 """
 
 
@@ -30,8 +30,8 @@ def upright_matrix(up: str) -> Float[np.ndarray, "3 3"]:
 
 
 def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
-    """Returns the name of the axis along which a vector points most, and the size of the vector's
-    component there.
+    """Returns the name of the axis along which a vector points most, such as "-z", and the absolute
+    value of the vector's component along this axis.
     """
     axis = int(np.argmax(np.abs(direction)))
     sign = "-" if direction[axis] < 0 else ""
@@ -39,8 +39,9 @@ def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
 
 
 def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
-    """Returns the name of the world's axis along which the y axis of the pelvis points on average.
-    Returns None if no axis is clearly that one, see `CLEARLY_UP`.
+    """Returns the name of the axis of the world along which a person stands: the y axis of the
+    pelvis points along it on average. Returns None if the pelvis points clearly along no axis, see
+    `CLEARLY_UP`.
 
     Arguments: root: axis-angle of the pelvis in each frame, (m, 3), radians.
     """

@@ -24,12 +24,12 @@ from humangs_jax.geometry import transform
 from humangs_jax.geometry.lens import check_lens, distorted
 
 RIGID_TOLERANCE = 1e-3
-"""Largest difference of R R^T from the identity, and largest skew relative to the focal length,
-before a camera is refused. Calibrations are stored with few digits.
+"""A camera is refused if an entry of R R^T differs from the identity by more than this, or if the
+skew of K is larger than this times the focal length. Calibrations are stored with few digits.
 """
 LARGEST_NUMBER = 1e7
-"""Largest focal length in pixels, and largest translation in metres. Larger numbers are faults, and
-their products overflow in float32.
+"""Largest magnitude of a number in K, pixels, and in `cam_from_world`, metres. Larger numbers are
+faults, and their products overflow in float32.
 """
 
 
@@ -75,16 +75,18 @@ class Camera(Batchable):
         distortion: object = None,
         lens: str = "pinhole",
     ) -> "Camera":
-        """Makes a camera of array-likes (3, 3), (4, 4) and perhaps (n,), checked. Under `jit`,
-        `vmap` and `grad` only shapes are checked.
+        """Makes a camera from array-likes, and checks them: K is (3, 3), `cam_from_world` is (4,
+        4), and `distortion` is (n,) or None. Under `jit`, `vmap` and `grad`, the numbers in K,
+        `cam_from_world` and `distortion` are not checked.
 
-        Its numbers are float32, or float64 where JAX's `jax_enable_x64` is on and the arrays have
-        it.
+        The camera's arrays are float32. They are float64 if JAX's `jax_enable_x64` is on and K or
+        `cam_from_world` is float64.
 
-        Raises: ValueError if a shape is wrong, a number not finite or larger than 1e7, a focal
-        length not positive, K skewed, the rotation not orthonormal and right-handed (to 1e-3), the
-        image empty, its sides no whole numbers, the lens unknown, or the coefficients not those of
-        the lens.
+        Raises: ValueError if a shape is wrong, if a number is not finite, or if a number in K or
+        `cam_from_world` is larger than 1e7. Also if a focal length is not positive, K has skew, or
+        the rotation is not orthonormal and right-handed (to 1e-3). Also if the sides of the image
+        are not positive whole numbers, if the lens is unknown, or if the lens does not have this
+        number of coefficients.
         """
         # arrays of the type that is kept: float64 only if JAX has it
         given = K, cam_from_world, distortion
@@ -168,9 +170,7 @@ class Camera(Batchable):
         return replace(self, K=from_host(K * scale[:, None]), width=width, height=height)
 
     def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
-        """Returns the camera for the same world with all lengths divided by `unit`, which is in
-        metres.
-        """
+        """Returns the camera for the same world with all lengths divided by `unit`, metres."""
         translation = self.cam_from_world[..., :3, 3] / unit
         moved = replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
         if self.lens != "orthographic":
@@ -181,8 +181,9 @@ class Camera(Batchable):
     def moved(self, twist: Float[Array, "*b 6"]) -> "Camera":
         """Returns the camera after a rigid motion in its own frame, exp(twist) `cam_from_world`.
 
-        twist: a rotation vector, radians, then a velocity, metres, in the camera's axes. It suits
-        optimizers: zeros are no motion, and the result stays a rotation (`transform.from_twist`).
+        twist: a rotation vector in radians, then a velocity in metres (see `transform.from_twist`),
+        both in the camera's axes. Twists can be optimized without constraints: a twist of zeros is
+        no motion, and the result is a rigid transform for every twist.
 
         Examples:
             >>> drawn = lambda twist: hg.render(gaussians, camera.moved(twist), config).rgb
@@ -369,10 +370,10 @@ def orbit(
 
 
 def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]]:
-    """Returns the centre of one pinhole camera, (3,), and the unit directions through its pixel
-    centres (x + 0.5, y + 0.5), (h, w, 3), in the world.
+    """Returns the centre of one pinhole camera in the world, (3,), metres, and the unit directions
+    of the rays through its pixel centres (x + 0.5, y + 0.5) in the world, (h, w, 3).
 
-    Raises: ValueError for another lens.
+    Raises: ValueError for another lens, and for a camera with distortion.
     """
     require_pinhole("pixel_rays", camera)
     x = (jnp.arange(camera.width) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
@@ -387,8 +388,11 @@ def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]
 
 
 def plucker_rays(camera: Camera) -> Float[Array, "h w 6"]:
-    """Returns the ray of every pixel, (h, w, 6): its moment, then its direction (reference:
-    HumanGS, after Sitzmann et al., Light Field Networks).
+    """Returns the Plücker coordinates of the ray through each pixel centre in the world, (h, w, 6).
+    The first three are the moment, the cross product of the camera's centre (metres) and the
+    direction. The last three are the unit direction.
+
+    Reference: HumanGS, after Sitzmann et al., Light Field Networks. Raises: as `pixel_rays`.
     """
     origin, directions = pixel_rays(camera)
     moments = jnp.cross(jnp.broadcast_to(origin, directions.shape), directions)

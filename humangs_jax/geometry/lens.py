@@ -29,7 +29,9 @@ COUNTS: dict[str, tuple[int, ...]] = {
 }
 """Allowed numbers of coefficients, by lens."""
 RINGS = 16
-"""Number of places on the way from the axis to a point at which the image must grow outwards."""
+"""Number of points between the axis and a given point at which `within_reach` checks that the image
+grows outwards.
+"""
 
 
 def check_lens(lens: object, count: int | None) -> None:
@@ -69,7 +71,9 @@ def distorted(
 
 
 def _fisheye_scale(coefficients: Float[Array, " n"] | None, rr: Array) -> Array:
-    """Returns t / r (1 + k1 t^2 + ...) from r^2, smooth on the axis."""
+    """Returns x / u = y / v of a fisheye, which is atan(r) / r times the polynomial of the module's
+    docstring. It has derivatives on the axis, too. rr: r^2.
+    """
     # near the axis atan(r) / r is its Taylor series, cut after r^10: exact to float64's rounding
     small = rr < 1e-3
     near = jnp.where(small, rr, 0.0)
@@ -86,8 +90,8 @@ def _fisheye_scale(coefficients: Float[Array, " n"] | None, rr: Array) -> Array:
 def distorted_with_slopes(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> tuple[Array, Array, list[list[Array]]]:
-    """Returns x, y, and the Jacobian [[dx/du, dx/dv], [dy/du, dy/dv]]. It is computed in forward
-    mode, so that it has a gradient.
+    """Returns x, y, and the Jacobian [[dx/du, dx/dv], [dy/du, dy/dv]]. The Jacobian is computed in
+    forward mode, so that its gradient can be computed in reverse mode.
     """
 
     def lensed(u, v):
@@ -102,10 +106,12 @@ def distorted_with_slopes(
 def within_reach(
     lens: str, coefficients: Float[Array, " n"] | None, u: Array, v: Array
 ) -> Bool[Array, "*b"]:
-    """Says whether the image grows outwards all the way from the axis to each point (u, v). Beyond
-    that, a lens's polynomial folds the image back over itself.
+    """Says whether the image of a point (u, v) moves outwards all the way while the point moves
+    from the axis to (u, v). Where it does not, the lens's polynomial folds the image back over
+    itself.
 
-    Tangential and thin-prism terms of a pinhole are left out. The result has no gradient.
+    Tangential and thin-prism terms of a pinhole are left out. Without coefficients, all finite
+    points are within reach. The result has no gradient.
     """
     u, v = jax.lax.stop_gradient((u, v))
     if coefficients is None:

@@ -27,7 +27,9 @@ def face_areas(
 def vertex_areas(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns a third of the area of the faces around each vertex, (n,)."""
+    """Returns a third of the summed area of the faces around each vertex, (n,), in the unit of the
+    vertices squared.
+    """
     return np.bincount(faces.ravel(), np.repeat(face_areas(vertices, faces) / 3, 3), len(vertices))
 
 
@@ -46,8 +48,8 @@ def vertex_area_vectors(
 def mesh_edges(
     faces: Int[np.ndarray, "f 3"],
 ) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
-    """Returns the undirected edges of a mesh, (e, 2), and for each face the number of the edge from
-    corner i to i + 1, (f, 3).
+    """Returns the undirected edges of a mesh, (e, 2), and the rows in the edges of each face's
+    three sides, (f, 3). Side i goes from corner i to corner i + 1.
     """
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
     edges, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)
@@ -60,8 +62,10 @@ def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
 
 
 def directions_around(count: int, turned: float = 0.5) -> Float[np.ndarray, "d 3"]:
-    """Returns unit vectors spread evenly over the sphere (a Fibonacci lattice), (d, 3). The first
-    is turned by `turned` golden angles.
+    """Returns unit vectors spread evenly over the sphere (a Fibonacci lattice), (d, 3), from +y to
+    -y. Their angle around y grows by the golden angle from each to the next.
+
+    turned: the angle of the first one around y, in golden angles.
     """
     i = np.arange(count)
     y, turn = 1 - 2 * (i + 0.5) / count, np.pi * (3 - np.sqrt(5)) * (i + turned)
@@ -78,9 +82,10 @@ def in_front(
 ) -> Bool[np.ndarray, " q"]:
     """Says which of the points `some`, (q, 3), are the foremost ones, seen along `forward`.
 
-    The plane across `forward` has a grid of square cells. A point counts if it is less than
-    `behind` farther along `forward` than the nearest of `points`, (p, 3), in its cell, or if there
-    is none. cell: side of a cell. forward: a unit vector. All lengths are in one unit.
+    The plane perpendicular to `forward` is divided into square cells with sides of length `cell`. A
+    point is compared with the nearest of `points`, (p, 3), in its cell, where near means a small
+    coordinate along `forward`. The point is foremost if it is less than `behind` farther away, or
+    if the cell has none of `points`. forward: a unit vector. All lengths are in one unit.
     """
     right = np.linalg.svd(forward[None])[2][1]
     frame = np.stack([right, np.cross(forward, right), forward])
@@ -103,7 +108,8 @@ def smallest_turns(
     """Returns the rotation matrices that turn unit vectors a into b by the smallest angle, (..., 3,
     3). Where a or b is zero, the matrix is the identity.
 
-    Where 1 + a.b is less than `opposite`, the rotation is half a turn about some axis across a.
+    Where 1 + a.b is less than `opposite`, the matrix is a half turn about an axis that is
+    perpendicular to a.
     """
     from scipy.spatial.transform import Rotation
 

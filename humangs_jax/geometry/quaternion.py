@@ -34,8 +34,8 @@ def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array,
 
 
 def between(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, "*b 4"]:
-    """Returns the shortest rotation from unit vectors a to unit vectors b. It is half a turn about
-    an axis across `a` where they are opposite.
+    """Returns the shortest rotation from unit vectors a to unit vectors b. Where they are opposite,
+    it is a half turn about an axis that is perpendicular to a.
     """
     real = jnp.sum(jnp.square(a + b), axis=-1, keepdims=True) / 2  # 1 + a.b without cancellation
     across = jnp.cross(a, jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a), axis=-1)])
@@ -62,14 +62,16 @@ def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
 def candidates_from_matrix(
     m: Float[Array, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 4 4"], Float[Array, "*b 4"]]:
-    """Returns the four quaternions that a rotation matrix can be read as, (..., 4, 4), and how well
-    conditioned each is, (..., 4).
+    """Returns four quaternions for each rotation matrix, (..., 4, 4), and how well conditioned each
+    of them is, q_abs, (..., 4).
 
-    Let M be the symmetric matrix (4, 4) that is 4 q q^T for a rotation. Its diagonal is
-    1 ± m00 ± m11 ± m22, with no or two minus signs. The second result is
-    q_abs = sqrt(max(0, diagonal)). Candidate c is row c of M divided by 2 max(q_abs, 0.1). For a
-    rotation, candidates with q_abs of at least 0.1 are equal but for their signs, and others are
-    shorter. For another matrix they differ.
+    For a rotation, candidate c is the quaternion q with component c made positive, and q_abs[c] is
+    2 |q[c]|. Where q_abs[c] is less than 0.1, candidate c is shorter than 1.
+
+    In detail, M is the symmetric matrix (4, 4) that equals 4 q q^T for a rotation. Its diagonal is
+    1 ± m00 ± m11 ± m22, with no or two minus signs, and q_abs is sqrt(max(0, diagonal)). Candidate
+    c is row c of M divided by 2 max(q_abs[c], 0.1). For a matrix that is no rotation, the four
+    candidates may be different rotations.
     """
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     squared = jnp.stack(
@@ -176,11 +178,11 @@ def interpolate(
 def left_singular_vectors(
     m: Float[Array, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3"]]:
-    """Returns rotations U (det +1) and singular values s >= 0, in no particular order, with m m^T =
-    U diag(s)^2 U^T.
+    """Returns the left singular vectors of matrices as rotations U (det +1), and the singular
+    values s >= 0, in no particular order: m m^T = U diag(s)^2 U^T.
 
-    The results are not meant to be differentiated: U is not unique where singular values coincide.
-    Columns of U for singular values of 0 are completed to a rotation.
+    The results are not meant to be differentiated, because U is not unique where singular values
+    coincide. Where singular values are 0, their columns of U complete the others to a rotation.
     """
     columns = [m[..., :, i] for i in range(3)]
     # cyclic Jacobi converges quadratically: 3x3 matrices reach float64's rounding after five sweeps
@@ -194,7 +196,9 @@ def left_singular_vectors(
 def _orthogonalize(
     a: Float[Array, "*b 3"], b: Float[Array, "*b 3"]
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
-    """Returns two columns, rotated in their plane until they are orthogonal."""
+    """Returns two orthogonal vectors that are a rotation of the pair: (c a - s b, s a + c b) with c
+    and s the cosine and the sine of one angle. This is a step of one-sided Jacobi.
+    """
     aa, bb, ab = (jnp.sum(x * y, axis=-1, keepdims=True) for x, y in ((a, a), (b, b), (a, b)))
     needed = ab != 0
     ratio = (bb - aa) / (2 * jnp.where(needed, ab, 1))
@@ -212,9 +216,12 @@ def _orthogonalize(
 def _complete_to_rotation(
     columns: Float[Array, "*b 3 3"], norms: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3 3"]:
-    """Returns rotations whose columns are the directions of the two longest columns, made
-    orthogonal, and their cross product, each in its place. The sign of the last column is chosen so
-    that the determinant is 1, even where columns vanish.
+    """Returns rotations made from the two longest columns of each matrix. These two become unit
+    vectors in their places, the second made orthogonal to the first. The third place gets their
+    cross product. The sign of the matrix's last column is then chosen so that the determinant is 1.
+    This holds even if columns are zero.
+
+    norms: the lengths of the columns.
     """
     order = jnp.argsort(-norms, axis=-1)
     first = jnp.take_along_axis(columns, order[..., None, 0:1], axis=-1)[..., 0]

@@ -51,9 +51,9 @@ def invert_rigid(transform: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
 def from_twist(twist: Float[Array, "*b 6"]) -> Float[Array, "*b 4 4"]:
     """Returns the rigid motion exp(twist) of SE(3), with exact derivatives at the zero twist.
 
-    twist: a rotation vector w in radians, then a velocity v in metres. The rotation is exp([w]),
-    and the translation is V v with V = 1 + (1 - cos t) / t^2 [w] + (t - sin t) / t^3 [w]^2 and t =
-    |w|.
+    twist: a rotation vector w in radians, then a velocity v in metres. Let t = |w|, and [w] the
+    matrix of the cross product with w. The rotation is exp([w]). The translation is V v, where V =
+    1 + (1 - cos t) / t^2 [w] + (t - sin t) / t^3 [w]^2.
     """
     w, v = twist[..., :3], twist[..., 3:]
     squared = jnp.sum(w * w, axis=-1, keepdims=True)
