@@ -1,9 +1,9 @@
 """Tables of formats of files, folders and data sets that can be read or written. Each row is a
 format.
 
-A row names its code and imports it when it is first asked for, so that the command line, its help
-and the docs can list every format without importing any. A new format is one file and one line:
-`MOTIONS["mine"] = Format("my program's", "my.module:read", (".mine",))`.
+A row names its code, which is imported when it is first needed. So the command line, its help and
+the docs can list all formats without importing any. A new format is one file and one line:
+`MOTIONS["mine"] = MotionFormat("my program's", "my.module:read", (".mine",))`.
 """
 
 import dataclasses

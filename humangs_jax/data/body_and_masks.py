@@ -1,8 +1,9 @@
 """Compares the posed body with the masks, to find out which views show the person.
 
 A mask that is empty, or nowhere near the body, does harm: the network takes its white photo for the
-person, and refinement makes the avatar transparent there. All that reads photos leaves such views
-out, by name. All of this runs on the host, by numpy: nothing is compiled.
+person, and refinement makes the avatar transparent there. So such views are left out wherever
+photos are used, and a warning names them. All of this runs on the host, by numpy: nothing is
+compiled.
 """
 
 import logging
@@ -23,9 +24,10 @@ logger = logging.getLogger(__name__)
 MASK_THRESHOLD = 0.5
 """A pixel belongs to the person when its mask is above this."""
 LEAST_SHARE = 0.05
-"""The least share of the body in the frame that lies on the mask.
+"""A view shows the person if at least this share of the body's points in the photo lie on the mask.
 
-In the demo's photos the head alone has 6 to 7 %, an inverted mask 1.4 %.
+In the demo's photos, the share is 6 to 7 % for a mask of the head alone, and 1.4 % for an inverted
+mask.
 """
 POINTS = 1000
 """The number of points on the skin."""
@@ -51,10 +53,12 @@ def report_left_out(names: Sequence[str], reasons: dict[int, str]) -> None:
 
 
 def views_without_person(capture: Capture) -> dict[int, str]:
-    """Returns the numbers of the views that do not show the person, each with the reason: the mask
-    is empty, or it hardly meets the part of the posed body in the frame.
+    """Returns the indices of the views that do not show the person, each with the reason. Either
+    the mask is empty, or fewer than `LEAST_SHARE` of the body's points in the photo lie on the
+    mask.
 
-    A body that is not finite is another fault, which is reported where the body is posed.
+    A view is not in the result if its body is not finite. The code that poses the body reports this
+    fault.
     """
     found = dict.fromkeys(empty_views(capture.masks), "the mask is empty")
     if capture.masks is None or len(found) == capture.view_count:
@@ -100,8 +104,8 @@ def surface_points(
     frames: Int[np.ndarray, " v"],
     count: int,
 ) -> dict[int, Float[np.ndarray, "count 3"]]:
-    """Returns points spread evenly over the skin, metres, for each frame that a view shows. Pose
-    correctives are left out.
+    """Returns, for each frame that a view shows, points spread evenly over the skin of the posed
+    body, (count, 3), metres. Pose correctives are left out.
     """
     rest = shaped(body, betas)
     joints = np.asarray(body.joint_regressor) @ rest
@@ -133,11 +137,12 @@ def skinned(
     weights: Float[np.ndarray, "n j"],
     corrected: bool = False,
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """Returns the matrices and the offsets (metres) that take vertices with some skinning weights
-    from the rest pose to a frame.
+    """Returns the affine transforms of vertices from the rest pose to one frame: matrices, (n, 3,
+    3), and offsets, (n, 3), metres.
 
-    joints: the joints of the rest pose, metres. corrected: whether the body's pose correctives are
-    added, if it has some; then `weights` has to be those of all vertices.
+    joints: the joints of the rest pose, (j, 3), metres. weights: the skinning weights of the
+    vertices, (n, j). corrected: whether the body's pose correctives are added, if it has some. Then
+    `weights` has to be the weights of all of the body's vertices, in their order.
     """
     turns = Rotation.from_rotvec(np.asarray(poses.rotations)[frame].astype(float)).as_matrix()
     world, places = posed_tree(turns, bones_of(joints, body.parents), body.parents)
@@ -159,8 +164,8 @@ def points_in_image(
     width: int,
     height: int,
 ) -> Float[np.ndarray, "q 2"]:
-    """Returns the pixels at which a camera sees the points; points that it does not see are left
-    out.
+    """Returns the positions (x, y) of points in an image, pixels. Points behind the camera or
+    outside of the image are left out.
     """
     seen = points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
     seen = seen[seen[:, 2] > 1e-6]

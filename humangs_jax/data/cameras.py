@@ -44,13 +44,21 @@ ROTATION_TO_Y_UP = {
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """The matrix that turns axes y down, z forward into y up, z backward; it is its own inverse."""
 CAM_FROM_WORLD = "cam_from_world, OpenCV axes"
-"""Matrices take points of the world to the camera, x right, y down, z forward."""
+"""Convention of matrices that take points of the world to the camera's axes x right, y down, z
+forward.
+"""
 WORLD_FROM_CAM = "world_from_cam, OpenCV axes"
-"""Matrices take points of the camera, x right, y down, z forward, to the world."""
+"""Convention of matrices that take points from the camera's axes x right, y down, z forward to the
+world.
+"""
 CAM_FROM_WORLD_OPENGL = "cam_from_world, OpenGL axes"
-"""Matrices take points of the world to the camera, x right, y up, z backward."""
+"""Convention of matrices that take points of the world to the camera's axes x right, y up, z
+backward.
+"""
 WORLD_FROM_CAM_OPENGL = "world_from_cam, OpenGL axes"
-"""Matrices take points of the camera, x right, y up, z backward, to the world."""
+"""Convention of matrices that take points from the camera's axes x right, y up, z backward to the
+world.
+"""
 CONVENTIONS = {
     CAM_FROM_WORLD: lambda matrix: matrix,
     WORLD_FROM_CAM: np.linalg.inv,
@@ -79,8 +87,8 @@ class CalibratedCamera:
     height: int | None = None
     """The height of the image, pixels; None where the format does not say."""
     distortion: Float[np.ndarray, " coefficients"] | None = None
-    """OpenCV's k1 k2 p1 p2 k3. Where there is a `refusal`: 8 or 12 numbers, or at least 4 of a
-    fisheye. None: the lens does not distort.
+    """Coefficients of the lens in OpenCV's order: k1 k2 p1 p2 k3. Only cameras with a `refusal`
+    have others: 8 or 12 coefficients, or at least 4 of a fisheye. None: the lens does not distort.
     """
     frame: int = 0
     """The frame of the image, counted from 0, where there is one camera for each image."""
@@ -97,15 +105,15 @@ class CalibratedCamera:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Observations:
     """Points that the cameras saw while they were calibrated. There is a row for each time that a
-    camera saw a point. The reprojection of the points is checked against them.
+    camera saw a point. To check a calibration, the points are projected and compared with `pixels`.
     """
 
     points: Float[np.ndarray, "n 3"]
-    """Where the point is in the world, (n, 3)."""
+    """Place of the point in the world, (n, 3), in the calibration's unit."""
     cameras: Int[np.ndarray, " n"]
-    """The number of the camera that saw it, (n,)."""
+    """Index of the camera that saw the point, (n,)."""
     pixels: Float[np.ndarray, "n 2"]
-    """Where the camera saw it, (n, 2), pixels, distortion included."""
+    """Place at which the camera saw the point, (n, 2), pixels, distortion included."""
     colors: Float[np.ndarray, "n 3"] | None = None
     """The color of the point, (n, 3), 0 to 255; None where the format has none."""
 
@@ -137,15 +145,17 @@ class Calibration:
     mask_key: str | None = None
     """The key under which the file names masks; None if it does not."""
     upright: bool = False
-    """Whether cameras belong to photos turned by their EXIF orientation; if not, sizes decide."""
+    """Whether the cameras belong to the photos as they look after turning by their EXIF
+    orientation. If False, the sizes of photos and cameras decide this.
+    """
     estimated: bool = False
     """Whether the cameras were found from the person."""
     unit: float | None = None
     """Metres per unit of the format; None where files may have any unit."""
 
     def with_cameras(self, kept: Sequence[int]) -> "Calibration":
-        """Returns the calibration of the cameras with these numbers, and of the points that they
-        saw. Frames are counted anew.
+        """Returns the calibration of the cameras with these indices, and of the points that they
+        saw. Frames are numbered again from 0, without gaps.
         """
         cameras = [self.cameras[i] for i in kept]
         frames = {frame: i for i, frame in enumerate(sorted({camera.frame for camera in cameras}))}

@@ -84,9 +84,9 @@ class Capture:
     body_file: str = DEFAULT_BODY
     """Where the model comes from, "makehuman" or a path."""
     displacement: Float[np.ndarray, "n 3"] | None = None
-    """Metres by which the vertices of the shaped body move in the T-pose, (n, 3), as another tool
-    registered them (SMPL+D); joints stay. It belongs to `betas`: code that changes `betas` leaves
-    it out. None: `reconstruct` may find one by the masks.
+    """Displacement of the vertices of the shaped body in the T-pose, (n, 3), metres, as other tools
+    register them (SMPL+D). Joints stay where they are. A displacement belongs to one shape, so code
+    that changes `betas` removes it. None: `reconstruct` may find a displacement by the masks.
     """
     calibrated: bool = True
     """Whether the cameras were calibrated; if not, they were found from the person, and are
@@ -118,9 +118,10 @@ class Capture:
     def check(self, owner: str) -> None:
         """Check a capture that may have been made by hand.
 
-        Raises: ValueError, one line that begins with `owner`, unless there are a photo, a camera
-        and a frame for each view, a mask for each view or none at all, a body that fits the poses,
-        and finite numbers in range.
+        There have to be a photo, a camera and a frame for each view, and a mask for each view or
+        none at all. The body has to fit the poses, and numbers have to be finite and in range.
+
+        Raises: ValueError, one line that begins with `owner`.
         """
         if self.view_count == 0:
             raise ValueError(f"{owner}: 0 views; at least one photo is needed")

@@ -146,9 +146,11 @@ def counted(number: int, noun: str) -> str:
 
 
 file_numbers = functools.partial(arrays.numbers, error=CaptureError)
-"""Returns the float64 numbers of a file, see `io.arrays.numbers`."""
+"""Returns the numbers of a file as a float64 array, see `io.arrays.numbers`. Raises:
+CaptureError.
+"""
 numbers = functools.partial(file_numbers, dtype=np.float32)
-"""Returns the float32 numbers of a file."""
+"""Returns the numbers of a file as a float32 array, see `file_numbers`."""
 
 
 def floats(
@@ -218,7 +220,8 @@ def body_parameters(
     Float[np.ndarray, "n 3"] | None,
 ]:
     """Returns betas, rotations, translations and displacement in float32, after checking that they
-    fit the body and are in range. betas are those of the body's first directions.
+    fit the body and are in range. The returned betas belong to the first of the body's shape
+    directions.
 
     Arguments: shape_names: see `shape_coefficients`. displacement: see `Capture`; None: there is
     none.
@@ -257,13 +260,14 @@ def body_parameters(
 def shape_coefficients(
     body: BodyModel, betas: Float[np.ndarray, " s"], names: Sequence[str] | None, file: object
 ) -> Float[np.ndarray, " used"]:
-    """Returns coefficients of the body's first directions, made of numbers whose directions are
-    known.
+    """Returns the shape coefficients in the order of the body's directions, up to the last one that
+    is given. Missing ones before it are 0.
 
-    Arguments: names: of the directions that the numbers belong to, as in `BodyModel.shape_names`.
-    None: the numbers are those of SMPL-X's shape, without expressions, or of all of the body's own
-    directions.
-    Raises: CaptureError for coefficients that the body has no direction for, unless they are 0.
+    Arguments: betas: the coefficients. names: for each of betas, the name of its direction, as in
+    `BodyModel.shape_names`. None: betas belong to SMPL-X's shape directions, or to all of the
+    body's directions except expressions.
+
+    Raises: CaptureError for a coefficient that is not 0 if the body has no such direction.
     """
     directions = body.shape_names or tuple(
         f"shape_{i}" for i in range(body.shape_directions.shape[-1])

@@ -1,17 +1,19 @@
 """Makes the exposure and the white balance of the photos of one person equal.
 
-Cameras that meter for themselves show one skin in several colors. A gain for each channel makes
-them agree. A point of the body that two photos show should have one color in both. The gains bring
-the medians of the colors' ratios nearest to 1. The logarithms of the gains have the mean 0 over the
-photos. Gains of photos that share few points stay near 1.
+Cameras that meter for themselves show one skin in several colors. A gain for each photo and channel
+makes the colors agree. A point of the body that two photos show should have one color in both. For
+each pair of photos, the ratios of the two colors of shared points have a median. The gains bring
+these medians nearest to 1. The logarithms of the gains have the mean 0 over the photos. Gains of
+photos that share few points stay near 1.
 
 Photos of the front and of the back share no point of the body, nor do photos of the left and of the
 right side. Groups of photos that are linked by shared points are compared by the parts of the body:
-skin, hair and a garment have about one color in front and behind, left and right. White balance
-comes first, because the color of a part, its brightness left out, hardly depends on how the light
-falls on it. Parts that differ (an open coat in front, hair over a neck) do not count, since the fit
-is robust. Brightness does depend on the light. It is made equal only where the photos are of other
-moments, or where their white balance is not one.
+skin, hair and a garment have about one color in front and behind, left and right.
+
+White balance is made equal first. The tint of a part, which is its color without its brightness,
+hardly depends on how the light falls on the part. Parts that differ (an open coat in front, hair
+over a neck) do not count, since the fit is robust. Brightness does depend on the light. It is made
+equal only between photos of different moments, or if their white balances differ.
 
 Gains are found once for the photos of a capture, which then records them (`Capture.gains`). Gains
 found again from photos that are nearly equal would not be 1.
@@ -47,22 +49,27 @@ THICKNESS = 0.02
 INSIDE = 5
 """Side of the square around each point that must lie in the mask, pixels."""
 WHOLE = 0.99
-"""Least value of the mask in this square."""
+"""A point is used if the mask is above this everywhere in this square."""
 BLUR = 3
 """Side of the square over which colors are averaged, pixels."""
 USABLE = (0.06, 0.95)
-"""Darker and brighter values say nothing about a gain."""
+"""Range of the values of a color that tell a gain. Darker and brighter values are left out."""
 LEAST_POINTS = 50
 """Points that two photos must share to be compared."""
 ALIKE = 50
-"""The number of neighbouring points whose errors are alike."""
+"""Number of neighbouring points with nearly the same error. So many points count as one independent
+measurement.
+"""
 NOISE = 0.03
-"""Standard deviation of a median of log ratios, whatever the number of points."""
+"""Least standard deviation of the median of the log ratios of two photos, however many points they
+share.
+"""
 EXPECTED = 0.15
-"""Standard deviation of the logarithm of a gain that is expected before the photos are compared."""
+"""Standard deviation that the logarithm of a gain has before photos are compared (the prior)."""
 CLEAR = 1.0
-"""Root mean square of the medians over their standard errors. Below it all photos stay as they are:
-loose clothes and shadows make 0.3 to 0.9 in photos of equal exposure (eight test people).
+"""Photos stay as they are if the medians of the log ratios, each divided by its standard error,
+have a root mean square below this. Loose clothes and shadows make 0.3 to 0.9 in photos of equal
+exposure (eight test people).
 """
 NORMAL_MAD = 1.4826
 
@@ -132,8 +139,8 @@ def _looks(capture: Capture) -> Iterator[tuple[Any, ...]]:
 
 
 def calls_of_exposure(capture: Capture) -> Iterator[Call]:
-    """Yields the call that finds the colors of the body in the first photo. Its compiled program
-    does not depend on where the body is.
+    """Yields one call of the jitted function that finds the body's colors in a photo, to compile it
+    ahead. The compiled program does not depend on where the body is.
     """
     yield _seen_colors, next(_looks(capture))
 
@@ -189,26 +196,31 @@ PARTS = (
 LEAST_OF_PART = 20
 """The least number of points that a group of photos must show of a part."""
 TINT = 0.03
-"""Standard deviation of the logarithm of a part's tint, in front against behind, in one light (16
-synthetic people: 0.02 to 0.04, without open coats).
+"""Standard deviation of the difference of a part's log tint between its front and its back, in one
+light. 16 synthetic people without open coats have 0.02 to 0.04.
 """
 BRIGHTNESS = 0.2
-"""Standard deviation of the logarithm of a part's brightness, in front against behind, in one light
-(16 synthetic people: 0.1 to 0.3).
+"""Standard deviation of the difference of a part's log brightness between its front and its back,
+in one light. 16 synthetic people have 0.1 to 0.3.
 """
 OFFSET = 0.01
-"""Standard deviation of a color by stray light, which makes the tint of dark parts uncertain."""
+"""Standard deviation of the stray light in a color. It makes the tints of dark parts uncertain."""
 OTHER_LIGHT = 0.04
-"""Root mean square of the logarithms of white balances. Photos of one moment above it count as
-balanced differently; in one light at most 0.03 is found (16 synthetic people).
+"""Photos of one moment count as balanced differently if the root mean square of their log white
+balances is at least this. In one light at most 0.03 is found (16 synthetic people).
 """
 OTHER_DAYS = 0.4
-"""Standard deviation of the logarithm of a gain between photos that may be of other days."""
+"""Standard deviation that the log gain of a group of photos has before the groups are compared (the
+prior). The groups may be of different days.
+"""
 FITS = 16
-"""How often the rows are weighted by their residuals."""
+"""Number of least-squares fits in `_robust_differences`. Each weights the rows by the residuals of
+the fit before.
+"""
 REDESCENDING = 8
-"""In this number of fits, the last ones, parts that differ lose all weight. In earlier fits that
-would tie the result to the start of the search.
+"""In this number of fits, the last ones, the weights are Cauchy's, so that parts that differ lose
+nearly all influence. If the first fits used them, too, the result would depend on where the search
+starts.
 """
 
 
@@ -248,15 +260,17 @@ def gains_between(
     frames: Int[np.ndarray, " v"],
 ) -> Float[np.ndarray, "v 3"]:
     """Returns the gains of groups of views that have no point in common, from the colors of the
-    body's parts.
+    body's parts, (v, 3).
+
+    If two groups share a frame, all photos count as taken in one light. Gains are then 1 if the
+    white balances hardly differ, see `OTHER_LIGHT`.
 
     Arguments:
         colors: in [0, 1], in equal exposure within each group.
         seen: which points each view shows.
         parts: the part of each point, see `body_parts`.
         groups: the group of each view, see `linked_views`.
-        frames: the frame of each view. If any two groups share a frame, all photos count as of one
-            light. Gains are then 1 if the white balances hardly differ.
+        frames: the frame of each view.
     """
     count = int(groups.max()) + 1
     medians = part_colors(colors, seen, parts, groups)
@@ -294,7 +308,7 @@ class PartColor(NamedTuple):
     color: Float[np.ndarray, "3"]
     """The median of the logarithms of the colors, (3,)."""
     error: float
-    """The standard error of its tint."""
+    """The standard error of the part's tint (its log color minus the mean over the channels)."""
 
 
 def part_colors(
@@ -336,12 +350,14 @@ def _robust_differences(
     errors: Float[np.ndarray, " r"],
     count: int,
 ) -> Float[np.ndarray, "count c"]:
-    """Returns `count` numbers x near 0 such that x[one] - x[other] = value for most rows. They are
-    found by weighted least squares: first with weights of absolute residuals, then with those of
-    Cauchy's distribution.
+    """Returns `count` numbers x for each of c columns, (count, c), such that x[one] - x[other] is
+    the value of most rows. x is near 0 where the rows leave it open.
 
-    ends: (one, other) of each row. values: the difference in each of c columns. errors: the
-    standard error of each row.
+    The fit is weighted least squares, repeated `FITS` times: first with Huber's weights, then with
+    Cauchy's.
+
+    ends: (one, other) of each row. values: the differences, (r, c). errors: the standard error of
+    each row.
     """
     differences = np.eye(count)[ends[:, 0]] - np.eye(count)[ends[:, 1]]
     prior = np.eye(count) / OTHER_DAYS

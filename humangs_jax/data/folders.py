@@ -176,8 +176,8 @@ def is_video(path: Path) -> bool:
 
 
 def photo_of_mask(name: str) -> str | None:
-    """Returns the name of the photo that the name of a mask contains, perhaps without suffix; None
-    if the name is not that of a mask.
+    """Returns the name of the photo that a mask belongs to, with or without suffix. Returns None if
+    the name is not the name of a mask.
 
     "1.jpg.mask.png" and "mask_1.jpg.png" are masks of "1.jpg", "1_mask.png" and "1-matte.png" of
     "1".

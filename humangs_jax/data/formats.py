@@ -82,8 +82,8 @@ class SourceFormats(Formats[F]):
     """Formats that are known by the content of their files."""
 
     def found(self, folder: Path) -> tuple[F, Path] | None:
-        """Returns the first format of which the folder has a file with a usual name, and the first
-        such file; None if it has none.
+        """Returns the first format that has a file with one of its usual names in the folder, and
+        the path of this file. Returns None if the folder has no such file.
         """
         for each in self.values():
             for pattern in each.files:
@@ -93,8 +93,8 @@ class SourceFormats(Formats[F]):
         return None
 
     def of_name(self, file: Path) -> F | None:
-        """Returns the first format that reads the files of a folder together and usually names one
-        of them like this file; None if there is none.
+        """Returns the first format that reads the files of a folder together and has a file of this
+        name among its usual names. Returns None if there is no such format.
         """
         named = (
             each
@@ -120,7 +120,7 @@ class SourceFormats(Formats[F]):
 _CAMERAS = "humangs_jax.capture.calibration."
 """The package whose modules read cameras."""
 _KEYPOINTS = "humangs_jax.capture.keypoints.formats:read_"
-"""The module and the beginning of the names of the functions that read keypoints."""
+"""The module that reads keypoints, and the beginning of the names of its functions."""
 _MODELS = ("", "sparse/0/", "sparse/")
 CAMERAS = SourceFormats(
     colmap=CameraFormat(
@@ -256,9 +256,10 @@ PLACES = {
     "right_hand": (40, 15),
     "hands": (25, 30),
 }
-"""The joints of each part among those of SMPL-X: the first joint, and the number of joints.
+"""Each part of the body -> the index of its first joint among the joints of SMPL-X, and its number
+of joints.
 
-In SMPL the body and the limbs have two further joints at the end, the whole hands.
+In SMPL the parts "body" and "limbs" have two further joints at the end, one for each whole hand.
 """
 
 
@@ -269,29 +270,31 @@ class ArrayKeys:
     keys: tuple[str, ...]
     """A file that has all of these keys is of this format."""
     poses: dict[str, str]
-    """The key of the rotations of each part that files have, by the name of the part in `PLACES`.
-    The rotations are axis-angles or rotation matrices.
+    """Name of a part in `PLACES` -> key of the part's rotations in the file. The rotations are
+    axis-angles or rotation matrices.
     """
     moves: tuple[str, ...] = ("trans", "transl")
-    """The keys of positions; the first one that a file has is used. For files without any see
-    `stays`.
+    """The keys that positions may have; the first one in the file is used. If the file has none of
+    them, see `stays`.
     """
     rates: tuple[str, ...] = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate")
-    """The keys of frames per second; the first one that a file has is used."""
+    """The keys that frames per second may have; the first one in the file is used."""
     fps: float | None = None
-    """Frames per second of files that do not say them; None: files must say them."""
+    """Frames per second if the file does not say them. None: the file must say them."""
     up: str = "y"
     """The axis that is up in files of this format."""
     fixed: bool = False
-    """Whether `up` holds whatever the poses look like."""
+    """Whether `up` is certain. If not, the poses may show that another axis is up."""
     also: tuple[str, ...] = ()
     """Other axes that point up in some files, see `rules.up_axis`."""
     scaling: str | None = None
-    """The key of the divisor of translations; 1000 where a file does not have it."""
+    """The key of the number by which translations are divided to get metres. If the file does not
+    have the key, the number is 1000. None: translations are in metres.
+    """
     pivot: str = "pelvis"
-    """The point that a person turns about, and whose positions the file has: the pelvis at rest
-    ("pelvis"), the origin ("origin", positions applied last), the head ("head"), or the root joint
-    in space ("joint").
+    """The point whose positions the file has. "joint": the root joint. "head": the joint of the
+    head. "pelvis": the positions are displacements of the pelvis from its place in the T-pose, as
+    in SMPL. "origin": the person first turns about the origin, then the positions are added.
     """
     six: bool = False
     """Whether rotations are six numbers each, (j, 6, m) or (m, j, 6) for m frames."""
@@ -302,7 +305,7 @@ class ArrayKeys:
     joints in space.
     """
     page: bool = True
-    """Whether the page reads this format, too."""
+    """Whether the viewer's web page reads this format, too."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -312,7 +315,8 @@ class MotionFormat(Format):
     """
 
     arrays: ArrayKeys | None = None
-    """The keys of files of arrays; the first format that fits a file is used, whatever its suffix.
+    """The keys of a format of arrays. A file is read by the first format with fitting keys,
+    whatever the file's suffix is. None: the files do not hold arrays.
     """
 
 
@@ -340,8 +344,8 @@ _OF_CAMERA = (
     *("camera", "cam_trans", "translation", "orig_cam"),
 )
 _FOUND: dict[str, Any] = {"fps": DEFAULT_FPS, "also": ("-y",), "moves": _OF_CAMERA}
-"""Fields of the formats of pose estimators. These write motions in a world, or in the coordinates
-of a camera, whose y axis points down.
+"""Fields of the formats of pose estimators. They write motions in the coordinates of a camera or in
+a world. In either, the y axis may point down.
 """
 _ALONE: dict[str, Any] = _FOUND | {"page": False}
 MOTIONS = Formats(

@@ -4,9 +4,9 @@ A mask says where the person is seen. Where the posed body lies well inside of t
 mask has a hole or ends, something is in front, or the mask is wrong: the photo says nothing there.
 These pixels become unknown (`Capture.unknown`).
 
-A body that is posed a little wrong lies beside the mask, too. So only parts of the silhouette that
-are thicker than an arm count, well inside of its edge, and only where the mask shows no part of the
-person beside the body nearby: the arm or leg that the body has elsewhere.
+If the pose is a little wrong, the body also lies beside the mask. So holes count only well inside
+of the silhouette's edge, in parts of the silhouette that are thicker than an arm. There must also
+be little of the mask beside the body near a hole: it would be an arm or a leg with another pose.
 """
 
 import dataclasses
@@ -29,33 +29,32 @@ from humangs_jax.io.images import resized
 LONGEST = 512
 """Longest side of the photos in which silhouettes are compared, pixels."""
 INSIDE = 0.035
-"""Metres inside the edge of the silhouette from which on the mask should show the person. Poses and
+"""A hole is looked for where the silhouette's edge is farther away than this, metres. Poses and
 shapes of fits are off by less.
 """
 THICK = 0.015
-"""Half of the least thickness of a hole, metres. With `INSIDE`, arms and the gap between arm and
-trunk are too thin for holes.
+"""Half of the least thickness of a hole, metres, measured inside of `INSIDE`. Arms, and the gap
+between arm and trunk, are too thin for holes.
 """
 AREA = 0.005
 """The least area of a hole, square metres."""
 EDGE = 0.01
-"""Holes that were found further inside are extended up to this distance inside the silhouette's
-edge, metres.
+"""A hole that is found farther inside is extended up to this distance from the silhouette's edge,
+metres.
 """
 RIM = 0.03
-"""Metres by which a hole is enlarged. The thing in front hides clothes as well, and the mask's edge
-beside it shows its colors.
+"""Distance by which a hole is enlarged, metres. The thing in front hides clothes outside of the
+body, too, and its colors are seen along the edge of the mask.
 """
 INTO_MASK = 0.008
-"""Metres of `RIM` that reach into the mask."""
+"""The part of `RIM` that may lie on the mask, metres."""
 LOOSE = 0.04
 """Metres outside the silhouette up to which the mask may show clothes and hair."""
 NEARBY = 0.25
-"""Metres around a hole in which the area of the person beside the body is measured, see `BESIDE`.
-"""
+"""Distance from a hole within which the mask beside the body is measured, metres, see `BESIDE`."""
 BESIDE = 0.35
-"""The largest area of the person beside the body near a hole, as a share of the area of the hole.
-With more, the hole is a part of the body that has another pose.
+"""Largest area of the mask beside the body near a hole, as a share of the hole's area. If there is
+more, the hole is not something in front: an arm or a leg has another pose than the body.
 """
 AGREES = 0.75
 """The least share of the mask that lies on the body or within `LOOSE` of it. With less, the body is
@@ -68,7 +67,8 @@ be a guess.
 
 
 def with_hidden_parts(capture: Capture) -> Capture:
-    """Returns the capture with those pixels unknown where something is in front of the posed body.
+    """Returns the capture with pixels made unknown where something is in front of the posed body.
+    These pixels are white in the photos and 0 in the masks.
 
     Returns the same object if there are no such pixels, or no masks.
     """

@@ -49,8 +49,8 @@ from humangs_jax.io.reading import shown
 
 LISTS = ("train.json", "test.json")
 WHITE = 250 / 255
-"""Where there is no mask, a pixel with a channel below this belongs to the person. 8-bit JPEG
-images ripple by a few levels.
+"""Where there is no mask, a pixel belongs to the person if one of its channels is below this. White
+pixels may be a little below 1, since 8-bit JPEG images ripple by a few levels.
 """
 KEPT_FRAMES = 64
 """Poses of a scene that are kept in memory."""
@@ -119,9 +119,10 @@ def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
 def open_scene_list(
     path: str | Path, body: FileBody, size: int | None = None
 ) -> tuple[Person, ...]:
-    """Returns the people of a list. Each is opened when it is first asked for. size: the side of
-    the stored squares, pixels. None: the longer side of the first scene's image that exists, or
-    `STORED_SIZE` if no scene's first image exists.
+    """Returns the people of a list. Each is opened when it is first asked for.
+
+    size: the side of the stored squares, pixels. None: the longer side of the first image that
+    exists among the first images of the scenes, or `STORED_SIZE` if none of these exists.
 
     Raises: CaptureError if the list cannot be read.
     """

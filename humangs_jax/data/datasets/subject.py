@@ -48,8 +48,8 @@ checked_numbers = functools.partial(file_numbers, some=True)
 FIRST_HAND_JOINT = 25
 """The first finger joint in the order of SMPL-X; 30 finger joints begin there."""
 RECOVERED_TOLERANCE = 3e-3
-"""Metres, root mean square over vertices. Arrays of a scene list that are nearer to a body model
-count as made with it.
+"""The arrays of a scene list count as made with a body model if they differ from the fitted model
+by less than this, metres, root mean square over the vertices.
 """
 
 
@@ -211,8 +211,10 @@ def recover_shape(
     """Returns the scale and the shape coefficients of a T-pose `v_cano`, by least squares: rest =
     scale (template + directions betas).
 
-    rest: the vertices of the T-pose, (n, 3). The release bends the hands by accident, so they are
-    left out if the fit of all vertices fails.
+    rest: the vertices of the T-pose, (n, 3), in units of the scene. All vertices are fitted first.
+    If the fit is off by `RECOVERED_TOLERANCE` or more, the vertices of the hands are left out,
+    because the published arrays have bent hands by accident.
+
     Raises: CaptureError if the arrays are not of this body.
     """
     template = body.arrays[0]
@@ -242,10 +244,11 @@ def _shape_solvers(
 ) -> tuple[
     tuple[Float[np.ndarray, "_u _r"], Float[np.ndarray, "_r _u"], Bool[np.ndarray, " n"]], ...
 ]:
-    """Prepares the least-squares problems of `recover_shape`: the first with all vertices, the
-    second without hands.
+    """Returns the two least-squares problems of `recover_shape`: with all vertices, and without the
+    hands.
 
-    Each is a tuple of the pseudo-inverse, the columns, and the vertices that are used.
+    Each is a tuple of three: the pseudo-inverse of the matrix, the matrix, and which vertices are
+    used. The columns of the matrix are the template and the shape directions.
     """
     columns = np.concatenate([body.arrays[0][..., None], body.arrays[1]], axis=-1)
     of_hands = np.asarray(body.model.skinning_weights)[:, FIRST_HAND_JOINT:].sum(axis=1) > 1e-6
@@ -286,11 +289,11 @@ def recover_pose(
 # --------------------------------------------------------------------------------------------------
 
 STORED_SIZE = 512
-"""Side of the squares that photos of data sets become, pixels. Sides of 256 and 128 are box
-averages of it.
+"""Side of the squares that photos of data sets become, pixels. Squares of 256 and 128 pixels can be
+computed from them by averaging whole blocks.
 """
 Photo = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]
-"""An image on white and its mask."""
+"""An image on white, (h, w, 3), and its mask, (h, w), as bytes."""
 THREADS = os.cpu_count() or 1
 """Threads that decode the photos of one request. JPEG decoding releases the interpreter's lock."""
 
@@ -476,8 +479,10 @@ def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tu
     Each person is opened when it is first asked for.
 
     Arguments: size: the side of the stored squares, pixels. None: for a scene list see
-    `open_scene_list`, else `STORED_SIZE`. Raises: CaptureError if the folder has none of the
-    layouts, or the layout of scans, which have no photos.
+    `open_scene_list`, else `STORED_SIZE`.
+
+    Raises: CaptureError if the folder has none of these layouts, or is a data set of scans, which
+    have no photos.
     """
     path = Path(path)
     for name, data_set in DATASETS.items():

@@ -70,13 +70,15 @@ class Loader:
     """The seed of the order of subjects and of the choice of views."""
     sharding: jax.sharding.Sharding | None = None
     """How a batch lies on the devices. Only its first axis may be split. A process makes the rows
-    that its devices hold, so that replicas hold equal rows. None: everything is on the default
-    device.
+    that its devices hold. A row that several processes hold is the same in all of them. None:
+    everything is on the default device.
     """
     first_step: int = 0
-    """The step at which the numbering of examples starts. Steps before it had other batches."""
+    """The step whose first example has the number `first_example`. Later examples are numbered from
+    there. It is above 0 if earlier steps had batches of another size.
+    """
     first_example: int = 0
-    """The number of the first example of that step."""
+    """The number of the first example of `first_step`."""
     threads: int = 4
     """The number of threads that make examples."""
 

@@ -57,15 +57,16 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
 def read_summary(
     path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY
 ) -> StoredSubject:
-    """Returns all of a capture but its pixels. Its parameters belong to `body`; its images and
-    masks have the right size, but hold no views.
+    """Returns all of a capture but its pixels, with its parameters for `body`. The arrays of images
+    and masks have the right height and width, but 0 views.
 
     Images are opened and their sizes compared. PNG files are checked by their checksums, others by
     decoding them.
 
-    Arguments: body_file: the file that `body` comes from, see `Capture`. Raises: ValueError naming
-    file and field. Captures without masks cannot be learned from, and parameters of another body do
-    not fit this one.
+    Arguments: body_file: the file that `body` comes from, see `Capture`.
+
+    Raises: ValueError naming file and field. A capture without masks is refused, because training
+    needs them. A capture with another body is refused, too.
     """
     folder = Path(path)
     file = folder / "capture.json"
@@ -113,8 +114,8 @@ def read_summary(
 
 
 def _same_body(name: str, folder: Path, body_file: str | Path) -> bool:
-    """Returns whether `name`, by which a capture in `folder` calls its body, means the body of
-    `body_file`.
+    """Returns whether a capture in `folder` has the body of `body_file`. name: the name or the path
+    of the body in the capture.
     """
     if DEFAULT_BODY in (name, str(body_file)):
         return name == str(body_file)
@@ -335,7 +336,9 @@ class CaptureSource:
     target_size: int
     """The side of the square target views, pixels."""
     depths: bool = False
-    """Whether examples have depths, all unknown, to be mixed with others that are known."""
+    """Whether examples have arrays of depths, in which all depths are unknown. So they can be mixed
+    with examples of other sources that have depths.
+    """
 
     @property
     def input_counts(self) -> tuple[int, ...]:
@@ -361,11 +364,11 @@ class CaptureSource:
         return str(self._found(seed, index, input_count)[0])
 
     def unusable(self) -> dict[str, str]:
-        """Returns the people that are broken so far, and those of which no example with the most
-        input views can be made: what is wrong with each, by name.
+        """Returns the names of the people that cannot be used, each with the reason. Files may be
+        wrong, or there may be too few views for the largest number of input views, or too small
+        photos.
 
-        Their files may be wrong, or they may have too few views or too small photos. No decoded
-        photo is kept. Raises: ValueError if no person can be used.
+        No decoded photo is kept. Raises: ValueError if no person can be used.
         """
         problems = {}
         for i in range(len(self.cache)):

@@ -1,9 +1,9 @@
 """Makes the examples to learn from: some views of a subject are the input, others the targets. The
 module also has the order of examples, and mixtures of sources.
 
-All of it is numpy, and pure functions of (seed, number). Example e = step * batch + i is the i-th
-of its batch, so that a run resumes from its step alone. Each purpose draws from a separate stream
-of random numbers.
+All of it is numpy, and pure functions of (seed, number). Row i of the batch of a step is example
+number step * batch size + i, so that a run resumes from its step alone. Each purpose draws from a
+separate stream of random numbers.
 """
 
 import dataclasses
@@ -21,8 +21,8 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import resized
 
 WINDOW = (25, 59)
-"""Least and greatest distance of the two ends of a window in the rule "window", in views of a
-subject that has `WINDOW_OF` views.
+"""Least and greatest distance between the two ends of a window, for the rule "window". The
+distances are numbers of views, for a subject that has `WINDOW_OF` views.
 """
 WINDOW_OF = 60
 
@@ -32,21 +32,30 @@ class ViewSampling:
     """Which views of a subject are input and which are targets."""
 
     input_counts: tuple[Count, ...] = (4,)
-    """Numbers of input views; one is drawn per step (each compiles once)."""
+    """Numbers of input views. Each step draws one of them; each is compiled once."""
     target_count: Count = 3
     """The number of target views."""
     jitter: Spread = 0.7
-    """Inputs stand evenly around the subject, each off by up to half this share of the spacing."""
+    """Largest random change of an input's azimuth, as a share of half the spacing. Without it,
+    inputs stand evenly around the subject.
+    """
     scattered_share: Share = 0.2
-    """The share of examples whose inputs stand anywhere instead."""
+    """The share of examples whose inputs stand at random azimuths, not evenly around the
+    subject.
+    """
     mixed_pose_share: Share = 0.3
-    """The share of examples whose inputs may each show another pose (frame)."""
+    """The share of examples in which the pose (frame) of each input is drawn separately. In the
+    others all inputs show one pose, if there are enough views of it.
+    """
     rule: Literal["random", "window"] = "random"
-    """How inputs and targets are drawn. "random": inputs stand around the subject, targets are
-    drawn from all other views, of any pose. "window": the rule of the release. The two ends of a
-    random window in the order of the views are taken, then random views inside of it. The ends are
-    25 to 59 views apart where a subject has 60 (in proportion for other counts). The first of these
-    views are input, the last targets. jitter, scattered_share and mixed_pose_share are not used.
+    """How inputs and targets are drawn.
+
+    "random": inputs stand around the subject. Targets are drawn from all other views, of any pose.
+
+    "window": the rule of the release. A random window in the order of the views is drawn. For a
+    subject with 60 views, its two ends are 25 to 59 views apart, and in proportion for others. The
+    two ends are taken first, then random views between them. The views that are taken first are
+    inputs, the others are targets. jitter, scattered_share and mixed_pose_share are not used.
     """
 
 
@@ -81,8 +90,8 @@ class StoredSubject(NamedTuple):
         frames: np.ndarray,
         *body: np.ndarray,
     ) -> "StoredSubject":
-        """Returns a subject without photos yet, whose photos will have this height and width. body:
-        rotations, translations, betas.
+        """Returns a subject whose arrays of images and masks hold no views yet. size: the height
+        and the width of the photos, pixels. body: rotations, translations, betas.
         """
         centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
         offsets = centers - centers.mean(axis=0)
@@ -156,10 +165,10 @@ def nearest_view(subject: StoredSubject, azimuth: float, allowed: np.ndarray) ->
 def sample_views(
     generator: np.random.Generator, subject: StoredSubject, input_count: int, sampling: ViewSampling
 ) -> tuple[list[int], list[int]]:
-    """Returns the indices of the input and of the target views, which are disjoint.
+    """Returns the indices of the input views and of the target views, which are disjoint.
 
     Raises: ValueError if the subject has too few views for the largest of the input counts, even if
-    `input_count` is smaller. So a subject is usable or not, independent of the step.
+    `input_count` is smaller. Whether a subject is usable does then not depend on the step.
     """
     count, needed = len(subject.frames), max(sampling.input_counts) + sampling.target_count
     if count < needed:
@@ -270,8 +279,8 @@ SUBJECT_STREAM = 4
 """The first entry of the seed for the people that are made while training."""
 
 MIX_BLOCK = 256
-"""Examples over which the shares of mixed sources are exact. A share of less than one example in a
-block becomes one example.
+"""Number of examples in a block. The shares of mixed sources are the same in each block. Each
+source has at least one example in a block, however small its weight is.
 """
 
 
@@ -318,8 +327,8 @@ def source_at(seed: int, index: int, counts: Int[np.ndarray, " sources"]) -> tup
     """Returns which source the index-th example comes from, and its number among the examples of
     that source.
 
-    Blocks of `MIX_BLOCK` examples are permutations of the same multiset: shares are exact over
-    every block, and each source provides its own examples 0, 1, 2, ... without a gap.
+    Each block of `MIX_BLOCK` examples has the same number of examples of each source, in a random
+    order. Each source provides its examples 0, 1, 2, ... without a gap.
     """
     block, position = divmod(index, MIX_BLOCK)
     labels = np.repeat(np.arange(len(counts)), counts)
@@ -332,8 +341,8 @@ def source_at(seed: int, index: int, counts: Int[np.ndarray, " sources"]) -> tup
 class Mixture:
     """Sources mixed by weight, see `source_at`.
 
-    Raises: ValueError if there are not as many weights as sources, one is not positive, or the
-    sources disagree on `input_counts` (a step has one).
+    Raises: ValueError if there are not as many weights as sources, if a weight is not positive, or
+    if the sources have different `input_counts`, since all examples of a step have one.
     """
 
     sources: tuple[Source, ...]
