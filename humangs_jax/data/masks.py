@@ -2,13 +2,14 @@
 photos.
 
 Segmentation leaves silhouettes that are some pixels off. A pixel too much shows the background at
-the person's rim, a pixel too little cuts the person, in all photos alike, so no later stage can
-find it. Here the photo is searched along the normals of the silhouette for the distance at which
-the colors change most, on average over the silhouette and near each of its points.
+the person's rim, and a pixel too little cuts the person. All photos have the same fault, so no
+later stage can find it. Here the photo is searched along the normals of the silhouette for the
+distance at which the colors change most, on average over the silhouette and near each of its
+points.
 
-A stripe along the rim that looks like the background (rim light before a bright wall, piping) has a
-stronger edge on its other side. So a mask is moved only where sectors of the silhouette agree, and
-views do, that there is no edge where it ends now.
+A stripe along the rim may look like the background (rim light before a bright wall, piping). Its
+inner side is then a stronger edge than the rim. So a mask is moved only if enough sectors of the
+silhouette, in the view and in all views, have an edge where it would move and none where it ends.
 """
 
 import itertools
@@ -22,23 +23,25 @@ from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.io.images import resized
 
 PERSON_HEIGHT = 200
-"""Lengths below are in units of the pixels of a person who is that many pixels high."""
+"""Lengths below are in units: the person is this many units high. So a unit is a pixel if the
+person is this many pixels high.
+"""
 REACH = 4.0
-"""Largest distance that a silhouette is moved, in these units."""
+"""Largest distance that a silhouette is moved, units."""
 STEP = 0.5
-"""Distance between the moves that are tried, in these units."""
+"""Distance between the moves that are tried, units."""
 NEIGHBORHOOD = 4.0
-"""Standard deviation of the Gaussian that weights the silhouette around a point, whose colors
-decide about the point; in these units.
+"""The move at a point depends on the colors along the silhouette around it, weighted by a Gaussian
+with this standard deviation, units.
 """
 SMOOTHING = 2.0
-"""Standard deviation of the smoothing of the distances that were found, in these units."""
+"""Standard deviation of the Gaussian that smooths the moves, units."""
 LEAST = 0.75
-"""Masks whose silhouette is off by less than this on average stay as they are, because exact masks
-would only lose (docs/stability.md). In these units.
+"""A mask stays as it is if its silhouette is off by less than this on average, units. Exact masks
+would only lose (docs/stability.md).
 """
 LEAST_MOVE = 0.5
-"""Parts of the silhouette that would move by less stay where they are. In these units."""
+"""Parts of the silhouette that would move by less than this stay where they are, units."""
 MOST_PIXELS = 400
 """Height of the person at which the photo is searched, pixels. Larger photos are reduced to it."""
 LEAST_PART = 0.005
@@ -54,35 +57,37 @@ SECTORS = 16
 SECTOR_POINTS = 8
 """The least number of points of a sector. Where points are few, there are fewer sectors."""
 AGREE = 0.7
-"""Share of the sectors, over all views that would be moved in the same direction, that must find
-the edge at one distance.
+"""Least share of the votes that must be for the move, among the votes of all views that would be
+moved in the same direction. Sectors vote, see `_sector_votes`.
 """
 AGREE_ALONE = 0.5
-"""Share of the sectors of the view itself that must find the edge there."""
+"""Least share of the votes that must be for the move, among the votes of the view."""
 EDGE = 0.06
-"""At an edge, colors change more than beside it, by this share of the strongest change in the
-sector.
+"""There is an edge where the mask ends if the colors change enough across this end. The change must
+be more than (1 + `OF_TEXTURE`) times the change beside it plus `EDGE` times the strongest change in
+the sector.
 """
 OF_TEXTURE = 1.0
-"""Colors also change more by this share of the change beside the edge."""
+"""Weight of the change of colors beside an edge, see `EDGE`."""
 SEEN_APART = 1.5
-"""The largest distance of a sector's edge from the place where the silhouette would move, in these
-units. Masks that are off by fewer pixels than this are not searched for an edge where they end.
+"""A sector votes for a move if its edge is at most this many units away from where the silhouette
+would move. An edge where the mask ends is looked for only if the mask is off by at least this many
+pixels.
 """
 CLEAR = 1.3
-"""Pixels within which a blurred edge ends."""
+"""Distance from an edge, pixels, from which on the colors are not blurred by it."""
 THIN = 0.0007
-"""Area of the parts of a mask that are too thin for one that is too large, over the area that it
-would lose. Masks with a larger share are not moved.
+"""Masks are not moved if they have many parts too thin for masks that have grown by their excess.
+This is the largest area of such parts, as a share of the area that the masks would lose.
 """
 
 
 class _Shift(NamedTuple):
-    """The correction of a mask that a photo suggests. The mask is too large by `excess` pixels
-    (negative: too small; 0: it stays), and by `moves` at each pixel of `window`.
+    """The correction of a mask that a photo suggests.
 
-    unit: pixels of the photo for one of a person `PERSON_HEIGHT` high. votes: the number of sectors
-    for and against the correction. thin: see `THIN`.
+    excess: by how many pixels the mask is too large (negative: too small; 0: it stays). moves: the
+    excess near each pixel of `window`, pixels. unit: pixels per unit, see `PERSON_HEIGHT`. votes:
+    the number of sectors for and against the correction. thin: see `THIN`.
     """
 
     excess: float
@@ -102,11 +107,14 @@ def masks_at_edges(
     Arguments: images: the photos of one person with their background, values in [0, 1]. masks:
     coverage in [0, 1].
 
-    A mask is kept, with 0, if it is empty, full or a line, if it is off by less than `LEAST`, or if
-    its photo shows no background. It is also kept if too few sectors of the silhouette vote for the
-    move, in its view or in all views that are off in the same direction. So it is if fewer than
-    half of the views are off in this direction, or if these have many parts thinner than their
-    excess allows (`THIN`).
+    A mask stays as it is, with 0, in these cases:
+
+    - It is empty, full or a line, or its photo shows no background.
+    - It is off by less than `LEAST`.
+    - Too few sectors of the silhouette vote for the move, in its view (`AGREE_ALONE`) or in all
+      views that are off in the same direction (`AGREE`).
+    - Fewer than half of the views are off in this direction.
+    - The masks that are off in this direction have many thin parts (`THIN`).
     """
     found = [_shift(image, mask) for image, mask in zip(images, masks, strict=True)]
     seen = [shift for shift in found if shift is not None]
@@ -177,9 +185,10 @@ def _boundary_moves(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], unit: float
 ) -> tuple[float, Float[np.ndarray, "h w"]]:
     """Returns how far inside the mask's silhouette the photo has its edges, pixels (negative:
-    outside): one number for the whole, and one near each pixel.
+    outside). The first result is one number for the whole silhouette, the second a number near each
+    pixel, (h, w).
 
-    unit: pixels of this image for one of a person `PERSON_HEIGHT` high.
+    unit: pixels of this image per unit, see `PERSON_HEIGHT`.
     """
     distances = signed_distance(mask)
     normal = np.gradient(ndimage.gaussian_filter(distances, 1.0))
@@ -282,8 +291,8 @@ def _sector_votes(
 
 
 def _thin_parts(mask: Float[np.ndarray, "h w"], excess: float) -> float:
-    """Returns the area of the parts of a mask that are too thin for a mask that is too large by
-    `excess`, over the area of the excess. excess: in pixels of a person `PERSON_HEIGHT` high.
+    """Returns the area of a mask's thin parts, divided by the area that the mask would lose. Thin
+    parts are narrower than a mask can be that has grown by `excess` (units, see `PERSON_HEIGHT`).
 
     A silhouette that has grown by some distance has no part thinner than twice that distance. A
     mask with thin fingers has not grown.
@@ -341,30 +350,34 @@ def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 # the person's.
 
 RIM_HEIGHT = 440
-"""Lengths below are in units of the pixels of a person who is that many pixels high."""
+"""Lengths below are in units: the person is this many units high."""
 DEPTH = 2.0
-"""Pixels outside the mask, and those inside that are nearer to its edge than this, are cleaned by
-the mean colors of pixels at least this far inside and this far outside.
+"""Pixels outside the mask, and pixels inside that are nearer to its edge than this, are cleaned.
+The cleaning compares two means: the color of the person at least this far inside, and the color of
+the background at least this far outside. Units.
 """
 SPREAD = 1.5
-"""Standard deviation of the Gaussian that weights these means, pixels."""
+"""Standard deviation of the Gaussian that weights these means, units."""
 LEAST_WEIGHT = 1e-3
-"""The least weight of the pixels further inside. Where the weight is less, as in fingers, which are
-too thin, the rim stays as it is.
+"""Least weight of the pixels far enough inside. Where their weight is less, the rim stays as it is.
+This is so at fingers, which are too thin.
 """
 CONTRAST = 0.02
-"""A pixel is taken for a mixture where the two means differ by more than this."""
+"""A pixel may be cleaned if the distance between the two mean colors is more than this (RGB in [0,
+1]).
+"""
 CERTAIN = 0.15
-"""A pixel is cleaned if the room's share in its mixture exceeds this."""
+"""A pixel is cleaned if the background's share in its color is more than this."""
 
 
 def clean_rims(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Returns a photo without the room's share in the pixels along and beyond the edge of the mask.
+    """Returns a photo without the background's share in the colors of pixels along and beyond the
+    edge of the mask.
 
-    The share of a pixel is measured between the colors further inside and further outside, and this
-    part of the difference is subtracted. All other detail stays.
+    A pixel's share says where its color lies between the mean color further inside and the mean
+    color further outside. The share of their difference is subtracted. All other detail stays.
     """
     inside = mask > 0.5
     if not inside.any() or inside.all():

@@ -56,18 +56,21 @@ Background = Literal["photo", "white"]
 LEAST_UNKNOWN = 0.5
 """Least value of a pixel that is unknown, in an image that marks the unknown pixels."""
 OFF_CENTER = 0.05
-"""Share of a side. If the principal point is nearer to the middle of the turned photo than to that
-of the stored one by more than this, K is that of the turned photo.
+"""K belongs to the photo as turned by its EXIF orientation if the principal point is nearer to the
+middle of the turned photo than to the middle of the stored one by more than this, as a share of a
+side.
 """
 LARGEST_LABEL = 20 / 255
-"""A mask with no value above this holds labels (0 and 1, or parts of a person) in place of
-coverage.
+"""A mask with no value above this holds labels (0 and 1, or numbers of parts of a person). It does
+not hold coverage.
 """
 NEARLY_WHITE = 0.9
-"""A mask of 0 and one other value below this holds labels as well."""
+"""A mask also holds labels if its values are 0 and one other value, and this one is below
+`NEARLY_WHITE`.
+"""
 LEAST_LABELLED = 1e-3
-"""A mask with a smaller share of labelled pixels is the rim of somebody outside the photo, and not
-taken for labels.
+"""A mask does not count as labels if at most this share of its pixels is not 0. It may be the rim
+of somebody outside the photo.
 """
 
 
@@ -196,10 +199,10 @@ def write_description(
 
 
 def _is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
-    """Returns whether the cameras of a capture were calibrated; true where the capture does not
-    say.
+    """Returns whether the cameras of a capture were calibrated. They were if the capture does not
+    say otherwise.
 
-    Older captures have this in a file that `humangs start` wrote beside capture.json.
+    In older captures a file that `humangs start` wrote beside capture.json may say this.
     """
     if "calibrated" in description:
         return description["calibrated"]
@@ -364,8 +367,10 @@ def _check_orientations(
     height: int,
     warns: bool,
 ) -> None:
-    """Check photos with an EXIF orientation, since photos are read as they are stored. Such a photo
-    is an error if K is that of the turned photo; else there is a warning if `warns`.
+    """Check photos with an EXIF orientation, since photos are read as they are stored. If `warns`,
+    a warning names such photos.
+
+    Raises: CaptureError if K belongs to the turned photo, see `OFF_CENTER`.
     """
     flagged = []
     for view, camera in zip(views, K, strict=True):
@@ -392,11 +397,11 @@ def _check_orientations(
 
 
 def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) -> None:
-    """Raise CaptureError if a description has more or larger photos than the limits allow, or has
-    one photo in too many views. No pixels are read.
+    """Raise CaptureError if a description names one photo in too many views. With `together`, also
+    if it has too many photos, or too many pixels in all. No pixels are read.
 
-    together: whether all photos will be in memory at one time. Only then are their number and size
-    checked; the size is that of the first photo, since all must have it.
+    together: whether all photos will be in memory at one time. Their size is taken from the first
+    photo, since all must have one size.
     """
     file = folder / "capture.json"
     check_repeats(file, [folder / view["image"] for view in views])
@@ -552,9 +557,10 @@ def cut_out(
 
 
 def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:
-    """Returns a unique name for each path, made of letters, digits, '.', '_' and '-'. It is the
-    file name without suffix. If two of these are equal, all names contain their folders, and if two
-    are still equal, all begin with their numbers.
+    """Returns a unique name for each path, made of letters, digits, '.', '_' and '-'.
+
+    A name is the file name without suffix. If two names are equal, all names get their folders in
+    front. If two are still equal, all names get the numbers of their paths in front.
     """
 
     def plain(name, i):

@@ -64,8 +64,8 @@ class PreparedCapture:
     skirt: bool = False
     """Whether `body` has a skirt, whose vertices are its last."""
     network: tuple[Any, ...] | None = None
-    """All of the network's configuration that `body` and `displacement` depend on. None: there is
-    no body.
+    """The settings of the network that `body` and `displacement` depend on. None: there is no
+    body.
     """
 
     __repr__ = short_repr

@@ -151,9 +151,9 @@ def made(
     workers: int,
     load: Callable[[], object],
 ) -> Iterator[tuple[K, Exception | None]]:
-    """Run tasks in parallel. Yields the name of each task as it ends, with None or the ValueError,
-    ArithmeticError or LookupError that it raised. Any other error ends all tasks, such as an
-    OSError of a full disk.
+    """Run tasks in parallel. Yields (name, error) for each task as it ends. The error is None, or
+    the ValueError, ArithmeticError or LookupError that the task raised. Any other error, such as an
+    OSError of a full disk, ends all tasks and is raised.
 
     Arguments: work: called as work(what `load` has returned, *arguments of the task). tasks: the
     arguments by name. workers: the number of processes, which use the CPU; `load` is called once in

@@ -2,15 +2,16 @@
 them.
 
 Each leg of a body is a tube, and no vertex spans the gap between the legs. On a body alone, a long
-skirt becomes a pair of ragged trousers. The vertices of the skirt are linear combinations of
-vertices of the legs, in shape, pose directions and skinning weights. In the gap each combines one
-point on each leg, so that the skirt bends smoothly between them. The rows of the skirt lie on the
-convex section of both legs. From there they are displaced along their normals to the edges of the
-masks, as the body is (`data.vertex_offsets`).
+skirt becomes a pair of ragged trousers. Each vertex of the skirt is a linear combination of
+vertices of the legs. Its shape directions, pose directions and skinning weights are combined with
+the same weights. A vertex in the gap combines one point on each leg, so that the skirt bends
+smoothly between them. A row of the skirt follows the outer halves of both legs, and is straight
+between them. From there the vertices are displaced along their normals to the edges of the masks,
+as the body is (`data.vertex_offsets`).
 
-The photos show a skirt where points between the legs, and beside both, lie inside the masks. It
-ends above the first row where they do not. Legs that no photo shows apart have no skirt. All of
-this runs on the host, by numpy and scipy.
+The photos show a skirt where points between the legs, but beside both of them, lie inside the
+masks. The skirt ends above the first row whose points do not. If no photo shows the legs apart,
+there is no skirt. All of this runs on the host, by numpy and scipy.
 """
 
 import jax
@@ -40,38 +41,38 @@ from humangs_jax.geometry.mesh import vertex_areas
 LEGS = (("left_hip", "left_knee", "left_ankle"), ("right_hip", "right_knee", "right_ankle"))
 TRUNK = ("pelvis", "spine1")
 TOP = 0.08
-"""The height where a skirt may begin: 0 at the hips, 0.5 at the knees, 1 at the ankles. Above it
-the body is around both legs.
+"""The height where a skirt begins: 0 at the hips, 0.5 at the knees, 1 at the ankles. Above it the
+body itself surrounds both legs.
 """
 BOTTOM = 0.97
-"""The height where a skirt may end, in the same measure as `TOP`."""
+"""The lowest height where a skirt may end, in the measure of `TOP`."""
 ROWS = 28
-"""The number of rows of a skirt, the same for all, so that all skirts share one program."""
+"""The number of rows of a skirt. It is the same for all, so that all skirts share one program."""
 GAP = 11
-"""Vertices of a row in each of the gaps between the legs."""
+"""Number of vertices of a row in each of the two gaps between the legs, in front and behind."""
 HALF = 13
-"""Vertices of a row on the outer half of each leg."""
+"""Number of vertices of a row on the outer half of each leg."""
 SKIRT_VERTICES = ROWS * 2 * (GAP + HALF)
-"""The vertices of a skirt, the last ones of a body that has one."""
+"""Number of vertices of a skirt. They are the last ones of a body that has a skirt."""
 BESIDE = 0.02
-"""Points count if they are at least this many metres beside the legs. Trousers reach as far."""
+"""A point between the legs counts if it is farther than this from the skin of both legs in the
+photo, metres. Trousers reach as far from the skin.
+"""
 SHOWN = 0.8
-"""A row is part of a skirt if this share of its points is inside the masks."""
+"""A row is part of a skirt if at least this share of its counted points is inside the masks."""
 VOTES = 4
-"""A row counts if all photos together have at least this many of its points beside the legs."""
+"""A row is judged if at least this many of its points count, in all photos together."""
 LEAST_ROWS = 4
-"""The least number of rows with a point inside the masks that is `CLEAR` of both legs. It tells
-skirts from wide trousers, which look worse with a skirt.
+"""The least number of rows of a skirt that have a point inside a mask and `CLEAR` of both legs.
+Wide trousers have fewer, and would look worse with a skirt.
 """
 CLEAR = 0.06
-"""Metres by which such a point is beside both legs."""
+"""Least distance of such a point from the skin of both legs, metres."""
 LONG_CLEAR = 0.1
-"""Metres by which such a point is beside both legs if no photo shows the legs apart below the hem.
-It takes the place of `CLEAR`.
-"""
+"""Least distance in place of `CLEAR` if no photo shows the legs apart below the hem, metres."""
 REACH = OffsetFitConfig(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)
 HELD = 1e4
-"""Weight of no displacement of the body's vertices in the fit of the skirt."""
+"""Weight that keeps the body's vertices where they are in the fit of the skirt."""
 
 
 def add_skirt(
@@ -166,8 +167,8 @@ def find_hem(body: BodyModel, capture: Capture) -> float | None:
 
 
 def with_tube(body: BodyModel, hem: float) -> BodyModel:
-    """Returns the body with a tube around its legs, from `TOP` down to `hem`. The tube's vertices
-    come after those of the body.
+    """Returns the body with a tube around its legs, from `TOP` down to `hem`, in the measure of
+    `TOP`. The tube's vertices come after those of the body.
 
     Raises: ValueError if the body has no legs that hang in the T-pose.
     """
@@ -222,8 +223,8 @@ def _legs(body: BodyModel) -> Int[np.ndarray, "2 3"] | None:
 def _along(
     joints: Float[np.ndarray, "j 3"], legs: Int[np.ndarray, "2 3"], levels: Float[np.ndarray, " r"]
 ) -> Float[np.ndarray, "2 r 3"]:
-    """Returns the points on the line from hip to knee to ankle of each leg, (2, r, 3), metres.
-    levels: their heights, in the measure of `TOP`.
+    """Returns points on each leg's line from hip to knee to ankle, (2, r, 3), metres. levels: the
+    heights of the points, in the measure of `TOP`.
     """
     lines = np.zeros((len(legs), len(levels), 3))
     for side, leg in enumerate(legs):
@@ -239,8 +240,8 @@ def _radii(
     legs: Int[np.ndarray, "2 3"],
     levels: Float[np.ndarray, " r"],
 ) -> Float[np.ndarray, "2 r"]:
-    """Returns the mean horizontal distance of the skin of each leg from its line, (2, r), metres.
-    Each vertex counts at the nearest of the heights, see `_along`.
+    """Returns the mean horizontal distance between the skin of each leg and the leg's line at each
+    height, (2, r), metres. A vertex of the skin counts at the nearest height only, see `_along`.
     """
     lines = _along(joints, legs, levels)
     radii = np.zeros(lines.shape[:2])
@@ -255,7 +256,8 @@ def _radii(
 
 
 def _tube(body: BodyModel, levels: Float[np.ndarray, " r"]) -> sparse.csr_array:
-    """Returns a matrix (r * loop, n) that makes the vertices of a tube of the vertices of the body.
+    """Returns a matrix (r * loop, n) that computes the vertices of a tube from the vertices of the
+    body. Each of the r rows of the tube is a closed loop.
 
     A loop goes over the front from the left to the right, around the right leg, over the back, and
     around the left leg.

@@ -1,15 +1,16 @@
 """Finds how far the skin of a body must move to fill the masks.
 
-The body is displaced: its vertices are moved along their normals until its silhouettes meet those
-of all photos. Where a vertex lies on the body's own silhouette in a photo, the mask's edge along
-its normal says how far it should move. A sparse least-squares fit carries this over the rest of the
-mesh, smoothly:
+The vertices of the body are moved along their normals until the body's silhouettes meet the masks
+of all photos. A vertex may lie on the body's silhouette in a photo. The edge of the mask along the
+vertex's normal then says how far the vertex should move, its target. A sparse least-squares fit
+gives all vertices moves t along their normals. It minimizes this sum over the surface:
 
-    sum over photos of (t - target)^2 + WEAKNESS t^2 + SMOOTHNESS^4 (Laplacian t)^2,    per area,
+    sum over photos of (t - target)^2 + (WEAKNESS + held) t^2 + smoothness^4 (Laplacian t)^2
 
-so that a section between two photos becomes round. What is then still outside a mask is moved
-inwards. Clothes become part of the body (as in "SMPL+D", https://arxiv.org/abs/1803.04758). All on
-the host, by numpy and scipy: nothing is compiled.
+So a section between two photos becomes round. `held` keeps hands and head where they are. Vertices
+that are still outside a mask then move inwards. Clothes become part of the body (as in "SMPL+D",
+https://arxiv.org/abs/1803.04758). All of this runs on the host, by numpy and scipy: nothing is
+compiled.
 """
 
 import dataclasses
@@ -29,40 +30,43 @@ from humangs_jax.geometry.mesh import unit, vertex_area_vectors, vertex_areas
 from humangs_jax.io.images import resized
 
 STEP = 0.0025
-"""Metres along a normal, of the search for a mask's edge."""
+"""Distance between the points along a normal at which a mask's edge is looked for, metres."""
 WEAKNESS = 0.002
-"""Weight of no displacement, beside 1 for each photo that shows a vertex on the silhouette."""
+"""Weight that keeps a vertex where it is. Each photo that shows the vertex on the silhouette has
+weight 1.
+"""
 HELD = 20.0
-"""Weight of no displacement for vertices of hands and head, times the share of their skinning
-weights that belongs to these parts.
+"""Weight that keeps vertices of hands and head where they are. It is multiplied by the share of the
+vertex's skinning weights that belongs to these parts.
 """
 HELD_JOINTS = ("head", "jaw", "eye", "wrist", "index", "middle", "pinky", "ring", "thumb")
 NEAR = 2.5
-"""Pixels. A vertex may be on the body's silhouette if it is no farther from the silhouette's
-edge.
+"""A vertex may be on the body's silhouette if it is nearer to the silhouette's edge than this,
+pixels.
 """
 PROBE = 0.012
-"""Metres by which a vertex near the silhouette's edge is moved along its normal to see whether it
-leaves the silhouette.
+"""A vertex near the silhouette's edge is moved outwards along its normal by this, metres, to see
+whether it leaves the silhouette.
 """
 LEAVES = 0.6
-"""A vertex is on the silhouette if the move by PROBE takes it at least this share of PROBE
-outwards."""
+"""A vertex is on the silhouette if this move takes it outwards, in the image, by more than this
+share of `PROBE`.
+"""
 DRAWN = 0.5
-"""Pixels by which polygons are drawn larger than they are."""
+"""Silhouettes are drawn larger than they are by this much, pixels."""
 WRAP = 0.07
-"""The largest move of the last step, metres. Vertices outside a mask move inwards until all masks
-contain them by the inset.
+"""Largest move of the last step, metres. In this step, vertices outside a mask move inwards until
+they are inside all masks by the least inset.
 """
 WRAP_ROUNDS = 6
 """How often the moves of the last step are averaged over the neighbours."""
 OUTSIDE = 0.01
 """A vertex is outside of a mask if it is farther outside than this, metres."""
 MISFIT = 0.025
-"""A body does not fit its masks if at least this share of its vertices (no head, no hands) lies
-more than OUTSIDE outside of a mask. Clothes never cause that: of true bodies the share is 0. It was
-at least 0.03 for bodies that are a centimetre off, 0.02 to 0.06 for a real man fitted to keypoints
-alone, and at most 0.02 for his fits refined by the masks.
+"""A body does not fit its masks if at least this share of its vertices (without head and hands)
+lies more than `OUTSIDE` outside of a mask. Clothes do not raise the share, and it is 0 for true
+bodies. It was at least 0.03 for bodies that are a centimetre off. For a real man it was 0.02 to
+0.06 with fits to keypoints alone, and at most 0.02 with fits refined by the masks.
 """
 LONGEST = 480
 """The longest side of the window around the person in which silhouettes are compared, pixels."""
@@ -82,15 +86,19 @@ class OffsetFitConfig:
     """
 
     outwards: float = 0.05
-    """The largest move outwards along a normal, metres. A mask's edge is looked for within it."""
+    """The largest move outwards along a normal, metres. A mask's edge is looked for up to this
+    distance.
+    """
     inwards: float = 0.06
-    """The largest move inwards, metres."""
+    """The largest move inwards along a normal, metres. A mask's edge is looked for up to this
+    distance.
+    """
     smoothness: float = 0.03
     """The length over which a move spreads to the vertices around it, metres."""
     inset: tuple[float, float] = (0.005, 0.025)
     """The least and the most that the surface may lie inside the masks, metres."""
     iterations: int = 2
-    """How often edges are looked for and the surface is then moved."""
+    """How many times edges are looked for and the surface is moved."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,19 +110,18 @@ class MaskedView:
     project: Float[np.ndarray, "3 4"]
     """From the world in metres to homogeneous pixels of the window, (3, 4)."""
     linear: Float[np.ndarray, "n 3 3"]
-    """The linear part of the move from the rest pose to the posed body, for each vertex, (n, 3, 3).
-    """
+    """The matrix that takes each vertex from the rest pose to the posed body, (n, 3, 3)."""
     offset: Float[np.ndarray, "n 3"]
-    """The offset of that move, (n, 3), metres."""
+    """The offset that is added after this matrix, (n, 3), metres."""
     low: Float[np.ndarray, "2"]
-    """The least x and y in the window of points that count as inside the photo, (2,), pixels. This
-    is `NEAR` inside the photo's corner.
+    """The least x and y of points in the window that count as inside the photo, (2,), pixels. They
+    lie `NEAR` inside the photo's upper left corner.
     """
     high: Float[np.ndarray, "2"]
-    """The largest x and y of such points, (2,), pixels."""
+    """The largest x and y of points in the window that count as inside the photo, (2,), pixels."""
     hidden: Float[np.ndarray, "h w"] | None = None
-    """The share of each pixel where somebody may be in front, (h, w), in [0, 1]. The ends of masks
-    say nothing there. None: nowhere.
+    """How much of each pixel or its neighbours somebody in front may hide, (h, w), in [0, 1]. The
+    ends of masks say nothing there. None: nothing is hidden.
     """
 
     @functools.cached_property
@@ -127,9 +134,10 @@ class MaskedView:
     def seen(
         self, points: Float[np.ndarray, "*n 3"], index: np.ndarray | slice = slice(None)
     ) -> tuple:
-        """Returns where points of the rest pose are in the window, (*n, 2), pixels, the pixels per
-        metre at each point (*n), and which points the photo shows (*n). index: the vertices whose
-        transforms move the points.
+        """Returns three values for points of the rest pose: their places in the window, (*n, 2),
+        pixels; the pixels per metre there, (*n); and whether the photo shows them, (*n).
+
+        index: the vertices whose transforms move the points.
         """
         posed = np.einsum("nab,n...b->n...a", self.linear[index], points)
         posed += self.offset[index].reshape(len(posed), *[1] * (points.ndim - 2), 3)
@@ -149,15 +157,16 @@ def fit_vertex_offsets(
     *,
     always: bool = True,
 ) -> Float[np.ndarray, "n 3"]:
-    """Returns the displacements of the vertices of a person's shaped body in the T-pose that fill
-    the masks, (n, 3), metres. Their lengths are bounded.
+    """Returns displacements of the vertices of a person's shaped body in the T-pose, (n, 3),
+    metres. They make the body fill the masks. Their lengths are bounded.
+
+    Displacements are 0 where the masks say nothing, or if the masks are not near the body.
 
     Arguments: body: the capture's body, or one of `data.views.gaussian_body`. capture: has masks;
     frames and worlds may be any. inset: the least and the most that the surface may lie inside the
-    masks, metres. always: whether a body that fits the masks already is moved, too, see `MISFIT`.
-    If not, it moves by 0, because it would gain less than the network's own clothes lose.
-
-    Bodies also move by 0 where the masks say nothing, or are not near the body.
+    masks, metres. always: whether a body that fits the masks already is displaced, too, see
+    `MISFIT`. If not, its displacements are 0, because they would gain less than the network's own
+    clothes lose.
     """
     assert capture.masks is not None
     rest = shaped(body, capture.betas)
@@ -182,11 +191,11 @@ def fit_vertex_offsets(
 def to_edges(
     views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: OffsetFitConfig
 ) -> Points:
-    """Returns the displacements of the vertices of a surface in the T-pose along its normals to the
-    masks' edges, (n, 3), metres. They are smooth.
+    """Returns smooth displacements of the vertices of a surface in the T-pose, (n, 3), metres. They
+    take the surface along its normals to the edges of the masks.
 
-    held: the weight of no displacement of each vertex, beside 1 for each photo that shows it on the
-    silhouette.
+    held: for each vertex, the weight that keeps it where it is. Each photo that shows the vertex on
+    the silhouette has weight 1.
     """
     total = np.zeros_like(rest)
     for _ in range(reach.iterations):
@@ -228,8 +237,9 @@ def _window(
     linear: Float[np.ndarray, "n 3 3"],
     offset: Points,
 ) -> MaskedView:
-    """Returns a view cut to the person, whose longest side has `LONGEST` pixels. project: from the
-    world to homogeneous pixels of the photo. linear, offset: see `MaskedView`.
+    """Returns a view cut to the person and resized, so that the window's longest side has `LONGEST`
+    pixels. project: from the world to homogeneous pixels of the photo. linear, offset: see
+    `MaskedView`.
 
     Outside of the photo the mask repeats the values at the photo's border.
     """
@@ -265,8 +275,8 @@ def _window(
 def _share_outside(
     views: list[MaskedView], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]
 ) -> float:
-    """Returns the share of the free vertices that are more than `OUTSIDE` outside of a mask. If
-    fewer than `MISFIT` are outside by any distance, their share is returned.
+    """Returns the share of the free vertices that are more than `OUTSIDE` outside of a mask. If the
+    share of the vertices outside by any distance is less than `MISFIT`, this share is returned.
     """
     if not free.any():
         return 0.0
@@ -289,8 +299,10 @@ def _targets(
     views: list[MaskedView], rest: Points, normals: Points, faces: Faces, how: OffsetFitConfig
 ) -> tuple[PerVertex, PerVertex]:
     """Returns for each vertex the number of photos that show it on the silhouette, and the sum of
-    the moves that these photos ask for, metres. A photo asks for the move after which the surface
-    is as far inside the mask's edge as `how.inset` allows.
+    the moves that these photos ask for, metres.
+
+    A photo asks for the smallest move after which the surface is inside the mask's edge by a
+    distance in the range `how.inset`.
     """
     count, summed = np.zeros(len(rest)), np.zeros(len(rest))
     reach = np.arange(-how.inwards, how.outwards + STEP / 2, STEP)
@@ -356,8 +368,8 @@ def _silhouette_distance(
 def silhouette(
     pixels: Float[np.ndarray, "n 2"], faces: Faces, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "h w"]:
-    """Returns an image of triangles, 1 on 0. They are drawn `DRAWN` pixels larger than they are.
-    shape: the height and the width of the image.
+    """Returns an image with 1 inside of triangles and 0 elsewhere. The triangles are drawn `DRAWN`
+    pixels larger than they are. shape: the height and the width of the image.
     """
     image = Image.new("L", (shape[1], shape[0]))
     pen = ImageDraw.Draw(image)
@@ -374,7 +386,11 @@ def _spread(
     held: PerVertex,
     reach: OffsetFitConfig,
 ) -> PerVertex:
-    """Returns the smooth displacement of the vertices that is nearest to their targets, metres."""
+    """Returns the move of each vertex along its normal that solves the least-squares problem of the
+    module's docstring, metres. The moves are limited by `reach`.
+
+    count, summed: as `_targets` returns them. held: see `to_edges`.
+    """
     areas = np.maximum(vertex_areas(vertices, faces), 1e-9)
     laplacian = _laplacian(vertices, faces)
     bending = reach.smoothness**4 * laplacian.T @ sparse.diags(1 / areas) @ laplacian
@@ -410,8 +426,8 @@ def _outside(
     free: Bool[np.ndarray, " n"],
 ) -> PerVertex:
     """Returns how far each vertex moves inwards so that all masks contain it, metres. Only free
-    vertices outside of a mask, and vertices near them, move, by at most `WRAP`. The moves are
-    smooth over the mesh.
+    vertices outside of a mask move, and vertices near them, because the moves are smoothed over the
+    mesh. The largest move is `WRAP`.
     """
     reach = np.arange(0, WRAP + STEP / 2, STEP)
     inside = np.full((len(rest), len(reach)), np.inf)

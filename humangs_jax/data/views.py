@@ -64,8 +64,8 @@ class SubjectViews:
     None: there is no padding.
     """
     depths: Float[Array, "v h w"] | None = None
-    """The mean z of the person in each pixel where the mask is not 0, (v, h, w), metres; 0: unknown
-    there. None: unknown everywhere.
+    """The mean depth (z in the camera's axes) of the person in each pixel, (v, h, w), metres. It
+    counts only where the mask is not 0. 0: unknown. None: unknown everywhere.
     """
     displacement: Float[Array, "n 3"] | None = None
     """The displacement of the vertices of the shaped body in the T-pose, (n, 3), metres
@@ -96,15 +96,17 @@ def pad_views(views: SubjectViews, count: int) -> SubjectViews:
 
 @checked_arguments
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
-    """Returns the body whose vertices carry the Gaussians. As the weights need it, it is decimated,
-    and then its long edges are split. It has a map of its surface if the network works on one.
+    """Returns the body whose vertices carry the Gaussians. It has the mesh that the weights need:
+    decimated, then with long edges split. It has a map of its surface if the network works on one.
 
-    Its `relative_vertex_spacing` is relative to the mesh that the weights were trained with. It is
-    None, which stands for 1, unless `runtime.max_edge_length` asks for more vertices or
-    `runtime.body_vertices` for fewer. The last four results are kept, because making one takes as
-    long as a small network does on a CPU. A body that `has_mesh_of` accepts is returned as it is.
+    The result's `relative_vertex_spacing` is relative to the mesh that the weights were trained
+    with. It is None, which stands for 1, unless `runtime.max_edge_length` asks for more vertices or
+    `runtime.body_vertices` for fewer.
 
-    Raises: ValueError if `runtime` has both.
+    The last four results are kept, because making one takes as long as a small network does on a
+    CPU. A body that `has_mesh_of` accepts is returned as it is.
+
+    Raises: ValueError if `runtime` has both settings.
     """
     asked = config.runtime
     if None not in (asked.body_vertices, asked.max_edge_length):
@@ -286,8 +288,8 @@ CROP_MARGIN = 0.04
 def _crop_boxes(masks: Float[np.ndarray, "v h w"] | None) -> list[tuple[int, int, int]] | None:
     """Returns the square (left, top, side) around the person in each mask, pixels.
 
-    Returns None if there are no masks, if one is empty, or if no square has a side below the longer
-    side of the photos.
+    Returns None if there are no masks, if a mask is empty, or if no square is smaller than the
+    photos' longer side.
     """
     if masks is None:
         return None
@@ -305,9 +307,11 @@ def _crop_boxes(masks: Float[np.ndarray, "v h w"] | None) -> list[tuple[int, int
 
 def cropped(capture: Capture, size: int) -> Capture:
     """Returns the capture with each photo cut to a square around the person in its mask, and
-    resized to `size` pixels. Pixels beyond a photo's edges become unknown if the person touches the
-    edge of a photo, or if the capture has unknown pixels. Returns the capture as it is if
-    `_crop_boxes` finds no such squares.
+    resized to `size` pixels. Returns the capture as it is if there are no masks, if a mask is
+    empty, or if no square would be smaller than the photos' longer side.
+
+    Pixels beyond a photo's edges become unknown if the person touches the edge of any photo, or if
+    the capture has unknown pixels.
     """
     boxes = _crop_boxes(capture.masks)
     if boxes is None or capture.masks is None:
@@ -421,11 +425,14 @@ def to_network_views(
     displacement: Float[np.ndarray, "n 3"] | None = None,
 ) -> SubjectViews:
     """Returns a capture's photos in the form that the network takes: padded with white to a centred
-    square, or cropped, and resized to `size` pixels. Unknown pixels are not passed on.
+    square, or cropped, and resized to `size` pixels. The cameras are changed accordingly. Unknown
+    pixels are not passed on.
 
-    Camera matrices follow the pixels. Without masks only what the posed body covers will count as
-    foreground. crop: whether photos are cut to the person where that is less than the photo, see
-    `_crop_boxes`. displacement: that of the body that carries the Gaussians, see `SubjectViews`.
+    Without masks, all masks are 0, and only what the posed body covers will count as foreground.
+
+    crop: whether photos are cut to squares around the person. This is not done where `_crop_boxes`
+    returns None. displacement: the displacement of the body that carries the Gaussians, see
+    `SubjectViews`.
     """
     boxes = None
     if crop:

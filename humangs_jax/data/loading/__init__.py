@@ -74,8 +74,8 @@ class Loader:
     everything is on the default device.
     """
     first_step: int = 0
-    """The step whose first example has the number `first_example`. Later examples are numbered from
-    there. It is above 0 if earlier steps had batches of another size.
+    """The step whose first example has the number `first_example`. The examples of later steps are
+    numbered from there. Earlier steps may have had batches of another size.
     """
     first_example: int = 0
     """The number of the first example of `first_step`."""

@@ -1,14 +1,16 @@
 """The published protocol: alignment, cameras around a scan, splits, evaluation indices (numpy,
-float64); photos of a scan.
+float64). Also draws photos of a scan.
 
-Scans: the middle of the raw scan's bounding box becomes the origin, then the smallest rotation
-takes pelvis -> neck of the fitted body to +y. Videos: the same rotation of frame 0 first, then the
-middle of the bounding box of the rotated body of frame 0.
+Scans are aligned in two steps. First the middle of the raw scan's bounding box goes to the origin.
+Then the smallest rotation takes the direction from pelvis to neck of the fitted body to +y. Videos
+are first turned by this rotation for frame 0. Then the middle of the bounding box of frame 0's
+turned body goes to the origin.
 
-Photos of a scan: our rasterizer, several samples a pixel, a texture shrunk to the samples. Color =
-texture (ambient + headlight |n . v|), n the smooth normal and v the direction to the camera, both
-sides alike. The published protocol names an ambient light of 0.3 and one headlight, and no strength
-of the latter: with 0.7 a surface that faces the camera has the color of its texture.
+Photos of a scan are drawn by our rasterizer, with several samples a pixel, and with a texture that
+is shrunk to the size of the samples. Color = texture (ambient + headlight |n . v|), where n is the
+smooth normal and v the direction to the camera. Both sides of the surface look alike. The published
+protocol names an ambient light of 0.3 and one headlight, but not how strong the headlight is. Here
+it is 0.7, so that a surface that faces the camera has the color of its texture.
 """
 
 import dataclasses
@@ -36,19 +38,22 @@ from humangs_jax.rendering.mesh.rasterizer import (
 T = TypeVar("T")
 
 PELVIS = 0
-"""The number of the joint in the middle of bodies."""
+"""Index of the pelvis among the joints."""
 NECK = 12
-"""Number of the joint of the neck."""
+"""Index of the neck among the joints."""
 VERTICAL_FOV = np.deg2rad(60.0)
 ELEVATIONS = (-5.0, 15.0)
-"""The range of the cameras' elevations, degrees, uniform."""
+"""Range of the elevations of the cameras, degrees. They are drawn uniformly."""
 FACTORS = (1.0, 1.75)
-"""The range of the cameras' distances in bounding radii, uniform, as the paper has it.
+"""Range of the distances of the cameras from the scan, in bounding radii, as the paper has it. They
+are drawn uniformly.
 
 At a field of view of 60 degrees, distances below 1.7 cut heads and feet.
 """
 NEAR_FACTORS = (2.0, 2.0)
-"""The distances of the paper's "near" test set, which the release uses for all sets."""
+"""Range of the distances in the paper's "near" test set, in bounding radii. The release uses it for
+all sets.
+"""
 VIEWS = 60
 """Views of every scan."""
 SIZE = 512
@@ -192,7 +197,9 @@ many scans.
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ScanRenderer:
-    """An aligned scan on the device, with a texture for each view's distance."""
+    """Draws an aligned scan on the device. The texture is halved more often for views from farther
+    away.
+    """
 
     vertices: Float[Array, "n 3"]
     """The aligned vertices, (n, 3), padded."""
