@@ -87,7 +87,9 @@ def views_without_person(capture: Capture) -> dict[int, str]:
 
 
 def empty_views(masks: Float[np.ndarray, "v h w"] | None) -> list[int]:
-    """Returns the numbers of the views whose mask shows nobody. Without masks there are none."""
+    """Returns the indices of the views whose masks have no pixel above `MASK_THRESHOLD`. The list
+    is empty if there are no masks.
+    """
     if masks is None:
         return []
     return [i for i, mask in enumerate(masks) if not (np.asarray(mask) > MASK_THRESHOLD).any()]

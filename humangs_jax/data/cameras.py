@@ -2,7 +2,7 @@
 captures, lens distortion, and checks.
 
 Readers return a `Calibration`. Its cameras have OpenCV's axes (x right, y down, z forward). Its
-lengths, the world's up axis and the place of pixel centres are those of the source.
+unit of length, the world's up axis and the place of pixel centres are as in the file.
 `in_capture_convention` changes these to metres, y up and pixel centres at +0.5.
 """
 
@@ -97,8 +97,8 @@ class CalibratedCamera:
     lens: str = "pinhole"
     """The kind of the lens, as `geometry.lens` names it."""
     refusal: CaptureError | None = None
-    """The error to raise where photos have to be undistorted, for lenses whose photos are not
-    undistorted here (fisheyes, more coefficients).
+    """The error to raise if photos have to be undistorted, but this package cannot undistort photos
+    of this lens (fisheyes, more than five coefficients). None: it can.
     """
 
 
@@ -232,8 +232,8 @@ def read_calibration(
     """Read the calibration in a file or folder. Its content decides which of the `CAMERAS` formats
     it has.
 
-    photo_size: as in `CalibrationFile`. any_lens: whether lenses are allowed whose photos are not
-    undistorted here; such lenses are refused otherwise.
+    photo_size: as in `CalibrationFile`. any_lens: whether lenses are allowed if this package cannot
+    undistort their photos.
 
     Raises: CaptureError, one line that names the file and what was expected.
     """
@@ -441,8 +441,8 @@ def undistort(
     """Returns the photo that a pinhole camera with the same K (pixel centres at +0.5) would have
     taken, interpolated bilinearly, float32.
 
-    Pixels that the photo does not show, and those outside of `box` (rows, columns), get the value
-    `fill`.
+    Pixels get the value `fill` if the photo does not show them, or if they lie outside of `box`
+    (rows, columns).
     """
     from skimage.transform import warp
 
@@ -466,8 +466,8 @@ def undistort_person(
     K: Float[np.ndarray, "3 3"],
     coefficients: Float[np.ndarray, "5"],
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """Returns a photo on white and its mask without distortion. `undistort` runs in the box around
-    the person alone, which is faster.
+    """Returns a photo on white and its mask, both without distortion. Only pixels near the person
+    are computed, because this is faster; the others are white.
     """
     step = 16
     rows, columns = (np.arange(0.0, size + step, step) for size in mask.shape)
@@ -492,8 +492,10 @@ def _in_photo(
     K: Float[np.ndarray, "3 3"],
     coefficients: Float[np.ndarray, "5"],
 ) -> Float[np.ndarray, "*n 2"]:
-    """Returns where in the photo the lens puts pixels of a pinhole camera with the same K. Both are
-    in pixels, with pixel centres at +0.5. Pixels that the lens cannot show are put far outside.
+    """Returns the places of points in a distorted photo, pixels, (*n, 2). pixels: the places of
+    these points in the photo of a pinhole camera with the same K.
+
+    Pixel centres are at +0.5. Points that the lens cannot show are put far outside.
     """
     plane = (pixels - K[:2, 2]) / np.diag(K)[:2]
     source = distort(plane, coefficients) * np.diag(K)[:2] + K[:2, 2]

@@ -430,8 +430,8 @@ def _load_model(file: object, name: str, folder: Path | None = None) -> BodyMode
 
 
 def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
-    """Returns the name of the model in a body.npz, and the arguments that `body_parameters` takes,
-    which are not checked yet.
+    """Returns the name of the model in a body.npz, and its other values as arguments of
+    `body_parameters`. These are not checked yet.
 
     Raises: CaptureError.
     """
@@ -544,8 +544,8 @@ def parameter_arrays(
     rotations: Any,
     translations: Any,
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays of body.npz for a capture that will be in `folder`, by their keys. A model
-    file is named relative to this folder.
+    """Returns the arrays of a body.npz by their keys. folder: the folder of the capture that the
+    file will be in. A model file is named by its path relative to this folder.
     """
     if body_file != DEFAULT_BODY:
         body_file = Path(os.path.relpath(Path(body_file).resolve(), folder.resolve())).as_posix()

@@ -166,12 +166,12 @@ def photos_in(folder: Path) -> dict[str, Path]:
 
 
 def is_photo(path: Path) -> bool:
-    """Returns whether the name of a file is that of a photo."""
+    """Returns whether a file has the name of a photo."""
     return path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".")
 
 
 def is_video(path: Path) -> bool:
-    """Returns whether the name of a file is that of a video."""
+    """Returns whether a file has the name of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
 
 

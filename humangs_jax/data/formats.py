@@ -31,7 +31,8 @@ F = TypeVar("F", bound="SourceFormat")
 
 @dataclasses.dataclass(frozen=True)
 class SourceFormat(Format):
-    """A format whose files have usual names, but are known by their content.
+    """A format whose files usually have certain names. A file belongs to the format if its content
+    fits.
 
     Its code is "module:read_NAME".
     """
@@ -299,7 +300,9 @@ class ArrayKeys:
     six: bool = False
     """Whether rotations are six numbers each, (j, 6, m) or (m, j, 6) for m frames."""
     stays: bool = False
-    """Whether people of files without positions stay in place; if not, such files are refused."""
+    """Whether a person stays in place if the file has no positions. If not, such files are
+    refused.
+    """
     kind: str = "poses"
     """The kind of reader: "poses" for rotations of parts, "ours" for whole rotations, "points" for
     joints in space.

@@ -49,7 +49,7 @@ body, too, and its colors are seen along the edge of the mask.
 INTO_MASK = 0.008
 """The part of `RIM` that may lie on the mask, metres."""
 LOOSE = 0.04
-"""Metres outside the silhouette up to which the mask may show clothes and hair."""
+"""Distance outside of the silhouette up to which the mask may show clothes and hair, metres."""
 NEARBY = 0.25
 """Distance from a hole within which the mask beside the body is measured, metres, see `BESIDE`."""
 BESIDE = 0.35
@@ -57,12 +57,12 @@ BESIDE = 0.35
 more, the hole is not something in front: an arm or a leg has another pose than the body.
 """
 AGREES = 0.75
-"""The least share of the mask that lies on the body or within `LOOSE` of it. With less, the body is
-not where the person is.
+"""At least this share of the mask has to lie on the body or within `LOOSE` of it. If not, the body
+is not where the person is, and no holes are looked for.
 """
 SHOWN = 0.3
-"""The least share of the body's silhouette that the mask shows. With less, most of the body would
-be a guess.
+"""The mask has to show more than this share of the body's silhouette. If not, most of the body
+would be a guess, and no holes are looked for.
 """
 
 
@@ -130,7 +130,9 @@ def hidden_parts(capture: Capture) -> Bool[np.ndarray, "v h w"] | None:
 def _hidden_part(
     capture: Capture, view: int, vertices: Float[np.ndarray, "n 3"], faces: np.ndarray
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns `hidden_parts` of one photo. vertices: those of the posed body, metres."""
+    """Returns `hidden_parts` of one photo. vertices: the vertices of the posed body, (n, 3),
+    metres.
+    """
     assert capture.masks is not None
     height, width = capture.masks.shape[1:]
     scale = min(1.0, LONGEST / max(height, width))

@@ -1,5 +1,5 @@
-"""The photos of a capture folder: capture.json, then images, masks and cameras, and the frame that
-each view shows.
+"""Reads and writes the photos of a capture folder: capture.json, images, masks, cameras, and the
+frame that each view shows.
 
 No body is needed to read them. `humangs import cameras` writes such a folder without a body, and
 `humangs fit` adds the body. Every fault is a `CaptureError`, one line with file and field.
@@ -184,7 +184,7 @@ def write_description(
     background: Background = "photo",
     calibrated: bool = True,
 ) -> None:
-    """Write a capture.json with these views, whose keys are those of the format. It names body.npz
+    """Write a capture.json with these views, which have the keys of the format. It names body.npz
     as the file of the body.
     """
     description: dict[str, Any] = {

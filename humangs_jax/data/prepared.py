@@ -62,7 +62,7 @@ class PreparedCapture:
     body.
     """
     skirt: bool = False
-    """Whether `body` has a skirt, whose vertices are its last."""
+    """Whether `body` has a skirt. The skirt's vertices are the last ones of the body."""
     network: tuple[Any, ...] | None = None
     """The settings of the network that `body` and `displacement` depend on. None: there is no
     body.
@@ -140,9 +140,11 @@ def prepare_capture(
 
     Args:
         capture: photos, cameras, poses, and masks if there are some.
-        config: of the network that will read the photos; None leaves the body alone.
-        views: the most photos that are used; those that together show the body best are chosen.
-            "auto": as many as add to what the others show. None: all.
+        config: the configuration of the network that will read the photos. None: the body is not
+            prepared.
+        views: the largest number of photos that are used. The photos that together show the body
+            best are chosen. "auto": photos are chosen as long as each adds to what the others show.
+            None: all.
 
     Returns:
         The prepared capture.
@@ -192,8 +194,8 @@ def prepare_capture(
 
 
 def allows_vertex_offsets(config: HumanGSConfig) -> bool:
-    """Returns whether the body may be displaced and get a skirt. It may if the network looks at the
-    person's pixels alone and `runtime.displacement` is not False.
+    """Returns whether the body may be displaced and get a skirt. It may if the network looks only
+    at the person's pixels and `runtime.displacement` is not False.
     """
     return config.runtime.displacement is not False and config.conventions.pixels == "person"
 

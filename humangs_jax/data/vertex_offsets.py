@@ -81,8 +81,8 @@ PerVertex = Float[np.ndarray, " n"]
 
 @dataclasses.dataclass(frozen=True)
 class OffsetFitConfig:
-    """How a surface moves to the edges of the masks. The defaults are those of bodies: the network
-    adds clothes on top, since it knows naked bodies.
+    """How a surface moves to the edges of the masks. The defaults are for bodies. They are small,
+    since the network knows naked bodies and adds clothes on top.
     """
 
     outwards: float = 0.05

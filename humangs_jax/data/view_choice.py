@@ -18,24 +18,25 @@ SELECTION_SIZE = 128
 SELECTION_VERTICES = 2000
 """The number of vertices of the body on which photos are compared."""
 LEAST_GAIN = 0.03
-"""The least share that a further photo has to add to what the chosen photos show.
+"""Least gain of a further photo, as a share of what the chosen photos show.
 
 It counts only if no number of photos is given.
 """
 
 
 def best_views(capture: Capture, count: int | None) -> list[int]:
-    """Returns the numbers of the `count` photos that together show the body best, in ascending
+    """Returns the indices of the `count` photos that together show the body best, in ascending
     order. If there are no more than `count`, all are returned.
 
-    The choice is greedy: each further photo is the one that adds most to the sum, over the
-    vertices, of area times the best `view_quality`. The sum is submodular, so the choice reaches at
-    least 63 % of the best one (Nemhauser, Wolsey, Fisher 1978, https://doi.org/10.1007/BF01588971).
-    What a photo shows outside its mask does not count.
+    The choice is greedy. The sum that it raises is, over the vertices, the vertex's area times the
+    best `view_quality` among the chosen photos. Each further photo is the one that adds most to the
+    sum. The sum is submodular, so the choice reaches at least 63 % of the best one (Nemhauser,
+    Wolsey, Fisher 1978, https://doi.org/10.1007/BF01588971). What a photo shows outside its mask
+    does not count.
 
     Arguments:
         capture: photos that all show the person.
-        count: None leaves out the photos that add less than `LEAST_GAIN` to what the others show.
+        count: None: no further photo is chosen once the best one adds less than `LEAST_GAIN`.
 
     Raises: ValueError for a count below 1.
     """

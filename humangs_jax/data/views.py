@@ -380,9 +380,9 @@ def world_up(roots: Float[np.ndarray, "v 3"], cameras: Camera) -> str:
     """Returns the axis that points up in the world of some views, such as "x" or "-z"; "y" where
     the axis is not certain.
 
-    Captures should have y up. A capture with z up is as consistent, but the network has seen no
-    such world, and an avatar's light is that of a world with y up. Another axis counts as up only
-    if both the person and the cameras stand along it, because a person alone may lie.
+    Captures should have y up. The network has seen no world with another axis up, and an avatar's
+    light comes from a world with y up. Another axis counts as up only if both the person and the
+    cameras stand along it, because a person alone may lie.
 
     roots: the rotation of the person's root joint in each view, axis-angle, radians.
     """

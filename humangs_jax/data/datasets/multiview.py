@@ -25,12 +25,12 @@ components, flat_hand_mean TRUE (unlike THuman2.1), no poses of the eyes.
 
 ActorsHQ's csv has name,w,h,rx,ry,rz,tx,ty,tz,fx,fy,px,py: rotation vector and centre of
 world_from_cam in metres with OpenCV's axes, focal lengths and principal point as shares of width
-and height. Each scale has its own. Portrait and landscape are mixed.
+and height. Each scale has a csv. Images in portrait and landscape format are mixed.
 
-DNA-Rendering: CC has two digits, C and FRAME have no zeros before. RT is world_from_cam, D is k1 k2
-p1 p2 k3: photos and masks are undistorted. The mask is the greatest channel. fullpose: 55 x 3,
-hands relative to the mean hand (flat_hand_mean False), gendered model. `scale` and color
-calibration are unused, as in the readers of others. Needs the package h5py.
+DNA-Rendering: CC has two digits, C and FRAME have no leading zeros. RT is world_from_cam. D is k1 k2
+p1 p2 k3, by which photos and masks are undistorted. The mask is the greatest channel. fullpose is 55
+x 3, with hands relative to the mean hand (flat_hand_mean False), for the gendered model. `scale` and
+color calibration are unused; the readers of others do not use them either. Needs the package h5py.
 """
 
 import csv
@@ -87,9 +87,12 @@ PARAMETERS = "smpl_params.npz"
 MISSING = "missing_img_files.txt"
 """File that lists images that are missing."""
 ON_PERSON = 128.5 / 255
-"""A pixel whose mask value, in [0, 1], is above this is on the person: bytes above 128."""
+"""A pixel is on the person if its mask value, in [0, 1], is above this. As bytes, these are the
+values above 128.
+"""
 PHOTO = re.compile(r"(?:[\w-]+_(?:rgb|mask))?(\d+)\.\w+")
-"""Matches the file names of photos and masks, those of ActorsHQ included; the group is the frame.
+"""Pattern of the file names of photos and masks, also in ActorsHQ. Its group is the number of the
+frame.
 """
 T = TypeVar("T")
 Photo = tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]
@@ -106,8 +109,8 @@ _ANGLES = {
 def read_parameters(file: Path, body: FileBody) -> BodyParameters:
     """Returns the shape and all poses of a smpl_params.npz.
 
-    If shape or expression differ between frames, those of the first frame are taken, since a person
-    has one shape. Raises: CaptureError naming file and key.
+    A person has one shape. If shape or expression differ between frames, the values of the first
+    frame are taken. Raises: CaptureError naming file and key.
     """
     values = open_arrays(file)
     count = len(values.numbers("global_orient", (None, 3), LARGEST_ANGLE))
@@ -472,7 +475,7 @@ def find_dna_rendering(folder: str | Path) -> tuple[Path, ...]:
 
 
 class _Smc:
-    """An HDF5 file whose every value is checked for its size before it is read.
+    """An HDF5 file. The size of each value is checked before it is read.
 
     Raises: CaptureError naming file and key.
     """

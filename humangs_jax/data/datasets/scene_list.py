@@ -9,9 +9,11 @@ the body of each frame as arrays.
     evaluation_N.json       {scene: {"context": [views], "target": [views]}}, N input views
 
 Paths are relative to the list. Images are square, on white. The arrays are in the units of the
-scene, and `v_posed` is `v_cano` moved by `joint_transforms`, pose correctives apart. Unit, shape
-and pose are recovered from them, so that lists of other programs need nothing more; cameras become
-metric. We also write `mask_path`; where it is missing, what is not white is the person.
+scene. Except for pose correctives, `v_posed` is `v_cano` moved by `joint_transforms`.
+
+The reader recovers unit, shape and pose from the arrays, so that lists of other programs need
+nothing more, and converts cameras to metres. We also write `mask_path`. Where it is missing, the
+person is what is not white.
 """
 
 import functools

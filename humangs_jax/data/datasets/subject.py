@@ -398,8 +398,8 @@ class Subject:
         body: FileBody,
         size: int = STORED_SIZE,
     ) -> Capture:
-        """Returns some views as a `Capture`, which can be reconstructed and animated. Its poses are
-        those of the frames that the views show.
+        """Returns some views as a `Capture`, which can be reconstructed and animated. The capture
+        has the poses of the frames that these views show.
 
         Raises: ValueError naming file and field.
         """

@@ -189,10 +189,11 @@ class CaptureFolder:
 
 class PeopleCache:
     """The people of a source on disk. Each is checked when it is first asked for. Images are
-    decoded when they are needed, and kept as bytes until they take `limit_bytes`.
+    decoded when they are needed, and kept as bytes until they take `limit_bytes`. Several threads
+    may ask at once.
 
-    Several threads may ask at once. broken: what was first found wrong with people, by name, in the
-    order in which it was found.
+    broken: by name, the first fault that was found in a person, in the order in which faults were
+    found.
     """
 
     def __init__(self, people: Sequence[StoredPerson], limit_bytes: int = 4 << 30):
@@ -229,7 +230,7 @@ class PeopleCache:
             return self._summaries.setdefault(name, summary)
 
     def some_views(self, index: int, views: Sequence[int]) -> StoredSubject:
-        """Returns person `index` with these views alone, in this order.
+        """Returns person `index` with only these views, in this order.
 
         Raises: ValueError naming file and field.
         """

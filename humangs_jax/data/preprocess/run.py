@@ -226,8 +226,8 @@ def _subjects(source: Path, settings: PreprocessConfig) -> tuple[dict[str, Path]
 def _made_with(source: Path, body: FileBody, settings: PreprocessConfig) -> dict[str, Any]:
     """Returns the settings that all scenes depend on, as the manifest has them.
 
-    The data set is known by the name of its folder alone, since it may lie elsewhere on another
-    machine.
+    The manifest names only the folder of the data set and not its path, since the data set may lie
+    elsewhere on another machine.
     """
     shipped = body.file == DEFAULT_BODY
     known = {
