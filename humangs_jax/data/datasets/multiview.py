@@ -27,10 +27,11 @@ ActorsHQ's csv has name,w,h,rx,ry,rz,tx,ty,tz,fx,fy,px,py: rotation vector and c
 world_from_cam in metres with OpenCV's axes, focal lengths and principal point as shares of width
 and height. Each scale has a csv. Images in portrait and landscape format are mixed.
 
-DNA-Rendering: CC has two digits, C and FRAME have no leading zeros. RT is world_from_cam. D is k1 k2
-p1 p2 k3, by which photos and masks are undistorted. The mask is the greatest channel. fullpose is 55
-x 3, with hands relative to the mean hand (flat_hand_mean False), for the gendered model. `scale` and
-color calibration are unused; the readers of others do not use them either. Needs the package h5py.
+DNA-Rendering: CC has two digits, C and FRAME have no leading zeros. RT is world_from_cam. D is k1
+k2 p1 p2 k3, by which photos and masks are undistorted. The mask is the greatest channel. fullpose
+is 55 x 3, with hands relative to the mean hand (flat_hand_mean False), for the gendered model.
+`scale` and color calibration are unused; the readers of others do not use them either. Needs the
+package h5py.
 """
 
 import csv
