@@ -255,8 +255,8 @@ def check_values(
     """Checks that the numbers in arrays are finite and in their ranges. Nothing is checked if one
     of the arrays is traced.
 
-    An accelerator reduces all its arrays of JAX by one program, and only two numbers for each are
-    transferred. Other arrays are checked on the host, without a copy.
+    Arrays of JAX on an accelerator are reduced there by one program, which returns two numbers for
+    each array. Other arrays are checked on the host, without a copy.
 
     Arguments: owner: the function that was called, for the message. arrays: by its name in the
     message, each array and the values that its entries may have. None and empty arrays pass.

@@ -1,7 +1,8 @@
 """Draws random numbers by name, all at once.
 
-Each draw of another shape puts a function of some 230 lines into a program and costs time to
-compile. So code that needs many numbers draws them once, uniform in [0, 1).
+For each shape that random numbers are drawn in, JAX adds a function of some 230 lines to the
+program, which takes time to compile. So code that needs many numbers draws them once, uniform in
+[0, 1).
 """
 
 import math

@@ -21,7 +21,9 @@ class Format:
     """One format of files. Tables with further columns use a subclass."""
 
     about: str
-    """Whose files these are, in a few words. `--help` and the docs show it."""
+    """The programs or data sets that such files come from, in a few words. `--help` and the docs
+    show this.
+    """
     code: str | Callable[..., Any]
     """The function that reads or writes such files, or its name as "package.module:function"."""
     suffixes: tuple[str, ...] = ()

@@ -74,7 +74,7 @@ PixelCenters = Literal["integer", "half"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CalibratedCamera:
-    """One camera, or one image's camera where the format has one per image."""
+    """One camera. In formats with one camera for each image, the camera of one image."""
 
     name: str
     """The name of the camera, or the image's path as the file has it."""

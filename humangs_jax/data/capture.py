@@ -207,21 +207,23 @@ def capture_from_arrays(
         rotations: (m, j, 3) axis-angle in the body's joint order, radians.
         translations: (m, 3) metres.
         betas: (s,) shape coefficients.
-        shape_names: (s,) the body's directions that betas belong to. None: all of them, or the
-            first of SMPL-X's shape.
+        shape_names: (s,) names of the body's shape directions that betas belong to. None: betas
+            belong to all directions without expressions, or to the first ones of SMPL-X.
         masks: (v, h, w) in [0, 1], or None.
         frames: (v,) which of the m poses each view shows; may be left out when m is 1.
-        names: (v,) file names without suffix. None: "000", "001" and so on.
-        background: "photo": the masks put the images on white. "white": they are on white already.
-        fit_masks: first move masks of photos that are too large or too small to the edges in the
+        names: (v,) names of the views, which are file names without suffix. None: "000", "001" and
+            so on.
+        background: "photo": the images show their background, and the masks put the person on
+            white. "white": the images are on white already.
+        fit_masks: whether masks that are too large or too small are first moved to the edges in the
             photos.
-        body: the model. None: that of `body_file`.
+        body: the model. None: the model in `body_file`.
         body_file: where the model comes from. Default: the shipped body.
         displacement: (n, 3) metres, of the vertices of the shaped body in the T-pose, or None.
-        calibrated: False for cameras that were found from the person: refinement moves them
-            further.
+        calibrated: False if the cameras were found from the person. Refinement then moves them
+            further than calibrated ones.
         unknown: (v, h, w), true where somebody or something in front may hide the person, or None.
-            Masks are 0 there, and nothing is concluded from these pixels.
+            The capture's masks are 0 there, and nothing is concluded from these pixels.
         source: what errors call the arrays.
 
     Returns:
@@ -369,8 +371,8 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
     """Write a capture folder: PNG images and masks, capture.json and body.npz. If writing fails,
     the folder stays as it was.
 
-    The model file of a body other than the default one is referred to by its relative path, never
-    copied.
+    If the body is not the default one, body.npz has the relative path of its model file. The model
+    file is not copied.
 
     Args:
         path: the folder to write.

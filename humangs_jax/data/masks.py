@@ -354,7 +354,7 @@ RIM_HEIGHT = 440
 DEPTH = 2.0
 """Pixels outside the mask, and pixels inside that are nearer to its edge than this, are cleaned.
 The cleaning compares two means: the color of the person at least this far inside, and the color of
-the background at least this far outside. Units.
+the background at least this far outside. In units.
 """
 SPREAD = 1.5
 """Standard deviation of the Gaussian that weights these means, units."""
@@ -376,8 +376,9 @@ def clean_rims(
     """Returns a photo without the background's share in the colors of pixels along and beyond the
     edge of the mask.
 
-    A pixel's share says where its color lies between the mean color further inside and the mean
-    color further outside. The share of their difference is subtracted. All other detail stays.
+    A pixel's share says where its color lies between two means: the color further inside and the
+    color further outside. This share of the difference of the means is subtracted from the pixel.
+    All other detail stays.
     """
     inside = mask > 0.5
     if not inside.any() or inside.all():

@@ -1,9 +1,9 @@
-"""A set of many items that is made bit by bit: one folder, with a manifest of what the set is made
-with, and a folder for each finished item.
+"""A set of many items that is made bit by bit. It is one folder, with a manifest that says what the
+set is made with, and with a folder for each finished item.
 
 The same call continues an interrupted set: finished items are kept, and other settings are refused.
 Several processes may make parts of one set at the same time. Each ends by writing the manifest of
-what is there. A name alone does not tell what an item was made from, so code that keeps finished
+what is there. A name alone does not tell what an item was made from. So code that keeps finished
 items compares contents, too (`avatar.recorded_source`, `files_key`).
 """
 

@@ -65,8 +65,8 @@ OUTSIDE = 0.01
 MISFIT = 0.025
 """A body does not fit its masks if at least this share of its vertices (without head and hands)
 lies more than `OUTSIDE` outside of a mask. Clothes do not raise the share, and it is 0 for true
-bodies. It was at least 0.03 for bodies that are a centimetre off. For a real man it was 0.02 to
-0.06 with fits to keypoints alone, and at most 0.02 with fits refined by the masks.
+bodies. The share was at least 0.03 for bodies that are a centimetre off. For a real man it was 0.02
+to 0.06 with fits to keypoints alone, and at most 0.02 with fits refined by the masks.
 """
 LONGEST = 480
 """The longest side of the window around the person in which silhouettes are compared, pixels."""
@@ -192,7 +192,7 @@ def to_edges(
     views: list[MaskedView], rest: Points, faces: Faces, held: PerVertex, reach: OffsetFitConfig
 ) -> Points:
     """Returns smooth displacements of the vertices of a surface in the T-pose, (n, 3), metres. They
-    take the surface along its normals to the edges of the masks.
+    move the surface along its normals to the edges of the masks.
 
     held: for each vertex, the weight that keeps it where it is. Each photo that shows the vertex on
     the silhouette has weight 1.

@@ -65,8 +65,8 @@ def candidates_from_matrix(
     """Returns four quaternions for each rotation matrix, (..., 4, 4), and how well conditioned each
     of them is, q_abs, (..., 4).
 
-    For a rotation, candidate c is the quaternion q with component c made positive, and q_abs[c] is
-    2 |q[c]|. Where q_abs[c] is less than 0.1, candidate c is shorter than 1.
+    For the matrix of a rotation q, q_abs[c] is 2 |q[c]|. Where this is at least 0.1, candidate c is
+    q or -q, with component c positive. Elsewhere candidate c is shorter than 1.
 
     In detail, M is the symmetric matrix (4, 4) that equals 4 q q^T for a rotation. Its diagonal is
     1 ± m00 ± m11 ± m22, with no or two minus signs, and q_abs is sqrt(max(0, diagonal)). Candidate
@@ -182,7 +182,7 @@ def left_singular_vectors(
     values s >= 0, in no particular order: m m^T = U diag(s)^2 U^T.
 
     The results are not meant to be differentiated, because U is not unique where singular values
-    coincide. Where singular values are 0, their columns of U complete the others to a rotation.
+    coincide. Columns of U that belong to singular values of 0 complete the others to a rotation.
     """
     columns = [m[..., :, i] for i in range(3)]
     # cyclic Jacobi converges quadratically: 3x3 matrices reach float64's rounding after five sweeps

@@ -170,7 +170,7 @@ def coefficients(
     that the file does not have are 0.
 
     Raises: CaptureError for more numbers than the body has directions, unless they are 0, and for a
-    body whose directions are not those of SMPL-X.
+    body with other directions than SMPL-X.
     """
     if not any(name.startswith("shape_") for name in body.shape_names):
         problem = (

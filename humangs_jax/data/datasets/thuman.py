@@ -101,8 +101,8 @@ def scan_files(folder: Path, name: str) -> tuple[Path, Path]:
 
 
 def open_thuman(folder: str | Path) -> tuple[list[str], dict[str, str]]:
-    """Returns the names of the scans in a folder that holds model/ and smplx/, sorted, and the
-    reasons why others cannot be used, by name.
+    """Returns the sorted names of the scans that can be used in a folder that holds model/ and
+    smplx/. Also returns, by name, why other scans cannot be used.
 
     Raises: CaptureError if no scan can be used.
     """

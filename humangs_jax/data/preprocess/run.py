@@ -247,8 +247,8 @@ def _source_key(name: str, source: Path, settings: PreprocessConfig) -> str:
 
 
 def _check_source(file: Path, name: str, source: Path, settings: PreprocessConfig) -> None:
-    """Check that a finished scene was made from the files that the data set holds now. It passes if
-    there is no scene.json, or one without a checksum. file: the scene.json.
+    """Check that a finished scene was made from the files that the data set holds now. The check
+    passes if there is no scene.json, or if it has no checksum. file: the scene.json.
 
     Raises: CaptureError if the files differ.
     """
