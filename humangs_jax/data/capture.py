@@ -220,8 +220,8 @@ def capture_from_arrays(
         body: the model. None: the model in `body_file`.
         body_file: where the model comes from. Default: the shipped body.
         displacement: (n, 3) metres, of the vertices of the shaped body in the T-pose, or None.
-        calibrated: False if the cameras were found from the person. Refinement then moves them
-            further than calibrated ones.
+        calibrated: False if the cameras were found from the person. Refining the capture by its
+            masks may then move them farther than calibrated cameras.
         unknown: (v, h, w), true where somebody or something in front may hide the person, or None.
             The capture's masks are 0 there, and nothing is concluded from these pixels.
         source: what errors call the arrays.

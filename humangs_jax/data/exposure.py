@@ -49,7 +49,7 @@ THICKNESS = 0.02
 INSIDE = 5
 """Side of the square around each point that must lie in the mask, pixels."""
 WHOLE = 0.99
-"""A point is used if the mask is above this everywhere in this square."""
+"""A point is used if the mask is above this everywhere in the square with side `INSIDE`."""
 BLUR = 3
 """Side of the square over which colors are averaged, pixels."""
 USABLE = (0.06, 0.95)
@@ -100,8 +100,9 @@ def equalize_exposure(capture: Capture) -> Capture:
 
 
 def exposure_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
-    """Returns the gains by which a rendered avatar gets the exposure of each camera, (v, 3): one
-    for each view and channel. They are 1 for views that do not show the person.
+    """Returns the factors by which the colors of a rendering are multiplied to get the exposure of
+    each camera, (v, 3): one for each view and channel. They are 1 for views that do not show the
+    person.
     """
     if capture.gains is not None:
         return 1 / capture.gains

@@ -23,25 +23,27 @@ from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.io.images import resized
 
 PERSON_HEIGHT = 200
-"""Lengths below are in units: the person is this many units high. So a unit is a pixel if the
-person is this many pixels high.
+"""Height of the person in the units of the lengths below. So a unit is a pixel if the person is
+this many pixels high.
 """
 REACH = 4.0
-"""Largest distance that a silhouette is moved, units."""
+"""Largest distance that a silhouette is moved, in units (see `PERSON_HEIGHT`)."""
 STEP = 0.5
-"""Distance between the moves that are tried, units."""
+"""Distance between the moves that are tried, in units (see `PERSON_HEIGHT`)."""
 NEIGHBORHOOD = 4.0
-"""The move at a point depends on the colors along the silhouette around it, weighted by a Gaussian
-with this standard deviation, units.
+"""The move at a point depends on the colors along the silhouette around it. They are weighted by a
+Gaussian with this standard deviation, in units (see `PERSON_HEIGHT`).
 """
 SMOOTHING = 2.0
-"""Standard deviation of the Gaussian that smooths the moves, units."""
+"""Standard deviation of the Gaussian that smooths the moves, in units (see `PERSON_HEIGHT`)."""
 LEAST = 0.75
-"""A mask stays as it is if its silhouette is off by less than this on average, units. Exact masks
-would only lose (docs/stability.md).
+"""A mask stays as it is if its silhouette is off by less than this on average, in units (see
+`PERSON_HEIGHT`). Exact masks would only lose (docs/stability.md).
 """
 LEAST_MOVE = 0.5
-"""Parts of the silhouette that would move by less than this stay where they are, units."""
+"""Parts of the silhouette that would move by less than this stay where they are, in units (see
+`PERSON_HEIGHT`).
+"""
 MOST_PIXELS = 400
 """Height of the person at which the photo is searched, pixels. Larger photos are reduced to it."""
 LEAST_PART = 0.005
@@ -350,21 +352,23 @@ def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 # the person's.
 
 RIM_HEIGHT = 440
-"""Lengths below are in units: the person is this many units high."""
+"""Height of the person in the units of the lengths below."""
 DEPTH = 2.0
 """Pixels outside the mask, and pixels inside that are nearer to its edge than this, are cleaned.
 The cleaning compares two means: the color of the person at least this far inside, and the color of
-the background at least this far outside. In units.
+the background at least this far outside. In units, see `RIM_HEIGHT`.
 """
 SPREAD = 1.5
-"""Standard deviation of the Gaussian that weights these means, units."""
+"""Standard deviation of the Gaussian that weights the two means (see `DEPTH`), in units (see
+`RIM_HEIGHT`).
+"""
 LEAST_WEIGHT = 1e-3
-"""Least weight of the pixels far enough inside. Where their weight is less, the rim stays as it is.
-This is so at fingers, which are too thin.
+"""Least weight of the pixels at least `DEPTH` inside. Where their weight is less, the rim stays as
+it is. This is so at fingers, which are too thin.
 """
 CONTRAST = 0.02
-"""A pixel may be cleaned if the distance between the two mean colors is more than this (RGB in [0,
-1]).
+"""A pixel may be cleaned if the distance between the two means (see `DEPTH`) is more than this, as
+RGB in [0, 1].
 """
 CERTAIN = 0.15
 """A pixel is cleaned if the background's share in its color is more than this."""

@@ -113,8 +113,8 @@ def load_photos(path: str | Path, *, fit_masks: bool = False) -> Photos:
 
 
 def capture_folder(path: str | Path) -> Path:
-    """Returns the path as a folder. A path that begins with "demo_capture" means the capture that
-    comes with the package, unless the path exists.
+    """Returns the path of the capture folder that `path` names. If a path begins with
+    "demo_capture" and does not exist, it names the capture that comes with the package.
     """
     folder = Path(path)
     if not folder.exists() and folder.parts[:1] == (DEMO_CAPTURE,):

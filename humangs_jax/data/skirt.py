@@ -67,7 +67,9 @@ LEAST_ROWS = 4
 Wide trousers have fewer, and would look worse with a skirt.
 """
 CLEAR = 0.06
-"""Least distance of such a point from the skin of both legs, metres."""
+"""Least distance from the skin of both legs at which a point is certainly cloth of a skirt, metres,
+see `LEAST_ROWS`.
+"""
 LONG_CLEAR = 0.1
 """Least distance in place of `CLEAR` if no photo shows the legs apart below the hem, metres."""
 REACH = OffsetFitConfig(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)

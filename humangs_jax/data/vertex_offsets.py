@@ -55,11 +55,13 @@ share of `PROBE`.
 DRAWN = 0.5
 """Silhouettes are drawn larger than they are by this much, pixels."""
 WRAP = 0.07
-"""Largest move of the last step, metres. In this step, vertices outside a mask move inwards until
-they are inside all masks by the least inset.
+"""Largest move of the last step, metres. In the last step, vertices outside a mask move inwards
+until they are inside all masks by the least inset.
 """
 WRAP_ROUNDS = 6
-"""How often the moves of the last step are averaged over the neighbours."""
+"""How many times the moves of the last step (see `WRAP`) are averaged over neighbouring
+vertices.
+"""
 OUTSIDE = 0.01
 """A vertex is outside of a mask if it is farther outside than this, metres."""
 MISFIT = 0.025
@@ -110,9 +112,11 @@ class MaskedView:
     project: Float[np.ndarray, "3 4"]
     """From the world in metres to homogeneous pixels of the window, (3, 4)."""
     linear: Float[np.ndarray, "n 3 3"]
-    """The matrix that takes each vertex from the rest pose to the posed body, (n, 3, 3)."""
+    """The matrix that takes each vertex from the rest pose to the posed body, (n, 3, 3). `offset`
+    is added afterwards.
+    """
     offset: Float[np.ndarray, "n 3"]
-    """The offset that is added after this matrix, (n, 3), metres."""
+    """The offset that is added to each vertex after `linear`, (n, 3), metres."""
     low: Float[np.ndarray, "2"]
     """The least x and y of points in the window that count as inside the photo, (2,), pixels. They
     lie `NEAR` inside the photo's upper left corner.

@@ -14,7 +14,9 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
 def normalize(q: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
-    """Returns q / |q|. Where q is 0, it is the identity, with zero gradient."""
+    """Returns q / |q|. Where q is 0, the result is the identity (1, 0, 0, 0), with zero
+    gradient.
+    """
     return safe_normalize(q, jnp.asarray(IDENTITY, q.dtype))
 
 

@@ -47,7 +47,7 @@ HAND_NUMBERS = 45
 FIT = "smplx_param.pkl"
 """File of the body that was fitted to a scan."""
 FIT_MESH = "mesh_smplx.obj"
-"""File of that body's mesh."""
+"""File of the mesh of the fitted body."""
 TOLERANCE = 2e-3
 """The largest mean distance of a fit's vertices from mesh_smplx.obj, metres of the body. Rounding
 of OBJ files is far below. Another gender moves vertices by centimetres, and a wrong hand convention
