@@ -22,8 +22,8 @@ from typing import Any
 
 
 def printable(text: object, lines: bool = False) -> str:
-    r"""Returns a text with every character that a terminal would act on escaped, as Python escapes
-    it (\x1b, \u202e, \n).
+    r"""Returns a text in which all characters that a terminal would act on are escaped, as Python
+    escapes them (\x1b, \u202e, \n).
 
     These are control characters, C1 included, marks of direction and other format characters,
     separators of lines, and bytes of file names that are not UTF-8 (\xe9). lines: whether line

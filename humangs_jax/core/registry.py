@@ -62,7 +62,7 @@ class Formats(dict[str, F]):
         return self.where(lambda each: suffix in each.suffixes)
 
     def recognized(self, path: Path) -> F | None:
-        """Returns the first format that the file or folder has, or None. Formats with `recognizes`
+        """Returns the first format that fits the file or folder, or None. Formats with `recognizes`
         are tried first.
         """
         found = sorted(self.of(path).values(), key=lambda each: each.recognizes is None)

@@ -42,7 +42,9 @@ ROTATION_TO_Y_UP = {
 }
 """For each axis that may point up in the source, the rotation that takes it to +y."""
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""The matrix that turns axes y down, z forward into y up, z backward; it is its own inverse."""
+"""The matrix that turns camera axes with y down and z forward into axes with y up and z backward.
+It is its own inverse.
+"""
 CAM_FROM_WORLD = "cam_from_world, OpenCV axes"
 """Convention of matrices that take points of the world to the camera's axes x right, y down, z
 forward.
@@ -504,9 +506,10 @@ def _in_photo(
 
 
 def _squared_reach(coefficients: Sequence[float | int] | np.ndarray) -> float:
-    """Returns the r^2 up to which r (1 + k1 r^2 + ..) grows; infinity if it always grows.
+    """Returns the squared radius r^2 on the plane z = 1 up to which the distorted radius, r (1 + k1
+    r^2 + ..), grows. Returns infinity if it always grows.
 
-    Beyond it the formula folds the image back over itself.
+    Beyond this radius the formula folds the image back over itself.
     """
     k1, k2, _, _, k3 = np.clip(coefficients, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
     roots = np.roots(

@@ -243,8 +243,8 @@ def _known(
 
 
 def body_parts(body: BodyModel) -> Int[np.ndarray, " n"]:
-    """Returns the part of the body that each vertex moves with most, an index into `PARTS`; -1 if
-    it is none of these parts.
+    """Returns for each vertex the part of the body that it moves with most, as an index into
+    `PARTS`, (n,). -1: none of these parts.
     """
     of_joint = [
         next((i for i, words in enumerate(PARTS) if any(word in name for word in words)), -1)
@@ -403,7 +403,9 @@ def _seen_colors(
     mask: Float[Array, "h w"],
     camera: Camera,
 ) -> tuple[Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Returns the colors of the body's vertices in one photo, and which vertices it shows."""
+    """Returns the colors of the body's vertices in one photo, (n, 3), and whether the photo shows
+    each vertex, (n,).
+    """
     vertices = pose_body(body, rest, pose).vertices
     towards = camera.center - vertices
     normals = vertex_normals(vertices, body.faces)

@@ -80,7 +80,7 @@ class PreparedCapture:
 
     @property
     def turned(self) -> bool:
-        """Whether the world of `capture` is not that of `given`."""
+        """Whether the world of `capture` has other axes than the world of `given`."""
         return self.up != "y"
 
     def select(self, views: Sequence[int] | Int[np.ndarray, " any"]) -> "PreparedCapture":

@@ -49,8 +49,8 @@ PROBE = 0.012
 whether it leaves the silhouette.
 """
 LEAVES = 0.6
-"""A vertex is on the silhouette if this move takes it outwards, in the image, by more than this
-share of `PROBE`.
+"""A vertex is on the silhouette if the move by `PROBE` takes it outwards, in the image, by more
+than this share of `PROBE`.
 """
 DRAWN = 0.5
 """Silhouettes are drawn larger than they are by this much, pixels."""
@@ -63,7 +63,7 @@ WRAP_ROUNDS = 6
 vertices.
 """
 OUTSIDE = 0.01
-"""A vertex is outside of a mask if it is farther outside than this, metres."""
+"""Distance outside of a mask beyond which a vertex counts as outside, metres, see `MISFIT`."""
 MISFIT = 0.025
 """A body does not fit its masks if at least this share of its vertices (without head and hands)
 lies more than `OUTSIDE` outside of a mask. Clothes do not raise the share, and it is 0 for true

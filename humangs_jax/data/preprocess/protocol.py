@@ -79,7 +79,8 @@ EVERY = 10
 def smallest_rotation(
     start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation about start x end that takes the direction of `start` to that of `end`.
+    """Returns the smallest rotation that takes the direction of `start` to the direction of `end`,
+    (3, 3).
 
     Raises: ValueError if a vector is zero.
     """
@@ -218,7 +219,7 @@ class ScanRenderer:
 
     @classmethod
     def of(cls, scan: Scan, vertices: Float[np.ndarray, "n 3"]) -> "ScanRenderer":
-        """Returns the renderer of a scan whose vertices are `vertices`."""
+        """Returns the renderer of a scan. vertices: the aligned vertices of the scan."""
         spare, spare_faces = -len(vertices) % STEP, -len(scan.faces) % STEP
 
         def pad(x):
