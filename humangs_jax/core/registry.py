@@ -28,7 +28,7 @@ class Format:
     """The function that reads or writes such files, or its name as "package.module:function"."""
     suffixes: tuple[str, ...] = ()
     """Suffixes of such files, in lower case, with the dot; FOLDER for a folder. Empty: files of
-    this format cannot be told by their names.
+    this format have no typical suffix.
     """
     recognizes: str | Callable[[Path], bool] | None = None
     """A function that says whether a path with one of the suffixes is of this format, or the
