@@ -164,7 +164,7 @@ def fit_vertex_offsets(
     """Returns displacements of the vertices of a person's shaped body in the T-pose, (n, 3),
     metres. They make the body fill the masks. Their lengths are bounded.
 
-    Displacements are 0 where the masks say nothing, or if the masks are not near the body.
+    Displacements are 0 if the masks say nothing, or if the masks are not near the body.
 
     Arguments: body: the capture's body, or one of `data.views.gaussian_body`. capture: has masks;
     frames and worlds may be any. inset: the least and the most that the surface may lie inside the

@@ -1,9 +1,9 @@
 """Makes the examples to learn from: some views of a subject are the input, others the targets. The
 module also has the order of examples, and mixtures of sources.
 
-All of it is numpy, and pure functions of (seed, number). Row i of the batch of a step is example
-number step * batch size + i, so that a run resumes from its step alone. Each purpose draws from a
-separate stream of random numbers.
+All of it is numpy, and pure functions of (seed, number). If all batches have one size, row i of the
+batch of a step is example number step * size + i. So a run resumes from its step alone. Each
+purpose draws from a separate stream of random numbers.
 """
 
 import dataclasses
