@@ -155,7 +155,8 @@ class Processes:
         """Joins the other processes, if there are any. Raises: see `join_processes`."""
         from humangs_jax.training.sharding import join_processes
 
-        if self.distributed or self.coordinator is not None:
+        given = (self.coordinator, self.processes, self.process)
+        if self.distributed or any(value is not None for value in given):
             join_processes(self.coordinator, self.processes, self.process)
 
 

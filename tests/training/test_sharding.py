@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec
 
+from humangs_jax.cli.training import Processes
 from humangs_jax.training.sharding import (
     SMALLEST_DIVIDED,
     divided_axis,
@@ -44,6 +45,15 @@ def test_a_mesh_of_what_does_not_divide_is_refused():
         ValueError, match="give coordinator, number of processes and process index, or none"
     ):
         join_processes("localhost:1234", 2, None)
+
+
+@pytest.mark.parametrize(
+    "words", [{"processes": 2}, {"process": 0}, {"processes": 2, "process": 1}]
+)
+def test_the_command_refuses_a_part_of_the_processes(words):
+    """Each process would train alone otherwise."""
+    with pytest.raises(ValueError, match="give coordinator, number of processes"):
+        Processes(**words).join()
 
 
 def test_gradients_are_means_over_all_devices_whichever_hold_the_parts():
