@@ -31,6 +31,7 @@ from humangs_jax.capture.fitting.camera_errors import find_camera_errors
 from humangs_jax.capture.fitting.fit_capture import Examination
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.processes import Call
 from humangs_jax.core.progress import text_table
 from humangs_jax.core.pytree import pytree_dataclass, replace
@@ -333,7 +334,7 @@ def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
     return tints.astype(np.float32)
 
 
-@jax.jit
+@compiled()
 def body_image(
     vertices: Float[Array, "n 3"],
     faces: Int[Array, "f 3"],

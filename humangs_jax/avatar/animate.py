@@ -9,7 +9,6 @@ pixels of the images that the Gaussians fit (after Mip-Splatting, https://arxiv.
 `Gaussians.pixel_footprint` holds the size of these pixels, and renderers then add only `MIP_EPS2D`.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -25,6 +24,7 @@ from humangs_jax.body.model import (
 )
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.loops import over
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.records import record_values
@@ -175,7 +175,7 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
     return _animate(avatar, pose)
 
 
-@jax.jit
+@compiled()
 def _animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
     return factored(skin(avatar, pose))
 
@@ -226,7 +226,7 @@ def with_pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Avatar:
     return replace(avatar, gaussians=_pixel_footprint_of(avatar, views))
 
 
-@jax.jit
+@compiled()
 def _pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Gaussians:
     gaussians, sizes = avatar.gaussians, pixel_sizes(avatar, views)
     if gaussians.pixel_footprint is None:
@@ -234,7 +234,7 @@ def _pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Gaussians:
     return replace(gaussians, pixel_footprint=jnp.minimum(gaussians.pixel_footprint, sizes))
 
 
-@jax.jit
+@compiled()
 def pixel_sizes(avatar: Avatar, views: SubjectViews) -> Float[Array, " g"]:
     """Returns the side of a photo's pixel at each Gaussian, metres. Of the photos that contain a
     Gaussian, the one with the smallest pixels there counts.

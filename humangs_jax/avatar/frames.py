@@ -3,7 +3,6 @@ person.
 """
 
 import dataclasses
-import functools
 from collections.abc import Iterable, Iterator
 
 import jax
@@ -18,6 +17,7 @@ from humangs_jax.body.motion import Motion, grounded
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.arrays import from_host, taken
 from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import COMPILING, bar
 from humangs_jax.core.pytree import replace
@@ -59,7 +59,7 @@ MOST_TRACKED = 1 << 25
 A_POSE = 48.0
 """Degrees by which the arms hang down in the A-pose, as in the page."""
 
-posed = jax.jit(skin)
+posed = compiled()(skin)
 
 
 def draw(
@@ -249,7 +249,7 @@ def _fitting_distance(
     return needed
 
 
-@functools.partial(jax.jit, static_argnames="parents")
+@compiled(static=["parents"])
 def _paths(
     means: Array, weights: Array, rest_joints: Array, parents: tuple[int, ...], poses: BodyPose
 ) -> Array:

@@ -27,7 +27,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -36,6 +35,7 @@ from humangs_jax.avatar.frame_settings import FrameSettings
 from humangs_jax.avatar.frames import composite_over, draw, posed, splatting_of
 from humangs_jax.body.model import BodyPose, blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.progress import COMPILING, bar
 from humangs_jax.geometry.camera import Camera, require_pinhole
@@ -269,7 +269,7 @@ def gaussian_normals(avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
     return _posed_normals(normals, avatar, pose)
 
 
-@jax.jit
+@compiled()
 def _posed_normals(
     normals: Float[Array, "g 3"], avatar: Avatar, pose: BodyPose
 ) -> Float[Array, "g 3"]:

@@ -35,6 +35,7 @@ from humangs_jax.body.model import (
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.loops import over
 from humangs_jax.core.processes import Call, compile_ahead
 from humangs_jax.core.progress import compiling
@@ -384,7 +385,7 @@ def reconstruct_views(
     return _reconstruct(variables, config, body, views)
 
 
-@jax.jit
+@compiled()
 def _reconstruct(
     variables: Variables,
     config: HumanGSConfig,
@@ -554,10 +555,10 @@ def _same_body(one: PreparedCapture, other: PreparedCapture) -> bool:
     )
 
 
-_prepare = jax.jit(prepare_inputs)
+_prepare = compiled()(prepare_inputs)
 
 
-@jax.jit
+@compiled()
 def _prepare_batch(body: BodyModel, batch: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
     """Returns the network's inputs for each person of a batch, see `prepare_inputs`."""
     pixels = math.prod(batch.images.shape[1:4])

@@ -15,7 +15,6 @@ fits give these landmarks less weight. If it is known where a detector sees its 
 moved there by a `LandmarkDefinition`.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -37,6 +36,7 @@ from humangs_jax.body.model import (
 )
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
 
@@ -431,7 +431,7 @@ def _placed(body: BodyModel, place: _Beside) -> SurfacePoints:
     return replace(mean, rest=mean.rest + jnp.asarray(place.offset, jnp.float32), weights=weights)
 
 
-@functools.partial(jax.jit, static_argnames=("vertices", "places"))
+@compiled(static=["vertices", "places"])
 def _on_the_body(
     body: BodyModel, vertices: tuple[int, ...], places: tuple[_Beside, ...]
 ) -> tuple[Float[Array, "j 3"], Float[Array, "j 3 s"], SurfacePoints]:

@@ -24,6 +24,7 @@ import numpy as np
 from humangs_jax.body.expressions import Expressions
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 
@@ -340,7 +341,7 @@ def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
     return _shaped_body(body.template, body.shape_directions, body.joint_regressor, betas)
 
 
-@jax.jit
+@compiled()
 def _shaped_body(
     template: Float[Array, "n 3"],
     directions: Float[Array, "n 3 s"],

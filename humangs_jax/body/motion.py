@@ -1,6 +1,5 @@
 """Motions of a body: one pose per frame, for the joints of SMPL-X or of another body."""
 
-import functools
 from collections.abc import Sequence
 
 import jax
@@ -11,6 +10,7 @@ from humangs_jax.body.joints import DEFAULT_FPS
 from humangs_jax.body.model import BodyPose, RestBody, joint_transforms
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.arrays import from_host, taken
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.axes import UPRIGHT, upright_matrix
@@ -106,7 +106,7 @@ class Motion:
         return replace(self, rotations=frames[0], translations=frames[1], expressions=faces)
 
 
-@jax.jit
+@compiled()
 def _between(
     rotations: Float[Array, "m j 3"],
     translations: Float[Array, "m 3"],
@@ -137,7 +137,7 @@ def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion
     return replace(motion, translations=moved)
 
 
-@functools.partial(jax.jit, static_argnames="parents")
+@compiled(static=["parents"])
 def _on_the_floor(
     rest: RestBody,
     parents: tuple[int, ...],
@@ -175,6 +175,6 @@ def turned_upright(
     return rotations, (translations + pelvis) @ turn.T - pelvis
 
 
-@jax.jit
+@compiled()
 def _turned_root(turn: Float[Array, "4"], root: Float[Array, "m 3"]) -> Float[Array, "m 4"]:
     return quaternion.multiply(turn, quaternion.from_axis_angle(root))

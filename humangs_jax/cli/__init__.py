@@ -154,11 +154,13 @@ def _prepare(verbose: bool) -> None:
     from humangs_jax.cli.screen import end_within_seconds, silence
 
     end_within_seconds()
-    from humangs_jax.core.processes import enable_compile_cache, keep_freed_memory
+    from humangs_jax.core.processes import enable_compile_cache, keep_freed_memory, keep_programs
 
     silence(verbose)
     keep_freed_memory()
-    enable_compile_cache()
+    cache = enable_compile_cache()
+    if cache is not None:
+        keep_programs(cache)
 
 
 RENAMED = {

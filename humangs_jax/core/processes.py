@@ -216,8 +216,8 @@ a second, with which most programs of a command are compiled again each time.
 
 
 def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Turns on JAX's persistent compilation cache, in a folder for each version of JAX and kind of
-    processor.
+    """Turns on JAX's persistent compilation cache, in a folder for each version of JAX and of this
+    package and each kind of processor.
 
     Programs call it once, before the first computation; the library never does. JAX is not imported
     here. It finds the folder in its environment variable, and so do the programs that this one
@@ -248,10 +248,12 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
     wish = os.environ.get(VARIABLE, "")
     if wish == "0":
         return None
-    # a folder for each version of JAX and processor, if it can be written to
+    from humangs_jax import __version__  # late: the package is being imported above
+
+    # a folder for each version and processor, if it can be written to
     try:
         root = Path(folder or wish or user_cache() / "humangs_jax").expanduser()
-        cache = root / f"jax-{version('jax')}-{version('jaxlib')}-{_processor()}"
+        cache = root / f"jax-{version('jax')}-{version('jaxlib')}-{__version__}-{_processor()}"
         cache.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=cache).close()
         _delete_oldest(root, LARGEST)
@@ -267,6 +269,35 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
         for name, value in settings.items():
             sys.modules["jax"].config.update(name, value)
     return cache
+
+
+_programs: list[Path] = []
+"""The folder of `keep_programs`, if it was called."""
+
+
+def keep_programs(cache: Path) -> None:
+    """Keeps the programs of `core.compiled` in a folder, if it is safe. A process calls it once,
+    before the first computation.
+
+    A program is code, and its file is read with `pickle`. So the folder is made for the user alone.
+    Nothing is kept if it belongs to somebody else, or if others may write to it. Windows has no
+    such owners; there the user's cache folder is private.
+
+    Args:
+        cache: the folder of JAX's own cache, in which the folder is made.
+    """
+    folder = cache / "programs"
+    with contextlib.suppress(OSError):
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.stat()
+        writable_by_others = bool(status.st_mode & 0o022)
+        if sys.platform == "win32" or (status.st_uid == os.getuid() and not writable_by_others):
+            _programs[:] = [folder]
+
+
+def kept_programs() -> Path | None:
+    """Returns the folder of `keep_programs`. None: programs are not kept."""
+    return _programs[0] if _programs else None
 
 
 def user_cache() -> Path:
@@ -301,7 +332,7 @@ def _delete_oldest(root: Path, largest: int) -> None:
     were not used for longest go first, of any version of JAX.
     """
     files = []
-    for file in root.glob("jax-*/*-cache"):
+    for file in root.glob("jax-*/**/*-cache"):
         with contextlib.suppress(OSError):  # another program deletes, too
             files.append((file, file.stat()))
     total = sum(stat.st_size for _, stat in files)
@@ -365,16 +396,24 @@ def compile_ahead(program: Any, *arguments: Any) -> threading.Thread:
 
     def compile_it() -> None:
         with contextlib.suppress(Exception):
-            program.lower(*arguments).compile()
+            _compile(program, arguments)
 
     thread = threading.Thread(target=compile_it)
     thread.start()
     return thread
 
 
+def _compile(program: Any, arguments: tuple[Any, ...]) -> None:
+    """Compiles a function that `jax.jit` or `core.compiled.compiled` returned."""
+    if hasattr(program, "prepare"):
+        program.prepare(*arguments)
+    else:
+        program.lower(*arguments).compile()
+
+
 Call = tuple[Any, tuple[Any, ...]]
-"""A function that `jax.jit` returned, and the arguments of a call; arrays may be
-`jax.ShapeDtypeStruct`.
+"""A function that `jax.jit` or `core.compiled.compiled` returned, and the arguments of a call;
+arrays may be `jax.ShapeDtypeStruct`.
 """
 
 
@@ -436,5 +475,5 @@ class Ahead:
         """Compiles one program, unless the block is over."""
         with contextlib.suppress(Exception):
             if not self._over.is_set():
-                program.lower(*arguments).compile()
+                _compile(program, arguments)
         self._free.release()

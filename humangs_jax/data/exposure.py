@@ -33,6 +33,7 @@ from scipy.sparse.csgraph import connected_components
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import taken
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.processes import Call
 from humangs_jax.data.body_and_masks import views_without_person
 from humangs_jax.data.capture import Capture
@@ -394,7 +395,7 @@ def apply_gain(
     return np.clip((images - white) * gains[:, None, None].astype(np.float32) + white, 0, 1)
 
 
-@jax.jit
+@compiled()
 def _seen_colors(
     body: BodyModel,
     rest: RestBody,

@@ -7,6 +7,7 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.compiled import compiled
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, prepare_inputs, to_network_views
 from humangs_jax.network import presets
@@ -70,7 +71,7 @@ def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0
     return chosen
 
 
-@jax.jit
+@compiled()
 def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
     """Returns how well every view shows every vertex, in [0, 1].
 

@@ -19,6 +19,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host, joined
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.processes import Call
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.datasets.subject import FileBody, open_people
@@ -511,13 +512,13 @@ def painted_body(inputs: Capture) -> Float[Array, "n 3"]:
         for i, frame in enumerate(inputs.frames)
     ]
     pixels, visible = (joined(x) for x in zip(*seen, strict=True))
-    return _photo_colors(from_host(inputs.images), pixels, visible)
+    return _photo_colors(from_host(inputs.images), pixels, visible, "half_pixel")
 
 
-_photo_colors = jax.jit(functools.partial(photo_colors, grid="half_pixel"))
+_photo_colors = compiled(static=["grid"])(photo_colors)
 
 
-@jax.jit
+@compiled()
 def _seen(
     body: BodyModel, rest: RestBody, pose: BodyPose, camera: Camera
 ) -> tuple[Float[Array, "n 2"], Bool[Array, " n"]]:
@@ -557,7 +558,7 @@ def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.n
     return np.stack(images)
 
 
-@jax.jit
+@compiled()
 def _painted(
     body: BodyModel, rest: RestBody, pose: BodyPose, camera: Camera, colors: Float[Array, "n 3"]
 ) -> Float[Array, "h w 3"]:

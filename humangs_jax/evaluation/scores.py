@@ -12,7 +12,6 @@ convolutions would.
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -25,6 +24,7 @@ from jax import lax
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import FINITE, check_values
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.configuration import Presets
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import box_of
@@ -242,7 +242,7 @@ Networks = Mapping[str, Lpips]
 """LPIPS networks by name."""
 
 
-@functools.partial(jax.jit, static_argnames="window")
+@compiled(static=["window"])
 def pair_scores(
     predicted: Float[Array, "h w 3"],
     truth: Float[Array, "h w 3"],
@@ -258,7 +258,7 @@ def pair_scores(
     return {"psnr": masked_psnr(predicted, truth, inside), "ssim": similarity}
 
 
-@functools.partial(jax.jit, static_argnames="window")
+@compiled(static=["window"])
 def person_scores(
     predicted: Float[Array, "h w 3"],
     truth: Float[Array, "h w 3"],
@@ -297,7 +297,7 @@ def _patch_means(x: Float[Array, "h w"], side: int) -> Float[Array, "y x"]:
     return lax.reduce_window(x, 0.0, lax.add, (side, side), (STRIDE, STRIDE), "VALID") / side**2
 
 
-@jax.jit
+@compiled()
 def _alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict[str, Scalar]:
     """Returns the IoU and the semi-transparent foreground of a rendering's coverage, as iou and
     semi_transparent.

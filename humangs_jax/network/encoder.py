@@ -11,7 +11,6 @@ from the centre of its first texel to the centre of its last texel (`align_corne
 of the texels the features are 0.
 """
 
-import functools
 from typing import Any, Literal
 
 import flax.linen as nn
@@ -19,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.configuration import Patch, Side, Width, configuration, knob, part
 from humangs_jax.core.loops import one_after_the_other
 from humangs_jax.geometry.camera import plucker_rays
@@ -280,7 +280,7 @@ def touched_patches(
     return jnp.any(patchify(foreground[..., None].astype(jnp.float32), patch_size) > 0, axis=(1, 2))
 
 
-@functools.partial(jax.jit, static_argnames="patch_size")
+@compiled(static=["patch_size"])
 def needed_tokens(
     foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, patch_size: int
 ) -> Int[Array, ""]:

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from humangs_jax.body.model import BodyPose, Texels
 from humangs_jax.core.array_types import Key, PyTree
 from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import Architecture, HumanGSConfig
@@ -118,7 +119,7 @@ def intermediates(
     return found
 
 
-@jax.jit
+@compiled()
 @checked_arguments
 def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     """Returns fresh variables of a network, float32.

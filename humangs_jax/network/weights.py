@@ -34,7 +34,7 @@ SHIPPED = "assets/weights.safetensors"
 
 def expected_variables(config: HumanGSConfig) -> Variables:
     """Returns the shapes and dtypes of a configuration's variables, without computing anything."""
-    return jax.eval_shape(lambda: init_humangs(jax.random.key(0), config))
+    return init_humangs.eval_shape(jax.random.key(0), config)
 
 
 def flatten_variables(variables: PyTree) -> dict[str, Any]:

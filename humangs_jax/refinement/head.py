@@ -19,6 +19,7 @@ from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
 from humangs_jax.core.arrays import from_host, taken
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.prepared import PreparedCapture
@@ -28,7 +29,7 @@ from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.objective import (
     Image,
     avatar_of,
-    compiled,
+    compiled_part,
     drawn_photo,
     image_loss,
     pulled,
@@ -155,7 +156,7 @@ def _advanced(
     return clock.with_room(advanced, state.splat)
 
 
-@compiled
+@compiled_part
 def _steps(
     state: RefineState, photos: Photo, avatar: Avatar, stop: Int[Array, ""], config: RefineConfig
 ) -> RefineState:
@@ -255,7 +256,7 @@ def _pixels(avatar: Avatar, views: SubjectViews) -> Float[np.ndarray, "v g 2"]:
     return np.stack(found)
 
 
-_projected = jax.jit(project)
+_projected = compiled()(project)
 
 
 def _squares(

@@ -33,7 +33,7 @@ from humangs_jax.core.processes import Call
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.tensors import read_safetensors
-from humangs_jax.refinement.objective import Image, compiled, drawn_photo, pulled
+from humangs_jax.refinement.objective import Image, compiled_part, drawn_photo, pulled
 from humangs_jax.refinement.photos import Photo
 from humangs_jax.rendering.gaussians import UnconstrainedGaussians
 from humangs_jax.rendering.splat_config import SplatConfig
@@ -387,13 +387,13 @@ def calls_of_update(
     yield _iteration_by, of_all
 
 
-@compiled
+@compiled_part
 def side_by_side(parameters: UnconstrainedGaussians) -> Float[Array, "g 14"]:
     """Returns `stacked` parameters, as a compiled program."""
     return stacked(parameters)
 
 
-@compiled
+@compiled_part
 def _iteration_by(
     variables: PyTree,
     parameters: UnconstrainedGaussians,
@@ -427,7 +427,7 @@ def photo_signals(
     return _signals_from(gradient, foreground, pixels, rendering, photo), rendering.overflow
 
 
-@compiled
+@compiled_part
 def _squared_errors(image: Image, photo: Photo) -> Image:
     """Returns the gradient of the sum of squared errors of colors and alpha, over the pixels that
     count, with respect to the image.
@@ -436,7 +436,7 @@ def _squared_errors(image: Image, photo: Photo) -> Image:
     return 2 * rgb, 2 * jnp.where(photo.counted, image[1] - photo.mask, 0)
 
 
-@compiled
+@compiled_part
 def _foreground_errors(image: Image, photo: Photo) -> Image:
     """Returns the gradient of the squared color errors, weighted by the mask, with respect to the
     image. A Gaussian in front of the background should fade and not take the background's color.
@@ -445,13 +445,13 @@ def _foreground_errors(image: Image, photo: Photo) -> Image:
     return rgb * photo.mask[..., None], jnp.zeros_like(alpha)
 
 
-@compiled
+@compiled_part
 def _colors_alone(image: Image) -> Image:
     """Returns the gradient of the sum of all colors with respect to the image."""
     return jnp.ones_like(image[0]), jnp.zeros_like(image[1])
 
 
-@compiled
+@compiled_part
 def _signals_from(
     gradient: UnconstrainedGaussians,
     foreground: UnconstrainedGaussians,
@@ -470,7 +470,7 @@ def _signals_from(
     return Signals(scale * stacked(gradient), rendering.visibility, scale * pixels / 3)
 
 
-@compiled
+@compiled_part
 def refiner_iteration(
     variables: PyTree,
     values: Float[Array, "g 14"],

@@ -7,20 +7,18 @@ one renderer and its transpose for steps, iterations and comparisons.
 """
 
 import dataclasses
-import functools
-import inspect
 from collections.abc import Callable
-from typing import Any, ParamSpec, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import pytree_dataclass, replace
@@ -43,68 +41,23 @@ FASTER_COMPILATION = {"xla_backend_optimization_level": 1}
 """Options of the compiler on a CPU. Compared with optimization level 3, programs compile in 0.8 to
 0.9 of the time and run as fast. At level 0 they would run eight times as long.
 """
-P = ParamSpec("P")
-T = TypeVar("T")
-T_co = TypeVar("T_co", covariant=True)
 
 jax.tree_util.register_static(
     RefineConfig
 )  # here: its own module is imported by the command line, without JAX
 
 
-@runtime_checkable
-class Compiled(Protocol[P, T_co]):
-    """The type of what `compiled` returns: a function that can also be compiled before it is
-    called.
-    """
-
-    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> T_co:
-        """Returns the result of the function."""
-        ...
-
-    def __hash__(self) -> int:
-        """Returns the hash of the function."""
-        ...
-
-    def lower(self, *args: Any) -> Any:
-        """Returns the program for these arguments, as the function of `jax.jit` lowers it."""
-        ...
-
-    def eval_shape(self, *args: Any) -> Any:
-        """Returns the shapes of the result."""
-        ...
+def _options() -> dict[str, Any] | None:
+    """Returns the options of XLA for the programs of refinement, see `compiler_options`."""
+    options = compiler_options()
+    return options and options | FASTER_COMPILATION
 
 
-def compiled(function: Callable[P, T]) -> Compiled[P, T]:
-    """Decorator that compiles a function when it is called with arrays. Inside of a transformation
-    the function becomes a part of the transformed program.
-
-    Parameters named config and splat are static.
-    """
-
-    @functools.cache
-    def program() -> Callable[P, T]:
-        static = [
-            name for name in ("config", "splat") if name in inspect.signature(function).parameters
-        ]
-        options = compiler_options()
-        return jax.jit(
-            function,
-            static_argnames=static,
-            compiler_options=options and options | FASTER_COMPILATION,
-        )
-
-    @functools.wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs)))
-        if traced:
-            return function(*args, **kwargs)
-        return program()(*args, **kwargs)
-
-    made: Any = call
-    made.lower = lambda *args: cast(Any, program()).lower(*args)
-    made.eval_shape = lambda *args: cast(Any, program()).eval_shape(*args)
-    return made
+compiled_part = compiled(static=("config", "splat"), options=_options)
+"""Decorator of the parts of refinement that are programs when they are called with arrays. Inside
+of a transformation they become a part of the transformed program. Parameters named config and splat
+are static.
+"""
 
 
 # Parameters
@@ -133,7 +86,7 @@ def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
     )
 
 
-@compiled
+@compiled_part
 def gaussians_of(
     parameters: UnconstrainedGaussians, pixel_footprint: Float[Array, " g"] | None
 ) -> Gaussians:
@@ -162,7 +115,7 @@ def posed_gaussians(parameters: UnconstrainedGaussians, avatar: Avatar, photo: P
     return skin(avatar_of(parameters, avatar), BodyPose(photo.rotations, photo.translation))
 
 
-@compiled
+@compiled_part
 def drawn_photo(
     parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo, splat: SplatConfig
 ) -> tuple[Image, PullBack, Rendering]:
@@ -180,7 +133,7 @@ def drawn_photo(
     return jax.vjp(draw, parameters, jnp.zeros_like(avatar.gaussians.opacities), has_aux=True)
 
 
-@compiled
+@compiled_part
 def pulled(pull_back: PullBack, image: Image) -> tuple[UnconstrainedGaussians, Float[Array, " g"]]:
     """Returns `pull_back(image)`, as a compiled program."""
     return pull_back(image)
@@ -201,7 +154,7 @@ def image_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
     )
 
 
-@compiled
+@compiled_part
 def loss_gradient(image: Image, photo: Photo, config: RefineConfig) -> Image:
     """Returns the gradient of `image_loss` with respect to the image."""
     return jax.grad(image_loss)(image, photo, config)
@@ -240,7 +193,7 @@ class Comparison:
         return _psnr(self.squared, self.pixels)
 
 
-@jax.jit
+@compiled()
 def _psnr(squared: Float[Array, "*v"], pixels: Float[Array, "*v"]) -> Float[Array, "*v"]:
     return decibels(safe_divide(squared, pixels))
 
@@ -258,7 +211,7 @@ def compare(
     return compared(image, rendering, photo, config)
 
 
-@compiled
+@compiled_part
 def compared(image: Image, rendering: Rendering, photo: Photo, config: RefineConfig) -> Comparison:
     """Returns the comparison of an image with a photo. rendering: the rendering that `image` is
     part of, with visibility.

@@ -31,6 +31,7 @@ from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.arrays import from_host
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.processes import Ahead, Call
 from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.progress import compiling
@@ -295,7 +296,7 @@ def calls_of_photos(avatar: Avatar, views: SubjectViews) -> Iterator[Call]:
     yield from calls_of_update(parameters, start, photos, graph, planned(start, views))
 
 
-@jax.jit
+@compiled()
 def _fresh(avatar: Avatar, pixel_footprint: Float[Array, " g"] | None) -> Gaussians:
     """Returns the Gaussians of `Task.fresh`."""
     return with_pixel_footprint(
@@ -609,5 +610,5 @@ def _side_by_side(
     return np.concatenate([np.asarray(colors), np.asarray(alpha)[..., None]], axis=-1)
 
 
-unconstrained = jax.jit(parameters_of)
+unconstrained = compiled()(parameters_of)
 """`parameters_of` as a compiled program: the parameters that refinement moves."""

@@ -23,7 +23,7 @@ from humangs_jax.refinement.objective import (
     Comparison,
     avatar_of,
     compare,
-    compiled,
+    compiled_part,
     drawn_photo,
     loss_gradient,
     parameters_of,
@@ -94,12 +94,12 @@ def started(
     return RefineState(parameters, parameters, trust, _moments(parameters, config), none, splat)
 
 
-@compiled
+@compiled_part
 def _moments(parameters: UnconstrainedGaussians, config: RefineConfig) -> PyTree:
     return OPTIMIZERS[config.optimizer]().init(cast(Any, parameters))
 
 
-@compiled
+@compiled_part
 def _trust(visibility: Float[Array, " g"], config: RefineConfig) -> Float[Array, " g"]:
     return jnp.minimum(visibility / config.visible, 1.0)
 
@@ -114,7 +114,7 @@ def step(state: RefineState, photo: Photo, avatar: Avatar, config: RefineConfig)
     return update(replace(state, overflow=rendering.overflow), gradient, config)
 
 
-@compiled
+@compiled_part
 def update(
     state: RefineState, gradient: UnconstrainedGaussians, config: RefineConfig
 ) -> RefineState:

@@ -13,6 +13,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Int
 from humangs_jax.core.checks import checked_arguments, require_concrete
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
@@ -170,7 +171,7 @@ def _needed(gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> list[
     return [int(rows), int(pairs)]
 
 
-@functools.partial(jax.jit, static_argnums=3)
+@compiled(static=["config"])
 def needed_by(
     gaussians: Gaussians, camera: Camera, size: Int[Array, "2"], config: SplatConfig
 ) -> tuple[Int[Array, ""], Int[Array, ""]]:

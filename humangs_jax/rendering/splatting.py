@@ -27,6 +27,7 @@ from jax.core import Tracer
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.numerics import at_least_float32, safe_divide
 from humangs_jax.core.processes import compiler_options
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
@@ -276,15 +277,15 @@ def _render(
     )
     if config.max_pairs is None:
         config = plan_buffers(gaussians, cameras, config, margin=1.0)
-    rendering = _jitted(draw)(gaussians, cameras, background, config, *more)
+    rendering = _compiled(draw)(gaussians, cameras, background, config, *more)
     raise_on_overflow(rendering.overflow, gaussians, cameras, config)
     return rendering
 
 
 @functools.cache
-def _jitted(draw: Callable[..., Rendering]) -> Callable[..., Rendering]:
+def _compiled(draw: Callable[..., Rendering]) -> Callable[..., Rendering]:
     """Returns the compiled `draw` or `draw_views` for eager calls."""
-    return jax.jit(draw, static_argnums=3, compiler_options=compiler_options())
+    return compiled(static=["config"], options=compiler_options)(draw)
 
 
 @jax.custom_vjp

@@ -228,7 +228,7 @@ def test_images_of_other_sizes_share_the_programs():
     """Crops of many people fall into few sizes, each of which is compiled once."""
     rng = np.random.default_rng(0)
     protocol = PROTOCOLS["giga"]
-    compiled = scores.pair_scores._cache_size
+    compiled = scores.pair_scores.jitted._cache_size
     counts = []
     for height, width in ((65, 75), (70, 80), (78, 66)):
         image = rng.random((1, 100, 100, 3)).astype(np.float32)

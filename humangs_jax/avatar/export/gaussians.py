@@ -8,7 +8,6 @@ take y for down: SuperSplat and PlayCanvas turn what they read by half a turn ab
 `export` turns avatars into these worlds; `load_gaussians` and `save_gaussians` do so with `y_up`.
 """
 
-import functools
 import logging
 import os
 import re
@@ -16,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,6 +33,7 @@ from humangs_jax.core.checks import (
     checked_arguments,
     require_concrete,
 )
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.progress import printable
 from humangs_jax.core.pytree import replace
 from humangs_jax.core.records import record_values
@@ -107,7 +106,7 @@ def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Ga
     return _rotated(gaussians, turn)
 
 
-@functools.partial(jax.jit, static_argnames="turn")
+@compiled(static=["turn"])
 def _rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Gaussians:
     gaussians, matrix = factored(gaussians), jnp.asarray(_matrix(turn), gaussians.means.dtype)
     means = jnp.matmul(gaussians.means, matrix.T, precision=EXACT)
@@ -163,7 +162,7 @@ def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
     return means, unit_quats(quats), scales, opacities, colors, harmonics
 
 
-@jax.jit
+@compiled()
 def _plain(gaussians: Gaussians) -> Gaussians:
     """Returns the Gaussians without deformations and without low-pass."""
     scales = widened(gaussians.scales, gaussians.pixel_footprint, -1)

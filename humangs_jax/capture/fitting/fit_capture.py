@@ -52,6 +52,7 @@ from humangs_jax.capture.fitting.swaps import (
 from humangs_jax.capture.keypoints.keypoints import Keypoints, KeypointSet
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.processes import Call
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import DEFAULT_BODY, Capture
@@ -135,7 +136,7 @@ def _determined(
     return determined
 
 
-@jax.jit
+@compiled()
 def _derivatives(
     model: LandmarkModel, observations: Observations, fit: LandmarkFit
 ) -> tuple[Float[Array, "m r u"], Float[Array, "m j 3 u"]]:

@@ -59,6 +59,7 @@ from humangs_jax.capture.fitting.triangulation import triangulate_robustly
 from humangs_jax.capture.keypoints.keypoints import mirrored_name
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.transform import EXACT
@@ -127,7 +128,7 @@ def fit_landmarks(
     return fit
 
 
-@jax.jit
+@compiled()
 def fit_frames(model: LandmarkModel, observations: Observations) -> LandmarkFit:
     """Runs all stages except motion, and returns the fit. observations: a batch of m frames."""
     problem = keypoint_problem(model)
@@ -441,7 +442,7 @@ def _person_residuals(
 # --------------------------------------------------------------------------------------------------
 
 
-@jax.jit
+@compiled()
 def smooth_motion(
     model: LandmarkModel,
     observations: Observations,

@@ -54,6 +54,7 @@ from humangs_jax.capture.fitting.state import (
 )
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry.transform import EXACT
 
@@ -451,9 +452,9 @@ def _run(
         rate=jnp.asarray(fps, jnp.float32),
         scales=jnp.asarray(scales, jnp.float32),
     )
-    found, betas = _solved(model, own, window)
+    found, shape = _solved(model, own, window)
     poses = jax.tree.map(lambda old, new: old.at[frames].set(new[:count]), poses, found)
-    return poses, np.asarray(betas)
+    return poses, np.asarray(shape)
 
 
 @functools.cache
@@ -465,7 +466,7 @@ def _smoother(fps: float) -> Float[np.ndarray, "w w"]:
     return (vectors / np.sqrt(1 + weight * np.maximum(values, 0))) @ vectors.T
 
 
-@jax.jit
+@compiled()
 def _solved(
     model: LandmarkModel, seen: Observations, window: _Window
 ) -> tuple[BodyPose, Float[Array, " s"]]:
@@ -560,7 +561,7 @@ def _roots_of(rotations: Float[Array, "m j 3"]) -> Float[Array, "m j 3"]:
 # --------------------------------------------------------------------------------------------------
 
 
-@jax.jit
+@compiled()
 def _landmarks(
     model: LandmarkModel, betas: Float[Array, " s"], poses: BodyPose
 ) -> tuple[Float[Array, "m k 3"], Float[Array, "m j 3"]]:

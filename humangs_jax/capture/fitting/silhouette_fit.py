@@ -8,7 +8,6 @@ loss of the start.
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Iterator, Sequence
 
@@ -64,6 +63,7 @@ from humangs_jax.capture.fitting.triangulation import reprojection_errors
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host, taken
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.processes import Call
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
@@ -217,7 +217,7 @@ def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
     )
 
 
-@jax.jit
+@compiled()
 def _moved(
     origin: Origin, state: FitState
 ) -> tuple[tuple[Float[Array, "v 3 3"], Float[Array, "v 4 4"]], Float[Array, " s"], BodyPose]:
@@ -310,7 +310,7 @@ def _as_motion(values: Float[Array, "m ..."], memory: Float[Array, " n"]) -> Flo
     return jnp.concatenate([values[:1], (values[1:] - r * values[:-1]) / jnp.sqrt(1 - r * r)])
 
 
-@functools.partial(jax.jit, static_argnames="independent")
+@compiled(static=["independent"])
 def solve_round(
     model: LandmarkModel,
     origin: Origin,
@@ -614,7 +614,7 @@ def overlap(
     return float((covered & person).sum() / (covered | person).sum())
 
 
-@jax.jit
+@compiled()
 def posed_vertices(
     body: BodyModel, betas: Float[Array, " s"], poses: BodyPose
 ) -> Float[Array, "m n 3"]:

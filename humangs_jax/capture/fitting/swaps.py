@@ -32,6 +32,7 @@ from humangs_jax.capture.fitting.triangulation import agreement, triangulate_rob
 from humangs_jax.capture.keypoints.keypoints import Keypoints, KeypointSet
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import replace
 
 
@@ -223,7 +224,7 @@ class Agreement(NamedTuple):
     """Agreement of each view if left and right of its keypoints were exchanged, (c,)."""
 
 
-@jax.jit
+@compiled()
 def agreements(
     observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]
 ) -> Agreement:

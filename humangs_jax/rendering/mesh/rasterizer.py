@@ -24,16 +24,15 @@ Derivatives: fragments are constants (`stop_gradient`). `interpolate_attributes`
 with respect to the attributes.
 """
 
-import functools
 from typing import Annotated
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import checked_arguments
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.configuration import Range, Spread, configuration
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
@@ -83,7 +82,7 @@ class Fragments(Batchable):
     """
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@compiled(static=["config"])
 @checked_arguments
 def rasterize_mesh(
     vertices: Float[Array, "n 3"],
@@ -119,7 +118,7 @@ def rasterize_mesh(
     )
 
 
-@jax.jit
+@compiled()
 @checked_arguments
 def interpolate_attributes(
     fragments: Fragments,
@@ -403,7 +402,7 @@ def gouraud_position_map(
     return _map(posed_vertices, 2 * colors - 1, faces, camera, config)
 
 
-@jax.jit
+@compiled()
 def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> Float[Array, "n 3"]:
     """Returns the unit normal of each vertex, (n, 3). It is the direction of the sum of the cross
     products of v1 - v0 and v2 - v0 over the vertex's faces. If the sum is 0, the normal is 0.
@@ -414,7 +413,7 @@ def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> F
     return safe_normalize(total, jnp.zeros(3))
 
 
-@jax.jit
+@compiled()
 def _light(albedo: Array, points: Array, normals: Array, eye: Array) -> Array:
     """Returns the colors of vertices by Phong's model, (n, 3): ambient and diffuse light times the
     albedo, plus a white highlight. eye: the camera's centre, (3,), normalised units.

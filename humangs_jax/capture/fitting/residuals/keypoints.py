@@ -3,7 +3,6 @@ they can be vmapped over frames and people.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +24,7 @@ from humangs_jax.capture.fitting.state import (
 from humangs_jax.capture.keypoints.keypoints import Keypoints
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.photos import Photos
@@ -226,7 +226,7 @@ def keypoint_errors(
     return pixels + observations.K[:, None, :2, 2] - observations.points
 
 
-@functools.partial(jax.jit, static_argnames="errors")
+@compiled(static=["errors"])
 def body_errors(
     model: LandmarkModel,
     betas: Float[Array, " s"],

@@ -17,7 +17,6 @@ points inside.
 """
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -29,6 +28,7 @@ from humangs_jax.body.model import BodyModel, SurfacePoints, surface_points
 from humangs_jax.capture.fitting.state import robust
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host
+from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
@@ -118,7 +118,7 @@ def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: C
     return BodyView(*map(np.asarray, look(vertices, faces, camera)))
 
 
-@jax.jit
+@compiled()
 def look(
     vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera
 ) -> tuple[Array, Array, Array, Array]:
@@ -338,7 +338,7 @@ def _ends_of_mask(
     return np.flatnonzero(found), body.normals[found], offsets[found]
 
 
-@jax.jit
+@compiled()
 def coverage(mask: Float[Array, "h w"], places: Float[Array, "p l 2"]) -> Float[Array, "p l"]:
     return sample_bilinear(mask[..., None], places - 0.5)[..., 0]
 
@@ -423,7 +423,7 @@ def padded(rows: np.ndarray, count: int) -> np.ndarray:
     return np.pad(rows, ((0, count - len(rows)),) + ((0, 0),) * (rows.ndim - 1))
 
 
-@functools.partial(jax.jit, static_argnames="coefficients")
+@compiled(static=["coefficients"])
 def _between(
     body: BodyModel,
     ends: Int[Array | np.ndarray, "v p 2"],

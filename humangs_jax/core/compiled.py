@@ -1,0 +1,356 @@
+"""Compiled functions whose programs stay on disk from one command to the next.
+
+JAX's cache keeps what XLA compiles, but finds it only by the lowered function. So a new process
+traces and lowers each function again, which takes longer than reading its program. A function with
+the decorator `compiled` finds its program by its name, the shapes of its arguments, its static
+arguments and the source of the package, and is not traced at all.
+
+Only the console script does this (`core.processes.keep_programs`), on a CPU. Elsewhere `compiled`
+is `jax.jit`: a notebook may change a function of the package while it runs, which the source does
+not show.
+"""
+
+import contextlib
+import dataclasses
+import enum
+import functools
+import hashlib
+import inspect
+import os
+import pickle
+import re
+import tempfile
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.experimental import serialize_executable
+
+from humangs_jax.core.processes import kept_programs
+
+T = TypeVar("T")
+
+PACKAGE = Path(__file__).parents[1]
+"""The folder of the package."""
+MADE_BY = ("jax", "jaxlib", "flax", "numpy", "optax", "optimistix", "equinox", "lineax")
+"""Packages whose versions are part of a program's name."""
+KNOWN = (PACKAGE.name, "builtins", "types", "collections", *MADE_BY)
+"""Packages whose classes and functions may be in the arguments of a program that is kept."""
+SETTINGS = ("enable_x64", "default_matmul_precision", "disable_jit", "debug_nans")
+"""Settings of JAX that a program depends on and that a block of code may change."""
+HIT = "/jax/compilation_cache/cache_hits"
+"""JAX's event of a program that its own cache on disk had."""
+
+
+class Compiled(Generic[T]):
+    """What `compiled` returns: a function that is compiled when it is called with arrays. Inside of
+    a transformation it becomes a part of the transformed program.
+
+    Types of arguments are not checked statically, as with `jax.jit`: arrays may be NumPy's.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., T],
+        static: Sequence[str],
+        options: Callable[[], dict[str, Any] | None] | None,
+    ) -> None:
+        functools.update_wrapper(self, function)
+        self.function: Any = function
+        self.signature = inspect.signature(function)
+        self.static = tuple(name for name in static if name in self.signature.parameters)
+        self.options = options
+        self._programs: dict[Any, Future[Any]] = {}
+        self._lock = threading.Lock()
+
+    @functools.cached_property
+    def jitted(self) -> Any:
+        """The function as `jax.jit` compiles it. It is made late, because the options may depend on
+        the device.
+        """
+        options = None if self.options is None else self.options()
+        return jax.jit(self.function, static_argnames=self.static, compiler_options=options)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> T:
+        """Returns the result of the function."""
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+            # JAX ignores the compiler options of an inner function
+            return (self.function if self.options else self.jitted)(*args, **kwargs)
+        call = self._call(args, kwargs)
+        program = None if call is None else self._program(call)
+        if call is None or program is None:
+            return self.jitted(*args, **kwargs)
+        return program(*call.args, **call.kwargs)
+
+    def __reduce__(self) -> str:
+        """Pickles the function by its name, as Python pickles functions."""
+        return self.function.__qualname__
+
+    def lower(self, *args: Any, **kwargs: Any) -> Any:
+        """Returns the lowered function, as the function of `jax.jit` does."""
+        return self.jitted.lower(*args, **kwargs)
+
+    def eval_shape(self, *args: Any, **kwargs: Any) -> Any:
+        """Returns the shapes of the result, as `jax.eval_shape`. They are kept on disk, too."""
+        call = self._call(args, kwargs)
+        file = None if call is None else self._file(call, "shapes")
+        if file is None:
+            return self.jitted.eval_shape(*args, **kwargs)
+        with contextlib.suppress(Exception):
+            return _read(file)
+        shapes = self.jitted.eval_shape(*args, **kwargs)
+        with contextlib.suppress(Exception):
+            _write(file, pickle.dumps(shapes))
+        return shapes
+
+    def prepare(self, *args: Any, **kwargs: Any) -> None:
+        """Compiles the program of these arguments, or reads it, so that the call need not. Arrays
+        may be `jax.ShapeDtypeStruct`.
+        """
+        call = self._call(args, kwargs)
+        if call is None or self._program(call) is None:
+            self.jitted.lower(*args, **kwargs).compile()
+
+    def _call(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> "_Call | None":
+        """Returns the arguments of a call apart from the static ones, and what its program depends
+        on. None if programs are not kept, or not those of such arguments.
+        """
+        folder = _folder()
+        if folder is None:
+            return None
+        bound = self.signature.bind(*args, **kwargs)
+        names = tuple(self.signature.parameters)
+        static = {name: bound.arguments[name] for name in self.static if name in bound.arguments}
+        dynamic = tuple(
+            value for name, value in zip(names, bound.args, strict=False) if name not in static
+        )
+        named = {name: value for name, value in bound.kwargs.items() if name not in static}
+        leaves, tree = jax.tree.flatten((dynamic, named))
+        shapes = tuple(map(_shape, leaves))
+        if None in shapes:
+            return None
+        settings = [getattr(jax.config, f"jax_{name}") for name in SETTINGS]
+        return _Call(
+            folder, bound, dynamic, named, (tree, shapes, tuple(static.items()), *settings)
+        )
+
+    def _program(self, call: "_Call") -> Callable[..., T] | None:
+        """Returns the program of a call. If another thread is making it, waits for it. None if
+        programs of this kind are not kept.
+        """
+        with self._lock:
+            future = self._programs.get(call.key)
+            first = future is None
+            if future is None:
+                future = self._programs[call.key] = Future()
+        if first:
+            try:
+                future.set_result(self._made(call))
+            except BaseException as error:
+                with self._lock:
+                    del self._programs[call.key]
+                future.set_exception(error)
+        return future.result()
+
+    def _made(self, call: "_Call") -> Callable[..., T] | None:
+        """Reads the program of a call from disk, or compiles it and writes it there. Returns None
+        if the program depends on something that has no stable text.
+        """
+        file = self._file(call, "program")
+        if file is None:
+            return None
+        # a file that cannot be read is made anew
+        with contextlib.suppress(Exception):
+            return serialize_executable.deserialize_and_load(*_read(file))
+        hits = _hits.count
+        lowered = self.jitted.lower(*call.bound.args, **call.bound.kwargs)
+        program = lowered.compile()
+        # XLA cannot write what it has read: the functions of such a program would be missing
+        if _hits.count == hits and _stands_alone(lowered.as_text()):
+            with contextlib.suppress(Exception):
+                _write(file, pickle.dumps(serialize_executable.serialize(program)))
+        return program
+
+    def _file(self, call: "_Call", kind: str) -> Path | None:
+        """Returns the file of a call. kind: what it holds. None if what the call depends on has no
+        stable text.
+        """
+        function = f"{self.function.__module__}.{self.function.__qualname__}"
+        options = None if self.options is None else self.options()
+        try:
+            about = _stable((kind, function, call.key, options))
+        except TypeError:
+            return None
+        name = hashlib.sha256(f"{_surroundings()}\n{about}".encode()).hexdigest()[:32]
+        return call.folder / f"{self.function.__name__}-{name}-cache"
+
+
+def compiled(
+    *, static: Sequence[str] = (), options: Callable[[], dict[str, Any] | None] | None = None
+) -> Callable[[Callable[..., T]], Compiled[T]]:
+    """Returns a decorator that compiles a function when it is called with arrays, and keeps its
+    programs on disk if the process does so (`core.processes.keep_programs`).
+
+    The function must depend on nothing but its arguments and the source of the package.
+
+    Args:
+        static: names of static parameters. Those that a function does not have are ignored.
+        options: returns the options of XLA. Called with the first arrays.
+
+    Examples:
+        >>> @compiled(static=["config"])
+        ... def scaled(x, config):
+        ...     return config * x
+    """
+    return lambda function: Compiled(function, static, options)
+
+
+class _Hits(threading.local):
+    """Counts the programs that JAX's own cache had, for each thread."""
+
+    count = 0
+
+    def note(self, event: str, **kwargs: Any) -> None:
+        """Counts an event of JAX."""
+        self.count += event == HIT
+
+
+_hits = _Hits()
+
+
+@functools.cache
+def _folder() -> Path | None:
+    """Returns the folder of the programs that this process keeps. None if it keeps none, or if it
+    computes on anything but a single CPU.
+    """
+    folder = kept_programs()
+    if folder is None or jax.default_backend() != "cpu" or jax.local_device_count() > 1:
+        return None
+    jax.monitoring.register_event_listener(_hits.note)
+    # jaxlib finds LAPACK when it lowers the first function that calls it: a program that is read
+    # would call nothing, and the process would crash
+    jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), np.float32))
+    return folder
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Call:
+    """A call of a compiled function whose program may be kept."""
+
+    folder: Path
+    """The folder of programs."""
+    bound: inspect.BoundArguments
+    """All arguments."""
+    args: tuple[Any, ...]
+    """Positional arguments that are not static."""
+    kwargs: dict[str, Any]
+    """Keyword arguments that are not static."""
+    key: tuple[Any, ...]
+    """What the program depends on: the tree, the shapes of its leaves, the static arguments."""
+
+
+def _stands_alone(program: str) -> bool:
+    """Returns whether a lowered program calls nothing but XLA and LAPACK. Functions of Python that
+    it calls would not be there in another process, and that would crash.
+    """
+    called = re.findall(r"custom_call @(\S+)", program)
+    return all(name.startswith("lapack_") for name in called)
+
+
+def _shape(leaf: Any) -> tuple[Any, ...] | None:
+    """Returns shape, type and kind of an argument. None for arrays on several devices and for what
+    is no array.
+    """
+    if isinstance(leaf, jax.Array | jax.ShapeDtypeStruct):
+        weak = getattr(leaf, "weak_type", False)  # keys of random numbers have none
+        return leaf.shape, str(leaf.dtype), bool(weak)
+    if isinstance(leaf, np.ndarray | np.generic):
+        return leaf.shape, str(jax.dtypes.canonicalize_dtype(leaf.dtype)), False
+    if isinstance(leaf, bool | int | float | complex):
+        return (type(leaf).__name__,)
+    return None
+
+
+def _stable(value: Any) -> str:
+    """Returns a text that is equal in two processes if, and only if, the values are.
+
+    Raises: TypeError for values of other packages' classes, whose source may change.
+    """
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes):
+        return repr(value)
+    if isinstance(value, enum.Enum):
+        return f"{_name(type(value))}.{value.name}"
+    if isinstance(value, tuple | list):
+        return f"{_name(type(value))}({','.join(map(_stable, value))})"
+    if isinstance(value, set | frozenset):
+        return f"{_name(type(value))}({','.join(sorted(map(_stable, value)))})"
+    if isinstance(value, Mapping):
+        items = ",".join(f"{_stable(key)}:{_stable(item)}" for key, item in value.items())
+        return f"{_name(type(value))}({items})"
+    if isinstance(value, np.dtype):
+        return str(value)
+    if isinstance(value, np.ndarray):
+        digest = hashlib.sha256(value.tobytes()).hexdigest()
+        return f"{value.dtype}{value.shape}{digest}"
+    if isinstance(value, jax.tree_util.PyTreeDef):
+        node = value.node_data()
+        if node is None:
+            return "*"
+        return f"{_stable(node)}({','.join(map(_stable, value.children()))})"
+    if isinstance(value, type) or inspect.isfunction(value):
+        return _name(value)
+    if dataclasses.is_dataclass(value):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return f"{_name(type(value))}({_stable(fields)})"
+    raise TypeError(f"{type(value).__name__}: expected what has a stable text")
+
+
+def _name(thing: Any) -> str:
+    """Returns the name of a class or function of a package in `KNOWN`.
+
+    Raises: TypeError for one of another package, or one that was made inside of a function.
+    """
+    name = f"{thing.__module__}.{thing.__qualname__}"
+    if name.partition(".")[0] not in KNOWN or "<" in name:
+        raise TypeError(f"{name}: expected a class or function of the package")
+    return name
+
+
+@functools.cache
+def _surroundings() -> str:
+    """Returns what all programs depend on: the source of the package, the versions of what compiles
+    it, and the settings of JAX and XLA in environment variables.
+    """
+    source = hashlib.sha256()
+    for file in sorted(PACKAGE.rglob("*.py")):
+        source.update(f"{file.relative_to(PACKAGE)}\0".encode() + file.read_bytes() + b"\0")
+    settings = {
+        name: value
+        for name, value in sorted(os.environ.items())
+        if name.startswith(("JAX_", "XLA_")) and "CACHE" not in name
+    }
+    versions = {name: version(name) for name in MADE_BY}
+    return f"{source.hexdigest()} {versions} {settings}"
+
+
+def _read(file: Path) -> Any:
+    """Returns what a file holds. Files that were not used for longest are deleted first, so that
+    the file is noted as used.
+    """
+    value = pickle.loads(file.read_bytes())
+    os.utime(file)
+    return value
+
+
+def _write(file: Path, data: bytes) -> None:
+    """Writes a file at once, so that no other process reads a part of it."""
+    with tempfile.NamedTemporaryFile(dir=file.parent, suffix="-cache", delete=False) as temporary:
+        temporary.write(data)
+    os.replace(temporary.name, file)
