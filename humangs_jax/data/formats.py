@@ -122,7 +122,7 @@ _CAMERAS = "humangs_jax.capture.calibration."
 """The package whose modules read cameras."""
 _KEYPOINTS = "humangs_jax.capture.keypoints.formats:read_"
 """The module that reads keypoints, and the beginning of the names of its functions."""
-_MODELS = ("", "sparse/0/", "sparse/")
+_MODELS = ("", "sparse/0/", "sparse/", "0/")
 CAMERAS = SourceFormats(
     colmap=CameraFormat(
         "COLMAP",
@@ -148,7 +148,7 @@ CAMERAS = SourceFormats(
     transforms=CameraFormat(
         "NeRF, instant-ngp, nerfstudio or VHAP",
         _CAMERAS + "scenes:read_transforms",
-        files=("transforms.json",),
+        files=("transforms.json", "transforms_train.json"),
         content="JSON with `frames`: `transform_matrix` is camera-to-world with OpenGL's axes",
         up="+z",
         pixel_centers="half",

@@ -25,6 +25,18 @@ INTRINSICS = (
     "intrinsic_matrix",
 )
 """Keys by which programs write the lens of one camera alone."""
+AS_COLMAP = {
+    ("<document", "<chunk"): "cameras of Metashape (File > Export > Export Cameras > Colmap)",
+    ("#name,x,y,alt",): "cameras of RealityScan (export the registration as COLMAP)",
+    ("xcr:Position",): "cameras of RealityScan (export the registration as COLMAP)",
+    ('"shots"', '"cameras"'): "a model of OpenSfM (`opensfm export_colmap` converts it)",
+    ('"poseId"', '"intrinsicId"'): "a model of Meshroom (`aliceVision_exportColmap` converts it)",
+}
+"""Words of calibrations of programs that can also write COLMAP's, and how they do it."""
+POSE = re.compile(r"extrinsics?|rotation|translation|[rt]vecs?|[RT]", re.IGNORECASE)
+"""Matches a key of where a camera stands."""
+PARTS = ("rows", "cols", "dt", "data")
+"""Keys inside of a matrix of OpenCV, which tell nothing about a file."""
 KEY = re.compile(r"""^[ \t]*["']?([A-Za-z_][\w .-]*?)["']?[ \t]*[:=]""", re.MULTILINE)
 """A key of JSON, YAML or TOML at the beginning of a line."""
 KEYS_SHOWN = 6
@@ -50,11 +62,14 @@ def described(text: str) -> str:
             "a camchain of Kalibr: write R and T of each camera into calibration.json,"
             " docs/cameras.md"
         )
-    if any(key in INTRINSICS for key in keys):
+    if any(key in INTRINSICS for key in keys) and not any(map(POSE.fullmatch, keys)):
         return (
             "the lens of one camera, without where it stands: K, R and T of each camera are needed"
         )
-    names = list(dict.fromkeys(keys))
+    for words, advice in AS_COLMAP.items():
+        if all(word in text for word in words):
+            return advice
+    names = list(dict.fromkeys(key for key in keys if key not in PARTS))
     if names:
         return f"it has the keys {few(names, KEYS_SHOWN)}"
     return f"a text that begins with {text.split()[0][:40]!r}"

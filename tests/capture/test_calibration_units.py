@@ -131,10 +131,14 @@ KALIBR = (
     "cam0:\n  distortion_model: radtan\n  intrinsics: [1, 1, 1, 1]\n  T_cn_cnm1:\n  - [1, 0, 0,"
     " 0]\n"
 )
+METASHAPE = (
+    '<?xml version="1.0" encoding="UTF-8"?>\n<document version="1.5.0">\n  <chunk label="Chunk 1"/>'
+)
 LENS = (
     "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data:"
     " [1,0,0, 0,1,0, 0,0,1]\n"
 )
+STEREO = LENS.replace("camera_matrix", "K1") + "R: [1, 0, 0]\n"
 
 
 @pytest.mark.parametrize(
@@ -143,6 +147,12 @@ LENS = (
         ("annots.npy", b"\x93NUMPY\x01\0v\0{}", "an array of NumPy, such as annots.npy"),
         ("camchain.yaml", KALIBR.encode(), "a camchain of Kalibr"),
         ("camera.yml", LENS.encode(), "the lens of one camera, without where it stands"),
+        ("cameras.xml", METASHAPE.encode(), "Metashape (File > Export > "),
+        ("poses.csv", b"#name,x,y,alt,heading,pitch,roll,f\n", "export the registration as COLMAP"),
+        ("reconstruction.json", b'[{"cameras": {}, "shots": {}}]', "`opensfm export_colmap`"),
+        ("small.sfm", b'[{"poseId": "1", "intrinsicId": "2"}]', "`aliceVision_exportColmap`"),
+        ("path.json", b'{"extrinsic": [1], "intrinsic_matrix": [1]}', "it has the keys extrinsic"),
+        ("stereo.yml", STEREO.encode(), "it has the keys K1, R: not a known format"),
         ("mine.json", b'{"focal": 3, "poses": []}', "it has the keys focal, poses"),
         ("none.json", b"", "none.json: not a known format"),
     ],

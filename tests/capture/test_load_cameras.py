@@ -18,6 +18,8 @@ MODELS = {
     "OPENCV_FISHEYE": ((0.05, -0.02, 0.008, -0.001), "fisheye", (0.05, -0.02, 0.008, -0.001)),
     "RADIAL_FISHEYE": ((0.05, -0.02), "fisheye", (0.05, -0.02, 0, 0)),
     "SIMPLE_RADIAL_FISHEYE": ((0.05,), "fisheye", (0.05, 0, 0, 0)),
+    "SIMPLE_FISHEYE": ((), "fisheye", (0, 0, 0, 0)),
+    "FISHEYE": ((), "fisheye", (0, 0, 0, 0)),
     "FULL_OPENCV": (
         (0.1, -0.2, 0.01, 0.02, 0.03, 0.04, -0.05, 0.06),
         "pinhole",
@@ -35,7 +37,7 @@ def model_of(folder, model, extra):
     seen = [written.project(k, pose, POINTS) for k, pose in zip(K, poses, strict=True)]
     names = [f"left/{name}" for name in FILES]
     written.write_colmap(folder, K, poses, names, model, extra, seen, POINTS)
-    if model in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"):  # one focal length
+    if model in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE"):  # one focal length
         lines = (folder / "cameras.txt").read_text().splitlines()
         lines = [lines[0], *(" ".join(np.delete(x.split(), 5)) for x in lines[1:])]
         (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
@@ -66,6 +68,11 @@ def test_cameras_of_colmap_keep_their_lens_their_world_and_its_points(tmp_path, 
         assert hg.load_cameras(tmp_path, lenses=False)[names[0]].is_plain
 
 
+def test_the_folder_of_all_models_of_colmap_leads_to_the_first(tmp_path):
+    model_of(tmp_path / "sparse" / "0", "PINHOLE", ())
+    assert len(hg.load_cameras(tmp_path / "sparse")) == len(hg.load_cameras(tmp_path)) == 4
+
+
 def test_y_up_turns_the_world_and_pixel_centres_become_ours(tmp_path):
     K, poses = written.scene()
     turned = written.in_source(poses, turn=written.Y_UP_FROM_Z_UP.T)
@@ -93,7 +100,8 @@ def test_y_up_turns_the_world_and_pixel_centres_become_ours(tmp_path):
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.01}, "fisheye", 4),
         ({"is_fisheye": True, "k1": 0.1}, "fisheye", 4),
         ({"k1": 0.1, "p2": 0.01}, "pinhole", 5),
-        ({"k1": 0.1, "k4": 0.01}, "pinhole", 8),
+        ({"k1": 0.1, "k4": 0.01, "k5": 0.02, "k6": 0.03}, "pinhole", 8),
+        ({"k1": 0.1, "camera_model": "SIMPLE_RADIAL"}, "pinhole", 5),
     ],
 )
 def test_lenses_of_transforms_are_kept(tmp_path, changes, lens, count):
@@ -101,6 +109,22 @@ def test_lenses_of_transforms_are_kept(tmp_path, changes, lens, count):
     camera = hg.load_cameras(tmp_path)["a.png"]
     assert camera.lens == lens and camera.distortion.shape == (count,)
     assert float(camera.distortion[0]) == pytest.approx(0.1)
+    if count == 8:
+        np.testing.assert_allclose(camera.distortion[5:], [0.01, 0.02, 0.03], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"k1": 0.1, "k4": 0.01}, r"frames\[0\]\.k4: a radial coefficient of r\^8"),
+        ({"ftheta_p0": 0.0}, r"frames\[0\]\.ftheta_p0: expected a pinhole"),
+        ({"equirectangular": True}, r"frames\[0\]\.equirectangular: expected a pinhole"),
+    ],
+)
+def test_lenses_that_no_camera_here_has_are_refused(tmp_path, changes, problem):
+    written.write_transforms(tmp_path / "transforms.json", *written.scene(), FILES, **changes)
+    with pytest.raises(CaptureError, match=problem):
+        hg.load_cameras(tmp_path)
 
 
 @pytest.mark.parametrize(

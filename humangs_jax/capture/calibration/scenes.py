@@ -56,10 +56,22 @@ _PARAMETERS = {
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
     "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "SIMPLE_FISHEYE": ("f", "cx", "cy"),
+    "FISHEYE": ("fx", "fy", "cx", "cy"),
 }
 """Camera models and the names of their parameters, in the order of cameras.txt."""
-NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9), _PARAMETERS, strict=True))
+NUMBERS = dict(zip((0, 1, 2, 3, 4, 5, 6, 8, 9, 14, 15), _PARAMETERS, strict=True))
 """Names of camera models by their numbers in cameras.bin."""
+_NOT_READ = {
+    7: "FOV",
+    10: "THIN_PRISM_FISHEYE",
+    11: "RAD_TAN_THIN_PRISM_FISHEYE",
+    12: "SIMPLE_DIVISION",
+    13: "DIVISION",
+    16: "EUCM",
+    17: "EQUIRECTANGULAR",
+}
+"""Names of the other camera models by their numbers, for errors."""
 
 
 def read_colmap(source: CalibrationFile, format: CameraFormat) -> Calibration:
@@ -239,7 +251,7 @@ def _binary_cameras(file: Path) -> Iterator[tuple[str, CalibratedCamera]]:
         data = _Bytes(file)
         for i in range(*data.read("Q")):
             camera_id, number, width, height = data.read("iiQQ")
-            model = NUMBERS.get(number, str(number))
+            model = NUMBERS.get(number) or _NOT_READ.get(number, f"number {number}")
             _check_camera_model(model, file, f"camera {i}")
             values = data.read("d" * len(_PARAMETERS[model]))
             yield str(camera_id), _lens(model, (width, height), values, file, f"camera {i}")
@@ -271,10 +283,12 @@ def _binary_points(file: Path) -> Iterator[tuple[int, Sequence[float]]]:
 # transforms.json
 # --------------------------------------------------------------------------------------------------
 
-_CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+_CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 """Values of `camera_model` for lenses that can be undistorted."""
 _FISHEYE_MODEL = "OPENCV_FISHEYE"
 """Value of `camera_model` for a fisheye lens."""
+_OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
+"""Keys by which instant-ngp knows lenses that are not read."""
 _MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_intrinsics")
 """Keys of a whole matrix K, in a frame or in the file."""
 
@@ -382,7 +396,7 @@ def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str,
     undistorted gets an error among them, which is raised by commands that need photos without
     distortion.
 
-    Raises: CaptureError if the camera model is not supported.
+    Raises: CaptureError if the lens is not supported.
     """
     model, refusal = values.get("camera_model", "OPENCV"), None
     if model not in _CAMERA_MODELS:
@@ -390,21 +404,25 @@ def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str,
         refusal = CaptureError(file, f"{prefix}camera_model", f"{shown(model)}: {expected}")
         if model != _FISHEYE_MODEL:
             raise refusal
-    # five coefficients do not describe these lenses
-    for key in ("is_fisheye", "k4"):
-        if values.get(key) and refusal is None:
-            problem = f"fisheye lenses are not supported: {UNDISTORT_BEFORE}"
-            refusal = CaptureError(file, f"{prefix}{key}", problem)
+    for key in _OTHER_LENSES:
+        if values.get(key, False) is not False:
+            problem = "expected a pinhole with the lens k1 k2 p1 p2 k3, or a fisheye"
+            raise CaptureError(file, f"{prefix}{key}", problem)
+    if values.get("is_fisheye") and refusal is None:
+        problem = f"fisheye lenses are not supported: {UNDISTORT_BEFORE}"
+        refusal = CaptureError(file, f"{prefix}is_fisheye", problem)
 
-    is_fisheye = model == _FISHEYE_MODEL or bool(values.get("is_fisheye"))
-    keys = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2", "k3", "k4")
-    coefficients = [_number(values, key, file, prefix) if key in values else 0.0 for key in keys]
-    if refusal is not None and is_fisheye:
-        return fisheye_lens(coefficients, file, f"{prefix}k1", refusal)
-    lens = pinhole_lens([*coefficients, 0.0, 0.0], file, f"{prefix}k1")
+    def coefficients(*keys: str) -> list[float]:
+        return [_number(values, key, file, prefix) if key in values else 0.0 for key in keys]
+
     if refusal is not None:
-        lens["refusal"] = refusal
-    return lens
+        return fisheye_lens(coefficients("k1", "k2", "k3", "k4"), file, f"{prefix}k1", refusal)
+    beyond = coefficients("k4", "k5", "k6")
+    # with k5 or k6, k4 is in OpenCV's denominator; alone it is Brown's (nerfstudio, Metashape)
+    if beyond[0] and not any(beyond[1:]):
+        problem = f"a radial coefficient of r^8 is not supported: {UNDISTORT_BEFORE}"
+        raise CaptureError(file, f"{prefix}k4", problem)
+    return pinhole_lens([*coefficients("k1", "k2", "p1", "p2", "k3"), *beyond], file, f"{prefix}k1")
 
 
 def _number(values: Mapping[str, Any], key: str, file: Path, prefix: str) -> float:
