@@ -8,6 +8,7 @@ unit of length, the world's up axis and the place of pixel centres are as in the
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -199,11 +200,11 @@ class CalibrationFile:
 
     @functools.cached_property
     def json(self) -> Any:
-        """The value of a file that begins like a JSON object, else None.
+        """The value of a file that begins like a JSON object or like a list of objects, else None.
 
         Raises: CaptureError.
         """
-        if self.text.lstrip().startswith("{"):
+        if re.match(r"\s*(\{|\[\s*\{)", self.text):
             return checked_json(self.path, self.text)
         return None
 

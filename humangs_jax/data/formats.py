@@ -154,6 +154,16 @@ CAMERAS = SourceFormats(
         pixel_centers="half",
         per_image=True,
     ),
+    splatting=CameraFormat(
+        "3DGS",
+        _CAMERAS + "scenes:read_splatting",
+        content=(
+            "JSON (`cameras.json` beside the splats): a list of `img_name`, `position`, `rotation`,"
+            " `fx`, `fy`, `width`, `height`"
+        ),
+        pixel_centers="half",
+        per_image=True,
+    ),
     toml=CameraFormat(
         "Caliscope, Anipose or Pose2Sim",
         _CAMERAS + "rigs:read_toml",

@@ -1,5 +1,7 @@
 """`load_cameras` reads cameras of other tools in their own world, with lenses and points."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -125,6 +127,31 @@ def test_lenses_that_no_camera_here_has_are_refused(tmp_path, changes, problem):
     written.write_transforms(tmp_path / "transforms.json", *written.scene(), FILES, **changes)
     with pytest.raises(CaptureError, match=problem):
         hg.load_cameras(tmp_path)
+
+
+def test_cameras_beside_splats_of_3dgs(tmp_path):
+    # the camera stands at (1, 2, 3) and looks along the world's x, its y points along the world's -z
+    entry = {
+        "img_name": "r_0",
+        "width": 80,
+        "height": 60,
+        "position": [1.0, 2.0, 3.0],
+        "rotation": [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]],
+        "fx": 90.0,
+        "fy": 91.0,
+    }
+    file = tmp_path / "cameras.json"
+    file.write_text(json.dumps([{"id": 0, **entry}]))
+    camera = hg.load_cameras(file)["r_0"]
+    np.testing.assert_allclose(camera.K, [[90, 0, 40], [0, 91, 30], [0, 0, 1]])
+    pixel, depth = project(camera, jnp.asarray([[3.0, 2.0, 3.0]]))
+    np.testing.assert_allclose(pixel, [[40, 30]], atol=PIXELS)
+    np.testing.assert_allclose(depth, [2.0], atol=1e-6)
+    below, _ = project(camera, jnp.asarray([[3.0, 2.0, 2.0]]))
+    np.testing.assert_allclose(below, [[40, 30 + 91 / 2]], atol=PIXELS)
+    file.write_text(json.dumps([entry, entry | {"position": [1.0, 2.0]}]))
+    with pytest.raises(CaptureError, match=r"\[1\]\.position: expected 3 numbers"):
+        hg.load_cameras(file)
 
 
 @pytest.mark.parametrize(

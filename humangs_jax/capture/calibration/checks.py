@@ -13,6 +13,7 @@ from humangs_jax.data.cameras import (
     CONVENTIONS,
     OPENGL_FROM_OPENCV,
     ROTATION_TO_Y_UP,
+    WORLD_FROM_CAM,
     WORLD_FROM_CAM_OPENGL,
     CalibratedCamera,
     Calibration,
@@ -227,7 +228,9 @@ def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> 
     if _axes_meeting(poses)[0] is None or np.isfinite(_miss(poses)):
         return []
     matrices = poses
-    if convention == WORLD_FROM_CAM_OPENGL:
+    if convention == WORLD_FROM_CAM:
+        matrices = np.linalg.inv(poses)
+    elif convention == WORLD_FROM_CAM_OPENGL:
         matrices = np.linalg.inv(OPENGL_FROM_OPENCV @ poses)
     misses = {name: _miss(meaning(matrices)) for name, meaning in CONVENTIONS.items()}
     best = min(misses, key=lambda name: misses[name])

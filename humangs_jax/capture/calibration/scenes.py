@@ -1,5 +1,5 @@
-"""Reads formats that list a camera for each image: COLMAP's models, and transforms.json (NeRF,
-nerfstudio, GaussianAvatars, VHAP).
+"""Reads formats that list a camera for each image: COLMAP's models, transforms.json (NeRF,
+nerfstudio, GaussianAvatars, VHAP), and the cameras.json that 3DGS writes beside its splats.
 
 A COLMAP model is a folder with cameras.txt, images.txt and, optionally, points3D.txt, or with the
 same files as .bin (https://colmap.github.io/format.html). images.txt has two lines for each image:
@@ -19,6 +19,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.cameras import (
     CONVENTIONS,
     UNDISTORT_BEFORE,
+    WORLD_FROM_CAM,
     WORLD_FROM_CAM_OPENGL,
     CalibratedCamera,
     Calibration,
@@ -29,6 +30,7 @@ from humangs_jax.data.cameras import (
     intrinsics,
     pinhole_lens,
     pose_matrix,
+    rotation,
 )
 from humangs_jax.data.capture_checks import (
     CaptureError,
@@ -427,6 +429,43 @@ def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str,
 
 def _number(values: Mapping[str, Any], key: str, file: Path, prefix: str) -> float:
     return float(floats(values[key], file, f"{prefix}{key}", ()))
+
+
+# cameras.json of 3DGS
+# --------------------------------------------------------------------------------------------------
+
+
+def recognizes_splatting(source: CalibrationFile) -> bool:
+    """Returns whether a file is a JSON list whose first entry has a name, a place and a rotation of
+    3DGS.
+    """
+    first = source.json[:1] if isinstance(source.json, list) else []
+    return bool(first) and {"img_name", "position", "rotation"} <= first[0].keys()
+
+
+def read_splatting(source: CalibrationFile, format: CameraFormat) -> Calibration:
+    """Reads the cameras of the list. `rotation` and `position` place the camera in the world, with
+    OpenCV's axes. The principal point is the middle of the image.
+
+    Raises: CaptureError with the name of the key.
+    """
+    cameras, file = [], source.path
+    for i, entry in enumerate(source.json):
+        prefix = f"[{i}]."
+        expect(entry, dict, file, f"[{i}]")
+        (name,) = members(entry, file, f"[{i}]", img_name=str)
+        sides = [required(entry, key, file, prefix) for key in ("width", "height")]
+        width, height = image_size(sides, file, f"{prefix}width, height")
+        focal = []
+        for key in ("fx", "fy"):
+            required(entry, key, file, prefix)
+            focal.append(_number(entry, key, file, prefix))
+        turn = rotation(required(entry, "rotation", file, prefix), file, f"{prefix}rotation").T
+        place = required(entry, "position", file, prefix)
+        pose = pose_matrix(turn, -turn @ floats(place, file, f"{prefix}position", (3,)))
+        K = intrinsics(*focal, 0.5 * width, 0.5 * height)
+        cameras.append(CalibratedCamera(name, K, pose, width, height))
+    return source.calibration(format, cameras, convention=WORLD_FROM_CAM)
 
 
 # Moments
