@@ -498,6 +498,16 @@ def test_what_a_file_cannot_hold_is_not_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_spz_that_a_download_unpacked_is_read(tmp_path):
+    packed, plain = tmp_path / "packed.spz", tmp_path / "plain.spz"
+    hg.save_gaussians(packed, scene(3))
+    plain.write_bytes(gzip.decompress(packed.read_bytes()))
+    assert_close(hg.load_gaussians(plain), hg.load_gaussians(packed), [0] * 5)
+    plain.write_bytes(plain.read_bytes()[:-1])
+    with pytest.raises(FileError, match=r"expected 20 Gaussians in .* bytes, got less"):
+        hg.load_gaussians(plain)
+
+
 def test_version_4_is_written_and_read(tmp_path):
     """The table names each array and no more; versions 3 and 4 hold the same numbers."""
     for count in COUNTS:

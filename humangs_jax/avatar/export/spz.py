@@ -184,10 +184,11 @@ def read_spz(data: bytes, notes: list[str]) -> Gaussians:
 
     Raises: InvalidFileError; for damaged files also the errors of gzip and zstd.
     """
-    if data.startswith(b"NGSP"):
+    version = int.from_bytes(data[4:8], "little")
+    if data.startswith(b"NGSP") and version >= WITH_TABLE:
         header, parts = _with_table(data, notes)
     else:
-        header, parts = _of_gzip(data)
+        header, parts = _of_stream(data)
     # what is in the file and not used
     if header.flags & ANTIALIASED:
         notes.append(
@@ -196,18 +197,18 @@ def read_spz(data: bytes, notes: list[str]) -> Gaussians:
         )
     if header.flags & MORE_BEHIND and header.version < WITH_TABLE:
         notes.append("records of other programs at its end are not used")
-    count, version = header.count, header.version
+    count = header.count
     # each part holds one property of all Gaussians
     positions, opacities, colors, scales, quats, harmonics = (
         np.frombuffer(part, "u1").reshape(count, width)
         for part, width in zip(parts, header.widths, strict=True)
     )
     # bytes to numbers; places and rotations differ by the version
-    if version == 1:
+    if header.version == 1:
         means = positions.view("<f2")
     else:
         means = _fixed_point(positions, header.bits)
-    if version < 3:
+    if header.version < 3:
         rotations = with_largest(quats / 127.5 - 1, np.zeros(count))
     else:
         rotations = _smallest_three(quats)
@@ -248,9 +249,12 @@ def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header
     return header
 
 
-def _of_gzip(data: bytes) -> tuple[_Header, list[bytes]]:
-    """Returns the header and the six arrays of a file of version 1 to 3."""
-    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+def _of_stream(data: bytes) -> tuple[_Header, list[bytes]]:
+    """Returns the header and the six arrays of a file of version 1 to 3. It is a gzip, or what the
+    gzip held, which downloads unpack if the server declares the gzip as an encoding.
+    """
+    packed = io.BytesIO(data)
+    with packed if data.startswith(b"NGSP") else gzip.GzipFile(fileobj=packed) as file:
         header = _checked_header(file.read(HEADER.size), (1, 2, 3), len(data))
         sizes = [header.count * width for width in header.widths]
         content = file.read(sum(sizes) + 1)
