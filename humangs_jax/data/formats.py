@@ -130,7 +130,7 @@ CAMERAS = SourceFormats(
         files=tuple(
             place + name
             for place in _MODELS
-            for name in ("images.txt", "cameras.txt", "images.bin")
+            for name in ("images.txt", "cameras.txt", "images.bin", "cameras.bin")
         ),
         content="text or binary: SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV",
         folder=True,

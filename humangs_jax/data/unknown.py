@@ -25,14 +25,15 @@ INTRINSICS = (
     "intrinsic_matrix",
 )
 """Keys by which programs write the lens of one camera alone."""
-AS_COLMAP = {
+CONVERTED = {
     ("<document", "<chunk"): "cameras of Metashape (File > Export > Export Cameras > Colmap)",
     ("#name,x,y,alt",): "cameras of RealityScan (export the registration as COLMAP)",
     ("xcr:Position",): "cameras of RealityScan (export the registration as COLMAP)",
+    ("<opencv_storage>",): "OpenCV's XML (write .yml or .json with cv2.FileStorage)",
     ('"shots"', '"cameras"'): "a model of OpenSfM (`opensfm export_colmap` converts it)",
     ('"poseId"', '"intrinsicId"'): "a model of Meshroom (`aliceVision_exportColmap` converts it)",
 }
-"""Words of calibrations of programs that can also write COLMAP's, and how they do it."""
+"""Words of calibrations of programs that can also write a format that is read, and how."""
 POSE = re.compile(r"extrinsics?|rotation|translation|[rt]vecs?|[RT]", re.IGNORECASE)
 """Matches a key of where a camera stands."""
 PARTS = ("rows", "cols", "dt", "data")
@@ -66,7 +67,7 @@ def described(text: str) -> str:
         return (
             "the lens of one camera, without where it stands: K, R and T of each camera are needed"
         )
-    for words, advice in AS_COLMAP.items():
+    for words, advice in CONVERTED.items():
         if all(word in text for word in words):
             return advice
     names = list(dict.fromkeys(key for key in keys if key not in PARTS))

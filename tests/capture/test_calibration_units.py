@@ -151,6 +151,7 @@ STEREO = LENS.replace("camera_matrix", "K1") + "R: [1, 0, 0]\n"
         ("poses.csv", b"#name,x,y,alt,heading,pitch,roll,f\n", "export the registration as COLMAP"),
         ("reconstruction.json", b'[{"cameras": {}, "shots": {}}]', "`opensfm export_colmap`"),
         ("small.sfm", b'[{"poseId": "1", "intrinsicId": "2"}]', "`aliceVision_exportColmap`"),
+        ("out.xml", b"<?xml version='1.0'?>\n<opencv_storage>\n<K_a>", "cv2.FileStorage"),
         ("path.json", b'{"extrinsic": [1], "intrinsic_matrix": [1]}', "it has the keys extrinsic"),
         ("stereo.yml", STEREO.encode(), "it has the keys K1, R: not a known format"),
         ("mine.json", b'{"focal": 3, "poses": []}', "it has the keys focal, poses"),

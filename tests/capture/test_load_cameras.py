@@ -75,6 +75,16 @@ def test_the_folder_of_all_models_of_colmap_leads_to_the_first(tmp_path):
     assert len(hg.load_cameras(tmp_path / "sparse")) == len(hg.load_cameras(tmp_path)) == 4
 
 
+def test_poses_of_three_rows_are_read(tmp_path):
+    file = tmp_path / "transforms.json"
+    written.write_transforms(file, *written.scene(), FILES)
+    whole = hg.load_cameras(file)["b.png"]
+    edit_json(file, lambda v: [each["transform_matrix"].pop() for each in v["frames"]])
+    np.testing.assert_array_equal(
+        hg.load_cameras(file)["b.png"].cam_from_world, whole.cam_from_world
+    )
+
+
 def test_y_up_turns_the_world_and_pixel_centres_become_ours(tmp_path):
     K, poses = written.scene()
     turned = written.in_source(poses, turn=written.Y_UP_FROM_Z_UP.T)

@@ -36,6 +36,7 @@ from humangs_jax.data.capture_checks import (
     CaptureError,
     checked_text,
     expect,
+    file_numbers,
     floats,
     members,
     required,
@@ -353,7 +354,11 @@ def _frame_camera(
         size = photo_size(name)
     K = _frame_intrinsics(values, size, file, prefix)
     width, height = size or (None, None)
-    matrix = required(values, "transform_matrix", file, prefix)
+    matrix = file_numbers(
+        required(values, "transform_matrix", file, prefix), file, f"{prefix}transform_matrix"
+    )
+    if matrix.shape == (3, 4):  # nerfstudio and instant-ngp read no more than three rows
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
     pose = floats(matrix, file, f"{prefix}transform_matrix", (4, 4))
     try:
         cam_from_world = CONVENTIONS[WORLD_FROM_CAM_OPENGL](pose)
