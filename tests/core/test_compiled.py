@@ -17,6 +17,7 @@ from humangs_jax.core import processes
 from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.buffers import needed_by
 
 
 @pytest.fixture(autouse=True)
@@ -225,6 +226,10 @@ def test_what_calls_python_is_not_kept(folder):
 
     assert np.array_equal(told(np.ones(3, np.float32)), np.full(3, 2))
     assert list(folder.iterdir()) == []
+
+
+def test_a_compiled_function_is_pickled_by_its_name():
+    assert pickle.loads(pickle.dumps(needed_by)) is needed_by
 
 
 def test_without_the_console_script_nothing_is_kept():
