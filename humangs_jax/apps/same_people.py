@@ -143,8 +143,8 @@ Row = list[PersonInPhoto | None]
 def _matched(
     photos: Sequence[PhotoPeople], cameras: Camera, frames: Int[np.ndarray, " v"]
 ) -> list[Row]:
-    """Returns the people of each photo by number, as far as cameras and time show who is who.
-    frames: the moment of each photo, (v,).
+    """Returns one row for each photo. Equal indices mean the same person in all rows, as far as
+    cameras and times show it. frames: the moment of each photo, (v,).
     """
     K, transforms = (np.asarray(x, np.float64) for x in (cameras.K, cameras.cam_from_world))
     points = [

@@ -43,7 +43,7 @@ class Start:
         ),
     ] = None
     masks: Path | None = None
-    """Folder of the masks, if it is elsewhere."""
+    """Folder of the masks, if they are not in the folder of photos."""
     others: Path | None = None
     """Folder of masks of other people and of things in front of the person, if it is elsewhere.
 

@@ -138,7 +138,9 @@ class Calibration:
     up: str
     """The world's up axis in this format, unless the user says otherwise."""
     observations: Observations | None = None
-    """The points that the calibration saw; None where the format has none."""
+    """The points that the cameras saw while they were calibrated. None if there are none, or if the
+    format has none.
+    """
     convention: str = CAM_FROM_WORLD
     """What the matrices in the file mean, a key of `CONVENTIONS`."""
     stations: int | None = None

@@ -533,8 +533,8 @@ def _seen(
 
 
 def calls_of_painted_body(inputs: Capture, views: Capture) -> Iterator[Call]:
-    """Yields a call of each of the two jitted functions that draw, as `painted_body` and
-    `draw_painted_body` call them.
+    """Yields a call of `_seen`, as `painted_body` makes it, and one of `_painted`, as
+    `draw_painted_body` makes it. The colors are zeros.
     """
     body = inputs.body
     rest = shape_body(body, from_host(inputs.betas))

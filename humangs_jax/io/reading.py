@@ -334,8 +334,9 @@ def walk(
     """Yields the files of a folder and of its subfolders, except names that begin with a dot and
     folders that `skip` accepts.
 
-    Each folder is searched once, however many links lead to it. Links that lead out of the folder
-    are not followed, unless the limit `photos_outside` allows it; the first such link is logged.
+    Each folder is searched once, however many links lead to it. Links to folders outside of the
+    folder are not followed, unless the limit `photos_outside` allows it; the first such link is
+    logged. Links to files are yielded, wherever they lead.
 
     Raises: InvalidFileError beyond the limit `entries`; OSError.
     """

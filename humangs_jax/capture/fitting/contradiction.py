@@ -88,7 +88,9 @@ class Contradiction:
     """Agreement of cameras and keypoints with the remedy. None if there is no remedy."""
 
     def __str__(self) -> str:
-        """Returns one line that says how large the disagreement is, and which change removes it."""
+        """Returns one line that says how large the disagreement is, or that the person would be
+        behind the cameras, and which change removes it, if one is known.
+        """
         off = f"landmarks miss each other by {self.found.pixels:.0f} px"
         share = f"{off}, {self.found.missed:.0%} of the person's size"
         what = "the person would be behind the cameras" if self.found.behind else share
