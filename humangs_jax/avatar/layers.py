@@ -54,7 +54,7 @@ RGBA = ("R", "G", "B", "A")
 DEPTH = "Z"
 WIDE = (DEPTH, "position.")
 """Channels whose names begin so keep 32 bits when the others have 16. They are lengths in metres,
-and half floats have steps of 2 mm at 4 m.
+and half floats have steps of 4 mm beyond 4 m.
 """
 
 
@@ -85,8 +85,8 @@ class ExrLayers:
     layers: tuple[str, ...] = ("rgba", "z")
     """The layers to write, names in `LAYERS`. Colors are always written."""
     half: bool = False
-    """Whether colors, normals and parts have 16 bits. Z and positions stay in 32, since half floats
-    are 2 mm apart at 4 m.
+    """Whether colors, normals and parts have 16 bits. Z and positions keep 32: beyond 4 m half
+    floats are 4 mm apart.
     """
 
     def check(self) -> None:

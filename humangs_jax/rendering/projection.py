@@ -253,15 +253,15 @@ def _conic_factor(m0: Planes, m1: Planes, eps2d: float) -> tuple[Array, Array, A
 
         (r M)_0j = r00 / yy (sum_i m1_i (m_j x m_i) + eps2d m0_j),     (r M)_1j = r11 m1_j
 
-    the term that would cancel, m_j x m_j, is left out. Autodiff would sum two terms that cancel,
-    one through yy and one through the determinant, and would be ten times less accurate. Above a
-    determinant of 2e19 pixels^4 (7e4 pixels square), the square of the determinant overflows.
-    Autodiff would then lose one of the terms, and the gradient along the long axis would be as
-    large as across.
+    m_j is column j of M, m0 and m1 are its rows, and a x b = a_0 b_1 - a_1 b_0. The term that would
+    cancel, m_j x m_j, is left out. Autodiff would sum two terms that cancel, one through yy and one
+    through the determinant.
     """
     _, xy, yy, determinant = _covariance(m0, m1, eps2d)
     regular = determinant > 0
     yy, determinant = jnp.where(regular, yy, 1.0), jnp.where(regular, determinant, 1.0)
+    # divided by yy: the gradient of a quotient squares its denominator, and the square of the
+    # determinant overflows from 2e19 pixels^4 on
     r00 = lax.rsqrt(2 * (determinant / yy))
     return r00, -r00 * (xy / yy), lax.rsqrt(2 * yy)
 

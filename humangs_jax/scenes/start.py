@@ -140,8 +140,9 @@ def _seen_points(
 
 
 def _middle(views: Sequence[Camera]) -> Float[np.ndarray, "3"]:
-    """Returns the point nearest to the axes of all cameras. If the axes are parallel, it lies on
-    the axis of the first camera, as far in front of it as `extent_of` the cameras.
+    """Returns the point with the least mean squared distance to the axes of the cameras. If the
+    axes are parallel (`PARALLEL`), returns the point on the first camera's axis at the distance
+    `extent_of(views)` in front of that camera.
     """
     poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in views])
     centers, axes = np.stack([np.asarray(camera.center) for camera in views]), poses[:, 2, :3]

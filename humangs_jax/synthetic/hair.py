@@ -238,8 +238,8 @@ def ears(template: Points) -> np.ndarray:
 
 
 def above_line(template: Points, line: tuple, shift: float = 0.0) -> Field:
-    """Returns the height of points above a hairline (n,), metres in template coordinates. It is -1
-    away from the head.
+    """Returns the height of each point above a hairline, (n,), metres in template coordinates.
+    Points that are not on the head get -1.
 
     line: azimuths and heights. shift: metres by which the line is raised.
     """

@@ -258,9 +258,9 @@ def _observations(keypoints: Keypoints, K: Float[np.ndarray, "3 3"]) -> Observat
 def _start(
     model: LandmarkModel, seen: Observations, fps: float, betas: Float[np.ndarray, " s"]
 ) -> BodyPose:
-    """Returns the poses with which the fit starts. Joints have the usual pose. Orientation and
-    position of each frame are found from the keypoints and the detector's 3D landmarks, and
-    smoothed over time.
+    """Returns the poses with which the fit starts. All joints but the root have the mean rotations
+    of the prior of poses. The body's orientation and position in each frame are found from the
+    keypoints and the detector's 3D landmarks, and smoothed over time.
     """
     problem = keypoint_problem(model)
     still = replace(zero_state(problem.origin), betas=jnp.asarray(betas, jnp.float32))

@@ -88,8 +88,8 @@ class KeypointSet:
 
     @property
     def offsets(self) -> Float[np.ndarray, "k 3"]:
-        """Offset of each point in `places`, (k, 3), metres. It is 0 for points that are not in
-        `places`.
+        """For each of the k points, the `offset` of its entry in `places`: the vector from its base
+        landmark, (k, 3), metres in the T-pose. 0 for points without an entry.
         """
         known = {place.name: place.offset for place in self.places}
         return np.asarray([known.get(name, (0.0, 0.0, 0.0)) for name in self.names])
