@@ -673,6 +673,7 @@ for kind, (reader, text) in FEW_BYTES.items():
 BAD_NUMBERS = {"10^400": 10**400, "words": "x", "objects": {}, "ragged": [[1], 2]}
 NUMBERS = {
     "import": ("frames.0.transform_matrix.0.0", "fl_x", "w"),
+    "cameras of splats": ("0.position", "0.rotation", "0.fx", "0.width", "0"),
     "capture": ("views.0.K", "views.0.cam_from_world", "views.0.frame", "views.0.image"),
     "openpose": ("people.0.pose_keypoints_2d",),
     "coco": ("0.keypoints",),

@@ -264,6 +264,20 @@ TRANSFORMS = {"fl_x": 60, "cx": 5, "cy": 6, "w": 10, "h": 12} | {
 }
 
 
+CAMERAS_OF_SPLATS = [
+    {
+        "img_name": name,
+        "width": 12,
+        "height": 10,
+        "position": [0.0, 0.0, -2.0],
+        "rotation": np.eye(3).tolist(),
+        "fx": 9.0,
+        "fy": 9.0,
+    }
+    for name in VIEWS
+]
+
+
 def write_import(folder):
     """Writes photos and a calibration beside them."""
     (folder / "photos").mkdir()
@@ -459,6 +473,7 @@ ROWS = {
     "photos": (load_photos, write_capture, "capture.json"),
     "summary": (lambda path: read_summary(path, BODY), write_capture, "capture.json"),
     "transforms": (read_cameras, real("nerfstudio/transforms_train.json")),
+    "cameras of splats": (read_cameras, written("cameras.json", CAMERAS_OF_SPLATS)),
     "colmap": (read_cameras, real_colmap(".txt"), IMAGES),
     "colmap binary": (read_cameras, real_colmap(".bin"), "images.bin"),
     "cameras with lenses": (load_cameras, real_colmap(".txt"), IMAGES),
