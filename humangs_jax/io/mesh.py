@@ -64,10 +64,18 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
     if start != GLB_START or kind != JSON_CHUNK:
         raise InvalidFileError("not a mesh or skeleton that can be read: no GLB file")
     check_limit(limit, length, "bytes of JSON in a GLB")
-    content = parse_json(data[20 : 20 + length].decode())
+    if 20 + length > len(data):
+        raise InvalidFileError("a GLB file that is cut short")
+    try:
+        text = data[20 : 20 + length].decode()
+    except UnicodeDecodeError:
+        raise InvalidFileError("a GLB file with damaged JSON") from None
+    content = parse_json(text)
     binary = b""
     if len(data) >= 28 + length:
         size, kind = struct.unpack_from("<II", data, 20 + length)
+        if 28 + length + size > len(data):
+            raise InvalidFileError("a GLB file that is cut short")
         binary = data[28 + length : 28 + length + size]
         if kind != BINARY_CHUNK or len(data) - (28 + length + size) not in range(8):
             raise InvalidFileError("a GLB file with other chunks than JSON and one of numbers")

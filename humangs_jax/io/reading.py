@@ -257,13 +257,31 @@ def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Gen
             raise FileNotFoundError(missing) from error
         raise raises("", "", missing) from error
     except InvalidFileError as error:
-        raise raises(path, "", error) from error
+        raise raises(path, "", _LEFT_OUT if _is_pointer(path) else error) from error
     except PermissionError as error:
         raise raises(error.filename or path, "", "no permission to read it") from error
     except Exception as error:  # readers of damaged files raise some twenty types
         if str(path) and str(error).startswith(f"{path}: "):
             raise raises("", "", str(error)) from error
-        raise raises(path, "", _why(kind, error)) from error
+        why = _LEFT_OUT if _is_pointer(path) else _why(kind, error)
+        raise raises(path, "", why) from error
+
+
+_POINTER = b"version https://git-lfs.github.com/spec/"
+"""Beginning of the text that Git LFS leaves in place of a large file."""
+_LEFT_OUT = "not the file itself but its pointer of Git LFS: `git lfs pull` fetches the file"
+
+
+def _is_pointer(path: object) -> bool:
+    """Says whether a file is a pointer of Git LFS. False if it cannot be read."""
+    try:
+        file = Path(str(path))
+        if not file.is_file():
+            return False
+        with file.open("rb") as opened:
+            return opened.read(len(_POINTER)) == _POINTER
+    except (OSError, ValueError):
+        return False
 
 
 def _why(kind: str, error: Exception) -> str:

@@ -40,6 +40,7 @@ OTHERS = {
         ", a video: `humangs motion` finds the motion of the person in it (docs/motions.md)",
     ),
     ".fbx": ": open it in Blender and export a .bvh or .glb",
+    ".gltf": ": export it as .glb, which holds all of its numbers",
     ".c3d": (
         ", markers without a skeleton: solve them with the program that recorded them, and export a"
         " .bvh"
@@ -226,7 +227,8 @@ def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motio
     check_limit("frames", count, "frames")
     every = np.arange(round(count))
     motion = motion._at(np.interp(every, np.cumsum([0, *steps]) / step, np.arange(len(frames))))
-    return motion, f"nobody in {len(every) - len(frames)} of {len(every)} frames: filled in between"
+    missing = f"{len(every) - len(frames)} of {len(every)} frames"
+    return motion, f"the file lacks {missing}: filled in between"
 
 
 def _reader(path: Path) -> MotionFormat:

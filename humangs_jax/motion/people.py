@@ -85,7 +85,7 @@ def read_people(path: Path) -> list[Person]:
             found = _people(content, pickled)
             if alone and not found:
                 values = content if isinstance(content, dict) else {}
-                raise InvalidFileError(expected(values))
+                raise InvalidFileError(expected(values, pickled))
             name = (_numbers(file) or [file.stem])[-1]
             if len(found) == 1 and not alone:
                 found = [found[0]._replace(name=name)]
@@ -374,8 +374,10 @@ def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
     return stacked
 
 
-def expected(values: Mapping[Any, Any]) -> str:
-    """Returns the text of an error about values that have no known format."""
+def expected(values: Mapping[Any, Any], pickled: Sequence[str] = ()) -> str:
+    """Returns the text of an error about values that have no known format. pickled: keys of values
+    that are not read because they are pickled.
+    """
     # other files of ours, by keys that they have
     if {"header", "skinning_weights", "means"} <= values.keys():
         return "no motion: this is an avatar: expected a motion to play with it"
@@ -387,5 +389,6 @@ def expected(values: Mapping[Any, Any]) -> str:
     first = ", ".join(
         key for key in first_keys if not key.startswith("(")
     )  # that of a single array
-    keys = ", ".join(sorted(map(str, values))[:SHOWN]) or "none"
+    unread = [f"{key} (a pickled object, which is never read)" for key in pickled]
+    keys = ", ".join([*unread, *sorted(map(str, values))][:SHOWN]) or "none"
     return f"no motion: expected one of the keys {first}, got {keys}{hint_for(values)}"

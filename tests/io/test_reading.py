@@ -20,7 +20,7 @@ from humangs_jax.capture.keypoints.reading import read_detections
 from humangs_jax.io import reading as module
 from humangs_jax.io.arrays import read_npz
 from humangs_jax.io.images import read_image
-from humangs_jax.io.mesh import read_obj
+from humangs_jax.io.mesh import GlbWriter, parse_glb, read_obj
 from humangs_jax.io.reading import (
     FileError,
     InvalidFileError,
@@ -338,3 +338,26 @@ def test_a_file_without_permission_says_that_and_not_what_is_in_it(tmp_path, mon
         with pytest.raises(FileError) as error:
             read(tmp_path / name)
         assert str(error.value) == f"{tmp_path / name}: no permission to read it"
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.pkl", "a.bvh", "a.glb", "a.csv", "a.json"])
+def test_a_pointer_of_git_lfs_is_named(tmp_path, name):
+    """Git leaves it in place of a large file where LFS is not installed."""
+    (tmp_path / name).write_text(
+        f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 12345\n"
+    )
+    with pytest.raises(FileError, match=rf"{name}: not the file itself but its pointer of Git LFS"):
+        load_motion(tmp_path / name)
+
+
+def test_a_glb_that_is_cut_short_says_so(tmp_path):
+    writer = GlbWriter()
+    writer.array("SCALAR", np.arange(100.0))
+    writer.write(tmp_path / "a.glb", {"nodes": [{"name": "Hips"}]})
+    data = (tmp_path / "a.glb").read_bytes()
+    for length in (100, len(data) - 60):
+        with pytest.raises(InvalidFileError, match="a GLB file that is cut short"):
+            parse_glb(data[:length])
+    with pytest.raises(InvalidFileError, match="a GLB file with damaged JSON"):
+        parse_glb(data.replace(b"Hips", b"\xff" * 4))
+    assert parse_glb(data)[0]["nodes"] == [{"name": "Hips"}]

@@ -243,7 +243,12 @@ def test_what_is_missing_or_no_motion_names_what_to_do(arrays, message, tmp_path
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("a.mp4", "a video: `humangs motion`"), ("a.MOV", "a video"), ("a.fbx", "open it in Blender")],
+    [
+        ("a.mp4", "a video: `humangs motion`"),
+        ("a.MOV", "a video"),
+        ("a.fbx", "open it in Blender"),
+        ("a.gltf", "export it as .glb"),
+    ],
 )
 def test_files_of_other_kinds_say_how_a_motion_comes_of_them(name, message, tmp_path):
     (tmp_path / name).write_bytes(b"something")

@@ -203,7 +203,7 @@ def test_frames_in_which_nobody_was_seen_are_filled(tmp_path, caplog):
     path = saved("a.pkl", {0: wham(np.zeros((4, 55, 3)), moves[at], frame_ids=seen)})(tmp_path)
     motion = load_motion(path, fps=25)
     np.testing.assert_allclose(motion.translations, moves, atol=SINGLE)
-    assert motion.fps == 25 and "nobody in 2 of 6 frames: filled in between" in caplog.text
+    assert motion.fps == 25 and "lacks 2 of 6 frames: filled in between" in caplog.text
     every_second = saved("b.pkl", {0: wham(frame_ids=np.arange(0, 2 * FRAMES, 2))})(tmp_path)
     assert len(load_motion(every_second).rotations) == FRAMES
 
