@@ -3,8 +3,8 @@
 A BVH file (https://research.cs.wisc.edu/graphics/Courses/cs-838-1999/Jeff/BVH.html) has a tree of
 joints with offsets and channels, then the numbers of each frame. Rotations are degrees about the
 axes of the channels, in their order: R = R_first R_second R_third. Position channels replace the
-offset. In the rest pose all rotations are 0. A joint's name may have spaces: it ends with its line
-or before a brace.
+offset, or in files of MakeHuman are added to it. In the rest pose all rotations are 0. A joint's
+name may have spaces: it ends with its line or before a brace.
 
 Of a GLB file (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations), one animation
 is read, for the joints of the skin. The rest pose is the one in which the skin was bound to the
@@ -73,16 +73,20 @@ def read_bvh(path: Path, options: object = None) -> Clip:
     # a row of numbers for each frame
     width = sum(len(each) for each in channels)
     numbers = _numbers(text[found.end() :])
-    if width == 0 or len(numbers) != count * width:
+    note = ""
+    if width == 0 or not len(numbers) or len(numbers) % width:
+        short = ": cut short?" if len(numbers) < count * width else ""
         raise InvalidFileError(
-            f"expected {found[1]} frames of {width} numbers, got {len(numbers):,} numbers: cut"
-            " short?"
+            f"expected {found[1]} frames of {width} numbers, got {len(numbers):,} numbers{short}"
         )
-    check_unpacked(len(text), bytes_of_clip(int(count), len(names)))
-    turns, places = _posed(parents, offsets, channels, numbers.reshape(int(count), width))
+    if len(numbers) != count * width:  # of a file that somebody has shortened or joined
+        note = f"the file says {found[1]} frames, but has {len(numbers) // width}: these are taken"
+    rows = numbers.reshape(-1, width)
+    check_unpacked(len(text), bytes_of_clip(len(rows), len(names)))
+    turns, places = _posed(parents, offsets, channels, rows)
     bones = np.where(np.asarray(parents)[:, None] < 0, 0.0, offsets)
     rest = posed_tree(np.tile(np.eye(3), (len(parents), 1, 1)), bones, parents)[1]
-    return Clip(names, parents, rest, turns, places, 1 / seconds)
+    return Clip(names, parents, rest, turns, places, 1 / seconds, note=note)
 
 
 def _tree(
@@ -184,6 +188,7 @@ def _posed(
     """
     frames = len(numbers)
     turns, moves = np.empty((frames, len(parents), 3, 3)), np.empty((frames, len(parents), 3))
+    moved = np.zeros((len(parents), 3), bool)  # what position channels move
     at = 0
     for joint, names in enumerate(channels):
         columns = numbers[:, at : at + len(names)]
@@ -197,7 +202,14 @@ def _posed(
                 turn = turn @ Rotation.from_euler(axis, angles, degrees=True).as_matrix()
             else:
                 move[:, "xyz".index(axis)] = columns[:, i]
+                moved[joint, "xyz".index(axis)] = True
         turns[:, joint], moves[:, joint] = turn, move
+    # positions of most joints that are nearer to 0 than to the offsets are added to these
+    moved[np.asarray(parents) < 0] = False
+    own, offset = moves[:, moved], offsets[moved]
+    most = moved.any(axis=1).sum() > len(parents) / 2
+    if most and np.abs(own).sum() < np.abs(own - offset).sum():
+        moves[:, moved] += offset
     return posed_tree(turns, moves, parents)
 
 

@@ -241,6 +241,36 @@ def test_names_with_spaces(tmp_path, gap, brace):
         np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
 
 
+@pytest.mark.parametrize("said", [1, 7])
+def test_a_file_that_miscounts_its_frames_is_read_with_a_warning(tmp_path, caplog, said):
+    rest, poses = person(), dance(3, names=CMU, scale=0.2)
+    text = write_bvh(rest, poses, CMU).replace("Frames: 3", f"Frames: {said}")
+    rotations, _, _ = loaded(tmp_path, text, rest_joints=rest)
+    np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+    assert f"the file says {said} frames, but has 3: these are taken" in caplog.text
+
+
+@pytest.mark.parametrize("added", [False, True])
+def test_positions_of_all_joints_are_offsets_or_added_to_them(tmp_path, added):
+    """MakeHuman adds them; Perception Neuron and others repeat the offsets."""
+    rest, poses = person(), dance(3, names=CMU, scale=0.2)
+    text, _, numbers = write_bvh(rest, poses, CMU).partition("Frame Time: 0.0083333\n")
+    offsets = [line.split()[1:] for line in text.splitlines() if "OFFSET" in line]
+    text = text.replace("CHANNELS 3", "CHANNELS 6 Xposition Yposition Zposition")
+    ends = [i for i, line in enumerate(text.split("OFFSET")[:-1]) if "End Site" in line[-60:]]
+    offsets = [offset for i, offset in enumerate(offsets) if i not in ends][1:]
+    rows = []
+    for line in numbers.splitlines():
+        turns = line.split()
+        row = turns[:6]
+        for i, offset in enumerate(offsets, 2):
+            row += (["0"] * 3 if added else offset) + turns[3 * i : 3 * i + 3]
+        rows.append(" ".join(row))
+    text += "Frame Time: 0.0083333\n" + "\n".join(rows)
+    rotations, _, _ = loaded(tmp_path, text, rest_joints=rest)
+    np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+
+
 HEAD = (
     "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd"
     " Site\n{\nOFFSET 0 0 0\n}\n}\n"
@@ -253,8 +283,12 @@ BAD = {
         "expected the names of CMU, Mixamo, Unity",
     ),
     "few": (
-        HEAD + "MOTION\nFrames: 2\nFrame Time: 0.1\n0 0 0\n",
-        "expected 2 frames of 3 numbers, got 3 numbers",
+        HEAD + "MOTION\nFrames: 2\nFrame Time: 0.1\n0 0 0 0\n",
+        "expected 2 frames of 3 numbers, got 4 numbers: cut short?",
+    ),
+    "many": (
+        HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 0 0 0\n",
+        "expected 1 frames of 3 numbers, got 4 numbers",
     ),
     "time": (
         HEAD + "MOTION\nFrames: 1\nFrame Time: 0\n0 0 0\n",

@@ -20,12 +20,35 @@ function parseBvh(text, rate = null) {
   if (!(count >= 1 && Number.isInteger(count))) throw new Error(expected);
   if (!(seconds > 0 && Number.isFinite(1 / seconds))) throw rateError(expected);
   const words = text.slice(found.index + found[0].length).split(/\s+/).filter(Boolean);
-  if (width === 0 || words.length !== count * width)
-    throw new Error(`expected ${count} frames of ${width} numbers, got ${words.length} numbers: cut short?`);
-  const frames = Array.from({ length: count }, (_, f) => words.slice(f * width, (f + 1) * width).map(bvhNumber));
+  const rows = words.length / width, short = words.length < count * width ? ": cut short?" : "";
+  if (width === 0 || !(rows >= 1 && Number.isInteger(rows)))
+    throw new Error(`expected ${count} frames of ${width} numbers, got ${words.length} numbers${short}`);
+  const note = rows === count ? "" : `the file says ${count} frames, but has ${rows}: these are taken`;
+  const frames = Array.from({ length: rows }, (_, f) => words.slice(f * width, (f + 1) * width).map(bvhNumber));
   const place = joints.map(() => [0, 0, 0]);  // parents stand before their children
   joints.forEach((joint, i) => { place[i] = joint.parent < 0 ? [0, 0, 0] : add(place[joint.parent], joint.offset); });
-  return { joints, place, own: frames.map((numbers) => poseBvh(joints, numbers)), fps: 1 / seconds, up: null, note: "" };
+  const added = positionsAreAdded(joints, frames);
+  return { joints, place, own: frames.map((numbers) => poseBvh(joints, numbers, added)), fps: 1 / seconds, up: null, note };
+}
+
+// Returns whether the positions of the joints below the root are added to their offsets, as in
+// files of MakeHuman, and do not replace them.
+function positionsAreAdded(joints, frames) {
+  let at = 0, moving = 0, own = 0, apart = 0;
+  for (const joint of joints) {
+    const places = joint.channels.map((channel, i) => [channel, at + i]).filter(([channel]) => channel.endsWith("position"));
+    at += joint.channels.length;
+    if (joint.parent < 0 || !places.length) continue;
+    moving++;
+    for (const [channel, column] of places) {
+      const offset = joint.offset["xyz".indexOf(channel[0])];
+      for (const numbers of frames) {
+        own += Math.abs(numbers[column]);
+        apart += Math.abs(numbers[column] - offset);
+      }
+    }
+  }
+  return moving > joints.length / 2 && own < apart;
 }
 
 function bvhNumber(word) {
@@ -396,7 +419,7 @@ function stepsOfBody(global, scene, source, moves) {
 }
 
 // Returns rotations and places of all joints in the world.
-function poseBvh(joints, numbers) {
+function poseBvh(joints, numbers, added) {
   const axes = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] }, world = [], position = [];
   let at = 0;
   joints.forEach((joint, i) => {
@@ -404,7 +427,7 @@ function poseBvh(joints, numbers) {
     const move = [...joint.offset];
     for (const channel of joint.channels) {
       const value = numbers[at++], axis = channel[0];
-      if (channel.endsWith("position")) move["xyz".indexOf(axis)] = value;
+      if (channel.endsWith("position")) move["xyz".indexOf(axis)] = value + (added && joint.parent >= 0 ? joint.offset["xyz".indexOf(axis)] : 0);
       else local = quatMultiply(local, quatFromAxisAngle(...scaled(axes[axis], value * Math.PI / 180)));
     }
     const m = matrixFromQuat(local), p = joint.parent;
