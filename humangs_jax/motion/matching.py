@@ -17,6 +17,7 @@ from humangs_jax.motion.rules import (
     ENDS,
     EXPECTED_NAMES,
     FEW,
+    FINGER_JOINT,
     LIKE,
     MIDDLE,
     NEEDED,
@@ -83,9 +84,13 @@ def matched(
 def _plain(names: Sequence[str]) -> list[str]:
     """Simplifies names to lower-case letters and digits: "Model:Bip01_L_Thigh" is "lthigh".
 
-    Words that say nothing about the joint are removed, and a beginning that all names share.
+    Words that say nothing about the joint are removed, and a beginning that all names share. A name
+    that begins with two underscores becomes "": MakeHuman puts such a joint, which never turns,
+    above the joint of the same name.
     """
-    words = [re.findall(r"[a-z0-9]+", re.sub(r"^.*[:|]", "", name).lower()) for name in names]
+    plain = [re.sub(r"^.*[:|]", "", name).lower() for name in names]
+    plain = [re.sub(r"(finger\d)-(?=\d)", rf"\1{FINGER_JOINT}", name) for name in plain]
+    words = [[] if name.startswith("__") else re.findall(r"[a-z0-9]+", name) for name in plain]
     words = [[word for word in each if word not in NOISE] for each in words]
     plain = [re.sub(r"^mixamorig\d*", "", "".join(each)) for each in words]
     filled = [name for name in plain if name]

@@ -46,52 +46,105 @@ NO_PLACES = "the file has no positions ({}): people stay in place"
 # Names of joints
 # --------------------------------------------------------------------------------------------------
 
+FINGER_JOINT = "joint"
+"""Word that `matching` writes for the dash in MakeHuman's names of fingers: "finger1-2" is the
+second joint of the thumb, but Biped's "Finger12" is the third of the index finger.
+"""
+_FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+_ORDINALS = ("first", "second", "third", "fourth", "fifth")
+"""The words that Xsens has for the fingers, from the thumb on."""
+
 
 def _finger(finger: str, i: int) -> tuple[str, ...]:
     """Returns the known names of joint i of a finger, counted from 1 at the palm.
 
-    In the names of Biped, fingers have numbers, counted from 0 at the thumb.
+    In the names of Biped, fingers have numbers, counted from 0 at the thumb. Rokoko and MakeHuman
+    count them from 1.
     """
-    number = ("thumb", "index", "middle", "ring", "pinky").index(finger)
-    words = (finger, "little") if finger == "pinky" else (finger,)
+    number = _FINGERS.index(finger)
+    words = {"pinky": (finger, "little"), "middle": (finger, "mid")}.get(finger, (finger,))
     plain = [
         form
         for w in words
         for form in (f"hand{w}{i}", f"{w}{i}", f"{w}0{i}", f"f{w}0{i}", f"f{w}{i}", f"{w}finger{i}")
     ]
-    bones = (("proximal",), ("intermediate",), ("distal",))
+    bones = (("proximal", "pp"), ("intermediate", "medial", "mp"), ("distal", "dp"))
     if finger == "thumb":
-        bones = (("metacarpal", "proximal"), ("intermediate", "proximal"), ("distal",))
+        bones = (
+            ("metacarpal", "proximal", "mc"),
+            ("intermediate", "proximal", "pp"),
+            ("distal", "dp"),
+        )
+    words = (*words, f"finger{number + 1}", _ORDINALS[number])
     plain += [w + bone for w in words for bone in bones[i - 1]]
-    return (*plain, f"finger{number}{i - 1 or ''}")
+    plain += [f"finger{number}{i - 1 or ''}", f"finger{number + 1}{FINGER_JOINT}{i}"]
+    # some fingers have numbers from the second joint on
+    return (*plain, finger) if i == 1 else tuple(plain)
 
 
 SIDED = {
-    "hip": ("upleg", "upperleg", "thigh", "thighbend", "hip", "femur", "legupper", "leg"),
-    "knee": ("leg", "shin", "lowleg", "lowerleg", "calf", "knee", "shinbend", "tibia", "leglower"),
+    "hip": (
+        "upleg",
+        "upperleg",
+        "upperleg01",
+        "thigh",
+        "thighbend",
+        "hip",
+        "femur",
+        "legupper",
+        "leg",
+    ),
+    "knee": (
+        *(
+            "leg",
+            "shin",
+            "lowleg",
+            "loleg",
+            "lowerleg",
+            "lowerleg01",
+            "calf",
+            "knee",
+            "shinbend",
+            "tibia",
+        ),
+        "leglower",
+    ),
     "ankle": ("ankle", "foot"),
     "foot": ("toebase", "toe", "toes", "toe0", "ball", "foot"),
     "shoulder": (
         "arm",
         "uparm",
         "upperarm",
+        "upperarm01",
         "shldr",
         "shldrbend",
         "humerus",
         "armupper",
         "shoulder",
     ),
-    "collar": ("collar", "clavicle", "scapula", "shoulder"),
-    "elbow": ("forearm", "lowarm", "lowerarm", "elbow", "forearmbend", "armlower"),
+    "collar": ("collar", "clavicle", "clav", "scapula", "shoulder"),
+    "elbow": (
+        *(
+            "forearm",
+            "lowarm",
+            "loarm",
+            "lowerarm",
+            "lowerarm01",
+            "elbow",
+            "forearmbend",
+            "armlower",
+        ),
+        "radius",
+    ),
     "wrist": ("hand", "wrist"),
     "eye": ("eye",),
     **{f"{finger}{i}": _finger(finger, i) for finger in FINGERS for i in (1, 2, 3)},
 }
 """For each of our joints that has a side, its names in other programs: CMU (cgspeed), Mixamo,
 LaFAN, MotionBuilder, Biovision, Biped, SMPL, Unreal, Unity, VRM, Bandai-Namco, Xsens, SOMA, Rigify,
-Daz, Advanced Skeleton. Names are without the side, and have lower-case letters and digits only.
-Each joint of the file is used once, for the first of our joints that it fits. So "shoulder" is the
-upper arm if no better name of the upper arm is there, else the collar.
+Daz, Advanced Skeleton, Rokoko, Poser, MakeHuman. Names are without the side, and have lower-case
+letters and digits only. Each joint of the file is used once, for the first of our joints that it
+fits. So "shoulder" is the upper arm if no better name of the upper arm is there, else the collar.
 """
 MIDDLE = {
     "pelvis": ("hips", "hip", "pelvis"),
@@ -302,7 +355,7 @@ def joint_places(
 def page_rules() -> dict[str, Any]:
     """Returns the tables of this module and of the formats, as the page gets them in JSON."""
     names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE NOISE ENDS UNDER LIKE SIDES NEXT
-    NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING
+    FINGER_JOINT NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING
     FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS ORTHONORMAL NO_RATE NO_PLACES"""
     rules = {name: globals()[name] for name in names.split()}
     rules |= {"DEFAULT_FPS": DEFAULT_FPS, "PLACES": PLACES, "LARGEST_DISTANCE": LARGEST_DISTANCE}

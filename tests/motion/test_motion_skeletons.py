@@ -30,6 +30,7 @@ from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.io.mesh import GlbWriter
 from humangs_jax.motion import MotionError, load_motion
 from humangs_jax.motion.clips import read_bvh
+from humangs_jax.motion.matching import matched
 from humangs_jax.motion.skeleton import retargeted, shipped_joints
 
 EXACT = 1e-5
@@ -208,6 +209,93 @@ def test_names_of_programs_and_the_tree_of_those_unknown(tmp_path, scheme):
     rest, poses = person(), dance(3, names=CMU, scale=0.2)
     rotations, _, _ = loaded(tmp_path, write_bvh(rest, poses, NAMED[scheme]), rest_joints=rest)
     np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+
+
+FINGERS_OF = {
+    "Rokoko": (
+        "{Side}Finger{n}{bone}",
+        ("Metacarpal Proximal Distal", *["Proximal Medial Distal"] * 4),
+        range(1, 6),
+    ),
+    "Xsens": (
+        "{Side}{n}{bone}",
+        ("MC PP DP", *["PP MP DP"] * 4),
+        ("First", "Second", "Third", "Fourth", "Fifth"),
+    ),
+    "Poser": ("{s}{n}{bone}", ["1 2 3"] * 5, ("Thumb", "Index", "Mid", "Ring", "Pinky")),
+    "Biped": ("Bip01 {S} Finger{n}{bone}", ["  1 2"] * 5, range(5)),
+    "MakeHuman": ("finger{n}-{bone}.{S}", ["1 2 3"] * 5, range(1, 6)),
+    "MocapNET": ("finger{n}-{bone}.{s}", ["1 2 3"] * 5, range(1, 6)),
+}
+"""For each program the form of a finger's names, the words for the joints of each finger, from the
+thumb on, and the words or numbers of the fingers.
+"""
+
+
+@pytest.mark.parametrize("scheme", FINGERS_OF)
+def test_fingers_with_numbers_are_counted_as_each_program_counts_them(tmp_path, scheme):
+    form, bones, words = FINGERS_OF[scheme]
+    fingers, names = ("thumb", "index", "middle", "ring", "pinky"), dict(CMU)
+    for side in ("left", "right"):
+        for finger, bones_of_it, word in zip(fingers, bones, words, strict=True):
+            for i, bone in enumerate(bones_of_it.split(" ")[-3:], 1):
+                names[f"{side}_{finger}{i}"] = form.format(
+                    Side=side.title(), S=side[0].upper(), s=side[0], n=word, bone=bone
+                )
+    if scheme == "MocapNET":
+        names |= {"left_thumb1": "lthumb", "right_thumb1": "rthumb"}
+    rest, poses = person(), dance(3, names=names, scale=0.2)
+    rotations, _, _ = loaded(tmp_path, write_bvh(rest, poses, names), rest_joints=rest)
+    np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+
+
+def test_limbs_of_two_joints_each_are_as_long_as_both():
+    """MakeHuman's rig has two joints in a thigh, a shin, an upper arm and a forearm."""
+    names, parents, rest = (
+        ["root", "spine", "neck01"],
+        [-1, 0, 1],
+        [[0, 0, 0], [0, 2, 0], [0, 5, 0]],
+    )
+    for side, x in (("L", 1.0), ("R", -1.0)):
+        for begin, limb in ((0, LEG), (1, ARM)):
+            for i, (name, along, down) in enumerate(limb):
+                names.append(f"{name}.{side}")
+                parents.append(begin if i == 0 else len(parents) - 1)
+                rest.append([x * along, rest[begin][1] - down, 0])
+    rest = np.asarray(rest, float)
+    source = matched(names, parents, rest, rest)
+    for ours, theirs in (
+        *(("hip", "upperleg01"), ("knee", "lowerleg01"), ("ankle", "foot"), ("foot", "toe1-1")),
+        *(("shoulder", "upperarm01"), ("elbow", "lowerarm01"), ("wrist", "wrist")),
+    ):
+        assert names[source[f"left_{ours}"]] == f"{theirs}.L"
+        assert names[source[f"right_{ours}"]] == f"{theirs}.R"
+
+
+LEG = (
+    *(("upperleg01", 1, 0), ("upperleg02", 1, 2), ("lowerleg01", 1, 4), ("lowerleg02", 1, 6)),
+    *(("foot", 1, 8), ("toe1-1", 1, 8.5)),
+)
+ARM = (
+    *(("clavicle", 0.5, -2), ("upperarm01", 2, -2), ("upperarm02", 3, -2)),
+    *(("lowerarm01", 4, -2), ("lowerarm02", 5, -2), ("wrist", 6, -2)),
+)
+"""Name, place to the side, and height below the joint that carries the limb."""
+
+
+def test_a_joint_that_only_carries_another_is_not_taken_for_it(tmp_path):
+    """MakeHuman writes "__Jaw", which never turns, above "Jaw"."""
+    names = CMU | {"spine3": "__Neck", "left_collar": "__LeftArm"}
+    rest, poses = person(), dance(3, names=CMU, scale=0.2)
+    rotations, _, _ = loaded(tmp_path, write_bvh(rest, poses, names), rest_joints=rest)
+    neck, arm = INDEX["neck"], INDEX["left_shoulder"]
+    np.testing.assert_allclose(matrices(rotations[:, neck]), matrices(poses[:, neck]), atol=EXACT)
+    theirs = places_of(rest, poses, np.zeros((3, 3)))
+    ours = places_of(rest, rotations, np.zeros((3, 3)))
+    elbow = INDEX["left_elbow"]
+    np.testing.assert_allclose(
+        ours[:, elbow] - ours[:, arm], theirs[:, elbow] - theirs[:, arm], atol=EXACT
+    )
 
 
 def test_a_foot_without_toes_does_not_follow_the_shin(tmp_path):

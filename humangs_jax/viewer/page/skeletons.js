@@ -120,7 +120,8 @@ function matchJoints(joints, scene, place, posed) {
 // Returns names as lower-case letters and digits, without prefixes that all or many of them share.
 function plainNames(names) {
   const plain = names.map((name) => {
-    const words = name.replace(/^.*[:|]/, "").toLowerCase().match(/[a-z0-9]+/g) || [];
+    name = name.replace(/^.*[:|]/, "").toLowerCase().replace(/(finger\d)-(?=\d)/, `$1${RULES.FINGER_JOINT}`);
+    const words = (!name.startsWith("__") && name.match(/[a-z0-9]+/g)) || [];
     return words.filter((word) => !RULES.NOISE.includes(word)).join("").replace(/^mixamorig\d*/, "");
   });
   const filled = plain.filter(Boolean);
