@@ -90,6 +90,9 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
 
 def _view_of(view: dict[str, Any], binary: bytes) -> bytes:
     """Returns the bytes of a buffer view. Raises: InvalidFileError."""
+    compressed = [name for name in view.get("extensions", {}) if name.endswith("_compression")]
+    if compressed:
+        raise InvalidFileError(f"compressed ({compressed[0]}): export the file without compression")
     start, size, step = view.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 1)
     if not all(type(n) is int and n >= 0 for n in (start, size)) or start + size > len(binary):
         raise InvalidFileError(f"{size} bytes from {start}, but there are {len(binary)}")

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import DEFAULT_FPS
 from humangs_jax.body.kinematics import posed_tree
 from humangs_jax.core.array_types import Float
 from humangs_jax.io.mesh import parse_glb, read_accessor
@@ -42,6 +41,7 @@ from humangs_jax.io.reading import (
 )
 from humangs_jax.motion import Poses, Reading
 from humangs_jax.motion.face_files import animated_face, face_alone
+from humangs_jax.motion.rules import frame_times
 from humangs_jax.motion.skeleton import Clip, bytes_of_clip
 
 _CHANNELS = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
@@ -379,21 +379,12 @@ def _tracks(
 def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
     """Returns evenly spaced times of frames (m,), seconds, and their rate in frames per second.
 
-    The rate is taken from the track with the most times.
-
     Raises: InvalidFileError if tracks have very different lengths.
     """
-    first, last = (
-        pick(times[end] for times, _, _ in tracks.values()) for pick, end in ((min, 0), (max, -1))
-    )
-    dense = max((times for times, _, _ in tracks.values()), key=len)
-    if len(dense) < 2 or not last > first:
-        return np.asarray([first]), DEFAULT_FPS
-    fps = (len(dense) - 1) / float(dense[-1] - dense[0])
-    count = round((last - first) * fps) + 1
-    if count > 4 * len(dense):
+    found = frame_times([keys for keys, _, _ in tracks.values()])
+    if found is None:
         raise InvalidFileError("animation: tracks of very different lengths")
-    return first + np.arange(count) / fps, fps
+    return found
 
 
 def _rotations(matrices: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3 3"]:

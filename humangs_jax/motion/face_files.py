@@ -39,7 +39,7 @@ from humangs_jax.motion.face_tracks import (
     checked_track,
     clipped,
 )
-from humangs_jax.motion.rules import NO_RATE
+from humangs_jax.motion.rules import NO_RATE, frame_times
 
 _ARMS_DOWN = 1.15
 """Angle by which the arms hang down, radians, for a person with a face and no motion."""
@@ -408,14 +408,15 @@ def face_alone(
         read_accessor(content, binary, animation["samplers"][channel["sampler"]]["input"])[:, 0]
         for channel in animation["channels"]
     ]
-    dense = max(inputs, key=len, default=np.zeros(0))
-    if not len(dense) or not np.isfinite(dense).all() or not (np.diff(dense) > 0).all():
+    for keys in inputs:
+        if not len(keys) or not np.isfinite(keys).all() or not (np.diff(keys) > 0).all():
+            return None
+    found = frame_times(inputs) if inputs else None
+    if found is None:
         return None
-    fps = DEFAULT_FPS
-    if len(dense) > 1:
-        fps = (len(dense) - 1) / float(dense[-1] - dense[0])
-    track, unknown = animated_face(content, binary, animation, dense)
+    times, fps = found
+    track, unknown = animated_face(content, binary, animation, times)
     if track is None:
         return None
     note = "; ".join(filter(None, (note, unknown)))
-    return _standing(track.values, np.zeros((len(dense), 3)), fps, None, note)
+    return _standing(track.values, np.zeros((len(times), 3)), fps, None, note)

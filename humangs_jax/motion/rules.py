@@ -238,6 +238,13 @@ larger, the pelvis's joint does not turn as a pelvis does.
 RATE_ROUNDING = 1e-4
 """Relative error of a frame rate. Some BVH files give the time of a frame in only four digits."""
 
+SHORT_STEPS = 0.1
+"""Share of the steps between keys of a GLB file that have to be shorter than a frame at the mean
+rate of the keys, for a higher rate to be taken.
+"""
+FRAMES_A_KEY = 16
+"""Largest number of frames for each key, where keys are not evenly spaced."""
+
 FLOOR_BAND = 0.05
 """The lowest joint is on the floor if it is within this distance of its usual height, metres."""
 STILL = (0.1, 0.3)
@@ -259,6 +266,37 @@ HANDS = tuple(
     i for i, name in enumerate(JOINT_NAMES) if any(x in name for x in ("elbow", "wrist", *FINGERS))
 )
 """Indices of the joints that carry a person who is upside down."""
+
+
+# Frames of animations
+# --------------------------------------------------------------------------------------------------
+
+
+def frame_times(keys: Sequence[Float[np.ndarray, " _"]]) -> tuple[np.ndarray, float] | None:
+    """Returns evenly spaced times of frames (m,), seconds, and their rate in frames per second.
+
+    The rate is that of the track with most keys. Optimizers leave out keys that lie on a line
+    between others, and animators set few keys: where a share of SHORT_STEPS of the steps between
+    keys are shorter than a frame at that rate, the rate is that of these steps.
+
+    keys: increasing times of the keys of each track, seconds. Returns None if tracks have very
+    different lengths.
+    """
+    first, last = min(each[0] for each in keys), max(each[-1] for each in keys)
+    dense = max(keys, key=len)
+    if len(dense) < 2 or not last > first:
+        return np.asarray([first]), DEFAULT_FPS
+    fps = (len(dense) - 1) / float(dense[-1] - dense[0])
+    if round((last - first) * fps) + 1 > 4 * len(dense):
+        return None
+    steps = np.concatenate([np.diff(each) for each in keys])
+    shortest = float(np.quantile(steps, SHORT_STEPS, method="lower"))
+    if shortest * fps < 0.99:
+        fps = max(fps, min(1 / shortest, FRAMES_A_KEY * fps))
+        # times are rounded to float32
+        if abs(fps - round(fps)) < 0.01 * fps:
+            fps = float(round(fps))
+    return first + np.arange(round((last - first) * fps) + 1) / fps, fps
 
 
 # Which way is up
@@ -356,6 +394,7 @@ def page_rules() -> dict[str, Any]:
     """Returns the tables of this module and of the formats, as the page gets them in JSON."""
     names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE NOISE ENDS UNDER LIKE SIDES NEXT
     FINGER_JOINT NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING
+    SHORT_STEPS FRAMES_A_KEY
     FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS ORTHONORMAL NO_RATE NO_PLACES"""
     rules = {name: globals()[name] for name in names.split()}
     rules |= {"DEFAULT_FPS": DEFAULT_FPS, "PLACES": PLACES, "LARGEST_DISTANCE": LARGEST_DISTANCE}

@@ -228,6 +228,22 @@ def test_weights_of_meshes_are_read_by_name_and_others_left_out(tmp_path, caplog
     assert motion.fps == pytest.approx(30, rel=1e-5) and "left out (ears)" in caplog.text
 
 
+def test_a_face_whose_keys_are_not_evenly_spaced_keeps_its_time(tmp_path):
+    writer = GlbWriter()
+    times = writer.array("SCALAR", np.asarray([0, 1, 5]) / 30)
+    output = writer.array("SCALAR", np.asarray([0, 0.2, 1.0]))
+    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+    animation = {"channels": [channel], "samplers": [{"input": times, "output": output}]}
+    mesh = {"primitives": [], "extras": {"targetNames": ["jawOpen"]}}
+    content = {"nodes": [{"mesh": 0}], "meshes": [mesh], "animations": [animation]}
+    writer.write(tmp_path / "face.glb", content)
+    motion = load_motion(tmp_path / "face.glb")
+    assert motion.fps == pytest.approx(30, rel=1e-5)
+    np.testing.assert_allclose(
+        coefficients(motion, "jawOpen"), [0, 0.2, 0.4, 0.6, 0.8, 1], atol=1e-6
+    )
+
+
 def test_parts_and_rates_of_a_motion_keep_its_face(talking):
     part = talking.part(slice(1, 4))
     np.testing.assert_array_equal(part.expressions, talking.expressions[1:4])

@@ -27,10 +27,11 @@ from motion_cases import UP, in_world, motions
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.io.mesh import GlbWriter
+from humangs_jax.io.mesh import GlbWriter, read_accessor
 from humangs_jax.motion import MotionError, load_motion
 from humangs_jax.motion.clips import read_bvh
 from humangs_jax.motion.matching import matched
+from humangs_jax.motion.rules import frame_times
 from humangs_jax.motion.skeleton import retargeted, shipped_joints
 
 EXACT = 1e-5
@@ -435,6 +436,37 @@ def test_the_skeleton_of_a_glb(tmp_path, interpolation):
     assert motion.fps == 24
     np.testing.assert_allclose(matrices(motion.rotations), matrices(poses), atol=EXACT)
     np.testing.assert_allclose((motion.translations + rest[0] - moves)[:, [0, 2]], 0, atol=EXACT)
+
+
+def test_keys_that_an_optimizer_left_out_do_not_lower_the_rate():
+    """Left out are those that lie on a line between others."""
+    every = np.arange(11) / 24
+    for keys in ([every], [every, every[[0, 10]]], [every.astype(np.float32)]):
+        times, fps = frame_times(keys)
+        np.testing.assert_allclose(times, every, atol=1e-6)
+        assert fps == pytest.approx(24, rel=1e-6)
+    times, fps = frame_times([every[[0, 1, 5, 6, 10]], every[[0, 10]]])
+    np.testing.assert_allclose(times, every)
+    assert fps == 24.0
+    # a single late key of a track that is even otherwise
+    times, fps = frame_times([np.append(np.arange(31) / 30, 1.005)])
+    assert fps == pytest.approx(31 / 1.005) and len(times) == 32
+    # two keys in a thousandth of a second: no more than 16 frames for each key
+    times, fps = frame_times([np.asarray([0, 1e-3, 1.0])])
+    assert len(times) == 33 and fps == 32
+    assert frame_times([np.arange(3) / 24, np.asarray([0, 100.0])]) is None
+
+
+def test_compressed_numbers_are_refused_by_the_name_of_the_compression():
+    """The views of gltfpack's files name a buffer that is not there."""
+    content = {
+        "bufferViews": [
+            {"buffer": 1, "byteLength": 8, "extensions": {"EXT_meshopt_compression": {}}}
+        ],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 2, "type": "SCALAR"}],
+    }
+    with pytest.raises(ValueError, match=r"compressed \(EXT_meshopt_compression\): export"):
+        read_accessor(content, b"", 0)
 
 
 def test_a_glb_in_centimetres_below_a_turned_node(tmp_path):

@@ -242,9 +242,17 @@ function glbTimes(tracks) {
   const last = largest(tracks.map(({ times }) => times.at(-1)));
   const dense = tracks.reduce((best, { times }) => (times.length > best.length ? times : best), []);
   if (dense.length < 2 || !(last > first)) return { times: [first], fps: RULES.DEFAULT_FPS };
-  const fps = (dense.length - 1) / (dense.at(-1) - dense[0]);
+  let fps = (dense.length - 1) / (dense.at(-1) - dense[0]);
+  if (Math.round((last - first) * fps) + 1 > 4 * dense.length)
+    throw new Error("animation: tracks of very different lengths");
+  // keys may be left out, see frame_times in humangs_jax/motion/rules.py
+  const steps = tracks.flatMap(({ times }) => times.slice(1).map((time, i) => time - times[i])).sort((a, b) => a - b);
+  const shortest = steps[Math.floor(RULES.SHORT_STEPS * (steps.length - 1))];
+  if (shortest * fps < 0.99) {
+    fps = Math.max(fps, Math.min(1 / shortest, RULES.FRAMES_A_KEY * fps));
+    if (Math.abs(fps - Math.round(fps)) < 0.01 * fps) fps = Math.round(fps);
+  }
   const count = Math.round((last - first) * fps) + 1;
-  if (count > 4 * dense.length) throw new Error("animation: tracks of very different lengths");
   return { times: Array.from({ length: count }, (_, i) => first + i / fps), fps };
 }
 
