@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.formats import PLACES, ArrayKeys
+from humangs_jax.data.formats import CAMERA_MOVES, PLACES, ArrayKeys
 from humangs_jax.geometry.mesh import smallest_turns, unit
 from humangs_jax.io.arrays import ArrayFile
 from humangs_jax.io.reading import InvalidFileError
@@ -24,9 +24,12 @@ from humangs_jax.motion import MotionError, Poses, Reading, skeleton
 from humangs_jax.motion.face_tracks import FaceTrack, checked_track
 from humangs_jax.motion.people import SHOWN, Person, are_rotations, format_of, read_people
 from humangs_jax.motion.rules import (
+    ASSUMED_FOCAL,
     COLUMNS,
+    FAR,
     HAND_NUMBERS,
     MILLIMETRES,
+    NEARER,
     NO_PLACES,
     NO_RATE,
     PELVIS,
@@ -75,13 +78,16 @@ def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
     frames = None
     if person.frames is not None and len(person.frames) == len(rotations):
         frames = person.frames
+    up, also = form.up, form.also
+    if "-y" in also and file.of_camera(form.moves):
+        up, also = "-y", ("y",)
     return Poses(
         rotations,
         moves,
         file.rate(form),
-        form.up,
+        up,
         form.fixed,
-        form.also,
+        also,
         frames,
         "; ".join(file.notes),
         face,
@@ -329,6 +335,9 @@ def _placed(
     if moves.size != 3 * count or moves.shape[-1] != 3 or (count > 1 and len(moves) != count):
         raise MotionError(file.path, key, f"expected shape ({count}, 3), got {moves.shape}")
     moves = moves.reshape(count, 3)
+    if file.of_camera(form.moves) and np.median(moves[:, 2]) > FAR:
+        file.notes.append(NEARER.format(key, ASSUMED_FOCAL))
+        moves = moves / [1, 1, ASSUMED_FOCAL]
     # in metres
     if form.scaling is not None:
         scale = MILLIMETRES
@@ -411,6 +420,13 @@ class _MotionFile(ArrayFile):
     def first(self, keys: tuple[str, ...]) -> str:
         """Returns the first of the keys that the file has, or keys[0] if it has none."""
         return next((key for key in keys if key in self.values), keys[0])
+
+    def of_camera(self, moves: tuple[str, ...]) -> bool:
+        """Says whether the file's positions are in the coordinates of a camera. moves: keys of
+        positions, of which the first that the file has is used.
+        """
+        key = self.first(moves)
+        return key in CAMERA_MOVES and key in self.values
 
     def rate(self, form: ArrayKeys) -> float:
         """Returns the frames per second that the user gave. If there are none, returns the rate of

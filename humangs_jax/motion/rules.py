@@ -22,7 +22,7 @@ from humangs_jax.body.kinematics import bones_of, posed_tree
 from humangs_jax.body.motion import PELVIS
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import LARGEST_DISTANCE
-from humangs_jax.data.formats import MOTIONS, PLACES
+from humangs_jax.data.formats import CAMERA_MOVES, MOTIONS, PLACES
 from humangs_jax.geometry.axes import CLEARLY_UP, UPRIGHT, upright_matrix
 
 # Files of arrays
@@ -40,6 +40,15 @@ COLUMNS = {
 MILLIMETRES = 1000.0
 ORTHONORMAL = 0.05
 """Largest difference of R R^T from the identity at which a matrix in a file is a rotation."""
+FAR = 25.0
+"""People that a camera sees at a larger distance than this, metres, are there because the focal
+length was assumed (4D-Humans and others).
+"""
+ASSUMED_FOCAL = 5000 / 256
+"""The focal length that these programs assume, divided by the longer side of the photo. A lens of a
+focal length as long as this side is usual.
+"""
+NEARER = "{} is of a focal length that was assumed: people are taken to be {:.3g} times nearer"
 NO_RATE = "the file says no frames per second: taken for {:g}"
 NO_PLACES = "the file has no positions ({}): people stay in place"
 
@@ -394,9 +403,10 @@ def page_rules() -> dict[str, Any]:
     """Returns the tables of this module and of the formats, as the page gets them in JSON."""
     names = """BODY_NUMBERS HAND_NUMBERS MILLIMETRES SIDED MIDDLE NOISE ENDS UNDER LIKE SIDES NEXT
     FINGER_JOINT NEEDED TOPS FEET EXPECTED_NAMES FEW STANDING BETTER_TILT LARGEST_BEND RATE_ROUNDING
-    SHORT_STEPS FRAMES_A_KEY
+    SHORT_STEPS FRAMES_A_KEY FAR ASSUMED_FOCAL NEARER
     FLOOR_BAND STILL ON_THE_FLOOR TREADMILL MOST_FRAMES HANDS ORTHONORMAL NO_RATE NO_PLACES"""
     rules = {name: globals()[name] for name in names.split()}
+    rules |= {"CAMERA_MOVES": CAMERA_MOVES}
     rules |= {"DEFAULT_FPS": DEFAULT_FPS, "PLACES": PLACES, "LARGEST_DISTANCE": LARGEST_DISTANCE}
     rules |= {"UPRIGHT": UPRIGHT, "CLEARLY_UP": CLEARLY_UP}
     formats = [

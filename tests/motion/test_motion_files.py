@@ -208,6 +208,33 @@ def test_frames_in_which_nobody_was_seen_are_filled(tmp_path, caplog):
     assert len(load_motion(every_second).rotations) == FRAMES
 
 
+def test_a_person_who_leans_before_a_camera_is_not_turned_over(tmp_path, caplog):
+    """Positions by this key are in the axes of a camera, whatever the person does."""
+    leaning = np.zeros((FRAMES, 55, 3))
+    leaning[:, 0] = [1.2, 0, 0]  # radians forward: nearer to z than to y
+    values = smpl(*down(leaning, PLACES))
+    path = npz(**{"pred_cam_t_full": values.pop("transl"), **values})(tmp_path)
+    motion = load_motion(path, fps=30)
+    np.testing.assert_allclose(
+        matrices(motion.rotations[:, 0]), matrices(leaning[:, 0]), atol=MATRICES
+    )
+    np.testing.assert_allclose(motion.translations, PLACES, atol=SINGLE)
+    assert "people lie along" in caplog.text  # somebody may lie, too
+
+
+def test_depths_of_an_assumed_focal_length_become_those_of_a_usual_one(tmp_path, caplog):
+    """4D-Humans assumes 5000 pixels where the longer side of the photo is 256."""
+    far = np.asarray([[0.1, 0.2, 60 + 0.5 * i] for i in range(FRAMES)])
+    values = smpl(*down(np.zeros((FRAMES, 55, 3)), np.zeros((FRAMES, 3))))
+    values = {key: value for key, value in values.items() if key != "transl"}
+    motion = load_motion(npz(camera=far, **values)(tmp_path), fps=30)
+    steps = np.diff(np.asarray(motion.translations), axis=0)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 0.5 * 256 / 5000, atol=SINGLE)
+    assert "camera is of a focal length that was assumed: people are taken to be 19.5" in (
+        caplog.text
+    )
+
+
 def test_missing_parts_are_reported(tmp_path, caplog):
     load_motion(npz(**{k: v for k, v in parts().items() if k != "transl"})(tmp_path))
     assert (

@@ -130,9 +130,15 @@ function motionFromArrays(arrays, scene, asked = null) {
     throw rateError(`key ${rate}: expected a positive number of frames per second, got ${fps}`);
   const scale = format.scaling === null ? 1 : arrays.get(format.scaling)?.data[0] ?? RULES.MILLIMETRES;
   if (!(scale > 0)) throw new Error(`key ${format.scaling}: expected a positive number, got ${scale}`);
-  const translations = poses.map((_, f) => (still ? [0, 0, 0] : scaled(moves.row(f), 1 / scale)));
-  const motion = turnedUp({ quats: poses, translations, fps }, format, scene);
+  // positions in the coordinates of a camera, whose y points down, perhaps by an assumed focal length
+  const ofCamera = !still && RULES.CAMERA_MOVES.includes(key);
+  const axes = ofCamera && format.also.includes("-y") ? { ...format, up: "-y", also: ["y"] } : format;
+  const nearer = ofCamera && median(poses.map((_, f) => moves.row(f)[2])) > RULES.FAR ? RULES.ASSUMED_FOCAL : 1;
+  const move = (f) => { const [x, y, z] = moves.row(f); return scaled([x, y, z / nearer], 1 / scale); };
+  const translations = poses.map((_, f) => (still ? [0, 0, 0] : move(f)));
+  const motion = turnedUp({ quats: poses, translations, fps }, axes, scene);
   const notes = [still && RULES.NO_PLACES.replace("{}", format.moves.slice(0, 3).join(", "))];
+  notes.push(nearer > 1 && RULES.NEARER.replace("{}", key).replace("{:.3g}", nearer.toPrecision(3)));
   notes.push(!given && !format.fixed && RULES.NO_RATE.replace("{:g}", fps));
   return { ...motion, note: [...notes, motion.note].filter(Boolean).join("; ") };
 }
