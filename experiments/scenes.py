@@ -33,7 +33,7 @@ def scene_fits(
     gaussians: int = 200_000,
     photos: int = 40,
     size: tuple[int, ...] = (640, 360),
-    steps: int = 3_000,
+    steps: tuple[int, ...] = (3_000,),
     points: float = 0.05,
     seed: int = 20_261,
     checkpoints: Path | None = None,
@@ -49,7 +49,7 @@ def scene_fits(
     gaussians: number of Gaussians of the scene, and capacity of the fits
     photos: number of photos that are fitted
     size: width and height of the photos, pixels
-    steps: steps of each fit, of one photo each
+    steps: steps of each fit, of one photo each; of several numbers each gives rows
     points: share of the scene's Gaussians that structure from motion finds
     seed: seed of the scene
     checkpoints: folder with checkpoints, from which interrupted fits continue
@@ -65,31 +65,34 @@ def scene_fits(
     rng = np.random.default_rng(seed + 1)
     found = np.asarray(scene.means) + rng.normal(0, FOUND, scene.means.shape)
     few = found[rng.choice(gaussians, int(points * gaussians), replace=False)]
-    every = max(1, int(0.6 * steps) // NUMBERS)
-    growing = SceneConfig(
-        capacity=gaussians,
-        steps=steps,
-        start=len(few),
-        relocate_every=every,
-        growth=float((gaussians / len(few)) ** (1.2 / NUMBERS)),
-        relocate_until=0.85,
-    )
-    alone = dataclasses.replace(
-        growing, relocate_until=0.0, noise=0.0, opacity_penalty=0.0, scale_penalty=0.0
-    )
-    cases = {
-        "true number, Adam alone": (found, alone),
-        "few points, Adam alone": (few, dataclasses.replace(alone, capacity=len(few))),
-        "few points, fit_scene": (few, growing),
-        "no points, fit_scene": (None, growing),
-    }
+    cases = {}
+    for count in steps:
+        growing = SceneConfig(
+            capacity=gaussians,
+            steps=count,
+            start=len(few),
+            relocate_every=max(1, int(0.6 * count) // NUMBERS),
+            growth=float((gaussians / len(few)) ** (1.2 / NUMBERS)),
+            relocate_until=0.85,
+        )
+        alone = dataclasses.replace(
+            growing, relocate_until=0.0, noise=0.0, opacity_penalty=0.0, scale_penalty=0.0
+        )
+        ways = {
+            "true number, Adam alone": (found, alone),
+            "few points, Adam alone": (few, dataclasses.replace(alone, capacity=len(few))),
+            "few points, fit_scene": (few, growing),
+            "no points, fit_scene": (None, growing),
+        }
+        end = f", {count:,} steps" if len(steps) > 1 else ""
+        cases |= {name + end: way for name, way in ways.items() if not only or name in only}
 
     def fit(name):
         return lambda: measured(
             *cases[name], truth, cameras, shown, hidden, checkpoint_of(checkpoints, name)
         )
 
-    chosen = {name: fit(name) for name in cases if not only or name in only}
+    chosen = {name: fit(name) for name in cases}
     settings = {"gaussians": gaussians, "photos": photos, "size": size, "steps": steps}
     rows = run.rows(chosen, {**settings, "points": points, "seed": seed})
     table = markdown_table(
@@ -108,7 +111,7 @@ def checkpoint_of(folder: Path | None, name: str) -> Path | None:
     if folder is None:
         return None
     folder.mkdir(parents=True, exist_ok=True)
-    return folder / f"{name.replace(', ', '_').replace(' ', '_')}.npz"
+    return folder / f"{name.replace(', ', '_').replace(' ', '_').replace(',', '')}.npz"
 
 
 def measured(
