@@ -82,7 +82,7 @@ def cache_folder() -> Path:
 def prune(folder: Path, size: int) -> None:
     """Deletes the files used longest ago until `size` bytes are left."""
     files = []
-    for path in folder.iterdir():
+    for path in filter(Path.is_file, folder.rglob("*")):  # some are in `programs`
         with contextlib.suppress(FileNotFoundError):  # another run prunes at the same time
             stat = path.stat()
             files.append((max(stat.st_atime, stat.st_mtime), stat.st_size, path))

@@ -75,8 +75,26 @@ class Compiled(Generic[T]):
         """The function as `jax.jit` compiles it. It is made late, because the options may depend on
         the device.
         """
+        return self._jitted(self.function)
+
+    @functools.cached_property
+    def _kept(self) -> Any:
+        """The function as `jax.jit` compiles it for programs that are kept.
+
+        JAX finds programs in memory by the function. This is another function, so that a program
+        that `jitted` has read from JAX's cache is not taken for one that was compiled.
+        """
+
+        @functools.wraps(self.function)
+        def function(*args: Any, **kwargs: Any) -> Any:
+            return self.function(*args, **kwargs)
+
+        return self._jitted(function)
+
+    def _jitted(self, function: Callable[..., Any]) -> Any:
+        """Returns a function as `jax.jit` compiles it."""
         options = None if self.options is None else self.options()
-        return jax.jit(self.function, static_argnames=self.static, compiler_options=options)
+        return jax.jit(function, static_argnames=self.static, compiler_options=options)
 
     def __call__(self, *args: Any, **kwargs: Any) -> T:
         """Returns the result of the function."""
@@ -105,7 +123,7 @@ class Compiled(Generic[T]):
             return self.jitted.eval_shape(*args, **kwargs)
         with contextlib.suppress(Exception):
             return _read(file)
-        shapes = self.jitted.eval_shape(*args, **kwargs)
+        shapes = self._kept.eval_shape(*args, **kwargs)
         with contextlib.suppress(Exception):
             _write(file, pickle.dumps(shapes))
         return shapes
@@ -170,9 +188,10 @@ class Compiled(Generic[T]):
         with contextlib.suppress(Exception):
             return serialize_executable.deserialize_and_load(*_read(file))
         hits = _hits.count
-        lowered = self.jitted.lower(*call.bound.args, **call.bound.kwargs)
+        lowered = self._kept.lower(*call.bound.args, **call.bound.kwargs)
         program = lowered.compile()
-        # XLA cannot write what it has read: the functions of such a program would be missing
+        # XLA cannot write what it has read: the file would lack the functions of the program, and
+        # the first call of another process would fail
         if _hits.count == hits and _stands_alone(lowered.as_text()):
             with contextlib.suppress(Exception):
                 _write(file, pickle.dumps(serialize_executable.serialize(program)))

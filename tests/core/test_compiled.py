@@ -1,5 +1,6 @@
 import dataclasses
 import functools
+import math
 import os
 import pickle
 import stat
@@ -216,6 +217,51 @@ def test_a_new_process_calls_lapack(tmp_path):
         for _ in range(2)
     ]
     assert said == ["5.0 1\n", "5.0 0\n"]
+
+
+READ_BEFORE = """
+import sys
+from pathlib import Path
+import jax.numpy as jnp
+import numpy as np
+from humangs_jax.core import compiled as module
+from humangs_jax.core.processes import enable_compile_cache, keep_programs
+
+cache = enable_compile_cache()
+
+@module.compiled()
+def product(x):
+    return jnp.sin(x @ x) + 1
+
+x = np.eye(64, dtype=np.float32)
+if sys.argv[1] != "keep":
+    product(x)
+    module._folder.cache_clear()
+if sys.argv[1] != "do not keep":
+    keep_programs(cache)
+print(float(product(x)[0, 0]))
+"""
+
+
+def test_a_program_that_was_read_is_not_written(tmp_path):
+    """XLA writes a program that it has read without its functions, and a process that reads that
+    file fails. The second process here has the program in memory, read by an earlier call.
+    """
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
+    environment |= {
+        "JAX_PLATFORMS": "cpu",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "HUMANGS_COMPILE_CACHE": str(tmp_path),
+    }
+    for what in ("do not keep", "keep what was read", "keep"):
+        said = subprocess.run(
+            [sys.executable, "-c", READ_BEFORE, what],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        assert float(said) == pytest.approx(1 + math.sin(1))
 
 
 def test_what_calls_python_is_not_kept(folder):
