@@ -62,8 +62,11 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
         >>> loss = lambda pose: jnp.mean((image(pose) - photo) ** 2)
         >>> gradient = jax.grad(loss)(pose)
     """
+    # the face moves before the joints do
     if pose.expression is not None:
         avatar, pose = _with_expression(avatar, pose)
+
+    # Gaussians follow the joints, and their colors the light
     joints = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     gaussians, transforms = avatar.gaussians, blend_transforms(avatar.skinning_weights, joints)
     if avatar.light is not None:

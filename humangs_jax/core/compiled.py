@@ -302,6 +302,7 @@ def _stable(value: Any) -> str:
 
     Raises: TypeError for values of other packages' classes, whose source may change.
     """
+    # values of Python
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
         return repr(value)
     if isinstance(value, enum.Enum):
@@ -313,6 +314,7 @@ def _stable(value: Any) -> str:
     if isinstance(value, Mapping):
         items = ",".join(f"{_stable(key)}:{_stable(item)}" for key, item in value.items())
         return f"{_name(type(value))}({items})"
+    # arrays, and the trees that hold them
     if isinstance(value, np.dtype):
         return str(value)
     if isinstance(value, np.ndarray):
@@ -323,6 +325,7 @@ def _stable(value: Any) -> str:
         if node is None:
             return "*"
         return f"{_stable(node)}({','.join(map(_stable, value.children()))})"
+    # what the package defines
     if isinstance(value, type) or inspect.isfunction(value):
         return _name(value)
     if dataclasses.is_dataclass(value):

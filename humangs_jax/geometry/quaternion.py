@@ -75,6 +75,7 @@ def candidates_from_matrix(
     c is row c of M divided by 2 max(q_abs[c], 0.1). For a matrix that is no rotation, the four
     candidates may be different rotations.
     """
+    # the diagonal of M: 4 q_c^2. The square root has no gradient at 0
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     squared = jnp.stack(
         [1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22],
@@ -82,6 +83,8 @@ def candidates_from_matrix(
     )
     positive = squared > 0
     q_abs = jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+
+    # the other elements of M, and its rows
     a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     d, e, f = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
     w2, x2, y2, z2 = jnp.moveaxis(jnp.square(q_abs), -1, 0)

@@ -60,6 +60,7 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
     Raises: InvalidFileError, KeyError, TypeError, ... for sizes that do not fit the file or are
     more than the limits allow.
     """
+    # the header, and the chunk of JSON
     start, _, _, length, kind = struct.unpack_from("<IIIII", data.ljust(20, b"\0"))
     if start != GLB_START or kind != JSON_CHUNK:
         raise InvalidFileError("not a mesh or skeleton that can be read: no GLB file")
@@ -71,6 +72,8 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
     except UnicodeDecodeError:
         raise InvalidFileError("a GLB file with damaged JSON") from None
     content = parse_json(text)
+
+    # the chunk of numbers, which may be missing; up to seven bytes of padding may follow
     binary = b""
     if len(data) >= 28 + length:
         size, kind = struct.unpack_from("<II", data, 20 + length)
@@ -79,6 +82,8 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
         binary = data[28 + length : 28 + length + size]
         if kind != BINARY_CHUNK or len(data) - (28 + length + size) not in range(8):
             raise InvalidFileError("a GLB file with other chunks than JSON and one of numbers")
+
+    # all numbers must be in this file, and not grow beyond the limits when they are unpacked
     if any("uri" in buffer for buffer in content.get("buffers", [])):
         raise InvalidFileError(
             "numbers in another file: expected a GLB file that holds all of its numbers"

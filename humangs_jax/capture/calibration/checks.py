@@ -127,6 +127,7 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
     chosen. It is the one that brings the cameras nearest to `USUAL_DISTANCE`. If no unit brings
     them within `DISTANCES`, the first unit is kept.
     """
+    # how far the cameras stand from the point where they look, in the calibration's unit
     known = calibration.unit or 1.0
     matrices = np.stack([camera.cam_from_world for camera in calibration.cameras])
     matrices[:, :3, :3] = [nearest_rotation(matrix[:3, :3]) for matrix in matrices]
@@ -134,6 +135,8 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
     distance = None
     if depths is not None:
         distance = float(np.median(np.abs(depths)))
+
+    # the stated unit, if it is plausible
     low, high = DISTANCES
     if distance is None or low <= known * distance <= high:
         line = (
@@ -141,6 +144,8 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
             " says otherwise)"
         )
         return known, line if known != 1 else None
+
+    # else the plausible unit that brings the cameras nearest to their usual distance
     fitting = [unit for unit in UNITS if low <= unit * distance <= high]
     if not fitting:
         return known, None
