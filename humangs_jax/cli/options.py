@@ -369,7 +369,8 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
 def refine_limits(text: str) -> dict[str, Any]:
     """Parses --refine into fields of `RefineConfig`.
 
-    text: "15s", "15" (seconds), "100steps", or "0steps" (iterations and steps on the head only).
+    text: seconds, as in "15s" or "15", or steps, as in "100steps". A number of steps above 0 means
+    no steps on the head. "0steps" means iterations and steps on the head only.
 
     Raises: UsageError for another text.
     """

@@ -542,8 +542,8 @@ def _tag() -> str:
 
 @functools.cache
 def _sweep(parent: Path) -> None:
-    """Removes the temporary files that killed processes left in a folder. An old folder that was
-    moved aside is put back if its name is free, else removed.
+    """Removes the temporary files and folders that killed processes left in a folder. An old file
+    or folder that was kept aside is put back if its name is free, else removed.
 
     It runs once per process and folder, because folders may have very many files.
     """

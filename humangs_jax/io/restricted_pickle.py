@@ -233,8 +233,9 @@ class PlainDict(dict):
 class RestrictedUnpickler(pickle.Unpickler):
     """Reads one pickle of a file, from the file's current position.
 
-    names: the stand-in for each (module, name) of a pickle. A name that is not in the table is
-    refused. purpose: ends the message of a refusal. Strings of Python 2 are read as latin1.
+    names: the stand-in for each (module, name) that a pickle may use. Any other name is refused.
+    All modules whose names begin with "scipy.sparse" are looked up as "scipy.sparse". purpose: ends
+    the message of a refusal. Strings of Python 2 are read as latin1.
     """
 
     def __init__(self, file: Any, names: Mapping[tuple[str, str], Any], purpose: str):
@@ -242,7 +243,8 @@ class RestrictedUnpickler(pickle.Unpickler):
         super().__init__(self.looked, encoding="latin1")
 
     def find_class(self, module: str, name: str) -> Any:
-        """Returns the stand-in for a name of a module.
+        """Returns the stand-in for a name of a module. All modules whose names begin with
+        "scipy.sparse" are looked up as "scipy.sparse".
 
         Raises: InvalidFileError if the table has no such name.
         """

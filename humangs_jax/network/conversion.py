@@ -326,8 +326,11 @@ def load_checkpoint(path: str | os.PathLike[str], head_width: int | None = None)
     """Returns a released checkpoint as float32 variables, with the configuration that its shapes
     show.
 
-    head_width: see `infer_config`. Raises: OSError; ValueError, which names file and tensor. It is
-    raised if the file cannot be read or holds more than tensors, or if a tensor of the network is
+    head_width: see `infer_config`.
+
+    Raises: FileNotFoundError; ValueError, which names the file, and the tensor if the fault is in
+    one. ValueError is raised if the file cannot be read or is no released checkpoint, if its state
+    dict holds anything but tensors, if `infer_config` refuses it, or if a tensor of the network is
     missing, unknown, of the wrong shape or not finite.
     """
     with reading(path, "checkpoint of the published network"):

@@ -234,8 +234,9 @@ def refine_with_report(
 def calls_of_refine(
     avatar: Avatar, capture: Capture | PreparedCapture, config: RefineConfig
 ) -> Iterator[Call]:
-    """Yields the long programs of a refinement, so that they can be compiled before it begins.
-    Yields nothing without iterations or masks.
+    """Yields the programs of a refinement's iterations, so that they can be compiled before it
+    begins. Programs of steps are not among them. Yields nothing if there are no iterations or if
+    the capture has no masks.
     """
     photos = prepare_capture(capture)
     if config.iterations and photos.capture.masks is not None:

@@ -236,9 +236,11 @@ def _save(path: str | os.PathLike[str], state: SceneState, about: str) -> None:
 
 
 def _resumed(path: str | os.PathLike[str] | None, state: SceneState, about: str) -> SceneState:
-    """Returns the state in a checkpoint, or the given state if there is no such file.
+    """Returns the state in a checkpoint. Returns the given state if there is no such file, or if
+    `path` is None.
 
-    Raises: FileError for a checkpoint of another run, or another file.
+    Raises: FileError if the checkpoint is damaged or belongs to another run, or if the file is no
+    checkpoint.
     """
     if path is None or not os.path.exists(path):
         return state

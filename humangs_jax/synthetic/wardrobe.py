@@ -328,9 +328,9 @@ def _trousers(outfit: Outfit, garment: Garment) -> None:
 
 
 def _let_hang_over(outfit: Outfit, margin: float) -> None:
-    """Hides the part of the last piece that the top hangs over.
+    """Hides the part of the last piece that lies under the top.
 
-    margin: metres above the hem of the top that stay.
+    margin: height of the strip above the top's hem in which the last piece is not hidden, metres.
     """
     lower = outfit.pieces[-1]
     x, y, _ = lower.surface.template.T

@@ -84,8 +84,8 @@ class BodyMesh:
     """The vertex of the body that each vertex of the mesh stands for, (u,)."""
 
     def posed(self, avatar: Avatar, pose: BodyPose) -> "BodyMesh":
-        """Returns the mesh in a pose of the avatar's joints. Normals are turned by the rotations of
-        the blended transforms.
+        """Returns the mesh in a pose of the avatar's joints. Normals are multiplied by the linear
+        part of the blended transforms, and scaled to length 1.
         """
         rest = RestBody(avatar.rest_vertices, avatar.rest_joints)
         still = jnp.asarray(self.vertices)
@@ -361,8 +361,9 @@ def _skin(writer: GlbWriter, avatar: Avatar, mesh: BodyMesh, up: Up) -> dict[str
 def _animation(
     writer: GlbWriter, avatar: Avatar, motion: Motion, name: str, mesh_node: int
 ) -> dict[str, Any]:
-    """Returns the glTF animation of a motion. It has the rotations of every joint that turns, the
-    translation of the root, and the expressions if the avatar has a face.
+    """Returns the glTF animation of a motion. It has the rotations of every joint that turns and
+    the translation of the root. It has expressions if the motion has any of those of the avatar's
+    face.
     """
     times = writer.array("SCALAR", np.arange(len(motion.translations)) / motion.fps, bounds=True)
     rotations = np.asarray(motion.rotations)

@@ -59,8 +59,8 @@ def sharpened(
 
 
 def filter_margin(pixel: float) -> int:
-    """Returns how far beyond the mask `sharpened` reads the photo, pixels of the photo. pixel: see
-    `sharpened`.
+    """Returns the width of the margin around the mask in which `sharpened` also reads the photo,
+    pixels of the photo. pixel: see `sharpened`.
     """
     return int(np.ceil(2 * _RADIUS * pixel))
 

@@ -424,8 +424,9 @@ def _certainty_found(
 def _person_residuals(
     problem: KeypointProblem, observations: Observations, state: FitState
 ) -> dict[str, Float[Array, "..."]]:
-    """Returns the residuals of all frames, which share one shape. The key is the kind of
-    residual.
+    """Returns the residuals of all frames by kind. The person has the same body shape in all
+    frames: "shape" and "places" are there once, and all other kinds for each frame. "places" is
+    missing if the state has none.
     """
 
     def of_frame(seen, own):

@@ -283,8 +283,8 @@ def _evidence_residuals(
         return landmarks_from(model, joints, points)
 
     def keypoint_errors(seen, points):
-        """Returns the residuals of a view's keypoints. The influence of errors beyond five standard
-        deviations decreases.
+        """Returns the residuals of a view's keypoints, see `keypoint_residuals`. The robust scale
+        is 5 standard deviations.
         """
         return keypoint_residuals(model, seen, points, 5.0)
 

@@ -513,7 +513,9 @@ class _Smc:
             return [] if found is None else list(found.keys())
 
     def array(self, key: str, limit: str = "array_bytes") -> np.ndarray:
-        """Returns the numbers of a data set. limit: the name of the limit on its bytes."""
+        """Returns the numbers of an HDF5 data set. limit: the field of `Limits` that bounds their
+        bytes.
+        """
         with reading(f"{self.path}: {key}", "data set", CaptureError):
             data = self._at(key)
             if data is None:
