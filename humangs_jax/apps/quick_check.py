@@ -221,9 +221,8 @@ def _wrong_exposure(view: _View) -> str | None:
     """Returns what is wrong with the exposure of the person, who may be nearly black or burnt out;
     None if nothing is.
     """
-    person = (
-        view.image if view.mask is None else view.image[view.mask > 0.99]
-    )  # without its blended edge
+    # without its blended edge
+    person = view.image if view.mask is None else view.image[view.mask > 0.99]
     if person.size and np.quantile(person, 0.98) < _LIMITS.dark:
         return (
             "the person is nearly black; is the photo underexposed, or were its values divided by"
@@ -274,9 +273,8 @@ def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
     off = [i for i, overlap in own.items() if overlap < _LIMITS.sure_iou]
     if len(off) < 2:
         return {}
-    from scipy.optimize import (
-        linear_sum_assignment,
-    )  # takes longer to import than all else here to compute
+    # takes longer to import than all else here to compute
+    from scipy.optimize import linear_sum_assignment
 
     overlaps = np.array([[_overlap(drawn(i, j), masks[i]) for j in off] for i in off])
     chosen = linear_sum_assignment(-overlaps)[1].tolist()
@@ -308,9 +306,8 @@ def _silhouette(view: _View) -> tuple[Cells, float, float]:
     covered = np.zeros((rows, columns), bool)
     column, row = np.minimum((pixels / cell).astype(int), (columns - 1, rows - 1)).T
     covered[row, column] = True
-    closed = ndimage.binary_closing(np.pad(covered, 2), np.ones((3, 3)))[
-        2:-2, 2:-2
-    ]  # gaps between the points
+    # gaps between the points
+    closed = ndimage.binary_closing(np.pad(covered, 2), np.ones((3, 3)))[2:-2, 2:-2]
     tall = 0.0
     if len(pixels):
         tall = float(np.ptp(pixels[:, 1])) / height

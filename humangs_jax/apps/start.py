@@ -372,9 +372,8 @@ def held_out_psnr(
     if watch is not None:
         watch(avatar, others)
     if refinement is not None:
-        avatar = refine(
-            avatar, others, dataclasses.replace(refinement, head_steps=0)
-        )  # heads hardly change the number
+        # heads hardly change the number
+        avatar = refine(avatar, others, dataclasses.replace(refinement, head_steps=0))
     photo = cropped(_with_unknown(capture.select([view])), SIZE)
     assert photo.masks is not None and photo.unknown is not None
     drawn = predict_views(avatar, photo)

@@ -298,9 +298,8 @@ def _hidden(avatar: Avatar, body: BodyModel, follows: np.ndarray) -> dict[str, A
     for name, color in COLORS.items():
         colors[parts.parts == PARTS.index(name)] = color
 
-    drawn = (
-        corners.copy()
-    )  # lids have the shape that they have when closed: they are folded when open
+    # lids have the shape that they have when closed: they are folded when open
+    drawn = corners.copy()
     for side, eye, blink in zip(("left", "right"), EYES, BLINKS, strict=True):
         lid, at = parts.parts == PARTS.index(f"{side}_lid"), names.index(blink)
         corners[lid] = _map_around(corners[lid], before, after, NEAR["lid"])(corners[lid])

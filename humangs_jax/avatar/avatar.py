@@ -427,10 +427,8 @@ def _load(cls: type[Avatar], path: Any) -> Avatar:
     if missing:
         raise InvalidFileError(f"missing keys {missing}")
     check_joints(header["parents"], header["joint_names"])
-    skinning, rendering = (
-        header["skinning"],
-        header.get("rendering", "exact"),
-    )  # the first files do not say
+    # the first files do not say
+    skinning, rendering = header["skinning"], header.get("rendering", "exact")
     if skinning not in ("affine", "rotation") or rendering not in ("exact", "inria"):
         raise InvalidFileError(
             f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation',"

@@ -201,9 +201,8 @@ def shot_cameras(
     right = np.stack([np.cos(turns), 0 * turns, -np.sin(turns)], axis=-1)
     back = np.cos(lift) * np.stack([np.sin(turns), 0 * turns, np.cos(turns)], axis=-1)
     back[:, 1] = np.sin(lift)
-    axes = np.stack(
-        [right, np.cross(right, back), -back], axis=1
-    )  # of the cameras in the world: right, down, forward
+    # of the cameras in the world: right, down, forward
+    axes = np.stack([right, np.cross(right, back), -back], axis=1)
     targets = np.broadcast_to(targets, back.shape)
     if shot.distance is None:
         distance = _fitting_distance(shot, points, targets, axes)

@@ -236,9 +236,8 @@ def write_webm(
         "4",
     ]
     quality += ["-fflags", "+bitexact"]  # no random number in the file
-    if (
-        shape[-1] == 4
-    ):  # a second stream beside the colors; alternate reference frames would separate the two
+    # a second stream beside the colors; alternate reference frames would separate the two
+    if shape[-1] == 4:
         quality += ["-pix_fmt", "yuva420p", "-auto-alt-ref", "0"]
     else:
         quality += ["-pix_fmt", "yuv420p"]

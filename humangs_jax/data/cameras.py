@@ -515,8 +515,7 @@ def _squared_reach(coefficients: Sequence[float | int] | np.ndarray) -> float:
     Beyond this radius the formula folds the image back over itself.
     """
     k1, k2, _, _, k3 = np.clip(coefficients, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
-    roots = np.roots(
-        [1, 3 * k1, 5 * k2, 7 * k3]
-    )  # 1 / r^2, so that tiny coefficients are not divided by
+    # 1 / r^2, so that tiny coefficients are not divided by
+    roots = np.roots([1, 3 * k1, 5 * k2, 7 * k3])
     real = roots[(np.abs(roots.imag) <= 1e-9 * np.abs(roots.real)) & (roots.real > 0)].real
     return 1 / real.max() if len(real) else np.inf

@@ -501,9 +501,8 @@ def read_view(
     if "mask" not in view:
         return image, alpha, False
     mask = read_mask(folder / view["mask"], "its image", image.shape[1], image.shape[0])
-    if (
-        on_white or alpha is not None
-    ):  # composited already: the mask file only says what the person is
+    # composited already: the mask file only says what the person is
+    if on_white or alpha is not None:
         return image, mask, False
     return image, mask, True
 
@@ -570,6 +569,5 @@ def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:
         names = tuple(plain(name_of(Path(path)), i) for i, path in enumerate(paths))
         if len(set(names)) == len(names):
             return names
-    return tuple(
-        f"{i:03d}_{name}" for i, name in enumerate(names)
-    )  # one photo used twice, "a b" and "a_b"
+    # one photo used twice, "a b" and "a_b"
+    return tuple(f"{i:03d}_{name}" for i, name in enumerate(names))

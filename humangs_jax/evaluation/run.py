@@ -179,9 +179,8 @@ def page_html(evaluation: dict[str, Any], notes: list[str], gallery: _Gallery) -
         "title": html.escape(f"{evaluation['name']}, protocol {evaluation['protocol']['name']}"),
         "style": read("style.css"),
         "script": read("report.js"),
-        "data": (
-            json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-        ),  # a name may not end the script
+        # a name may not end the script
+        "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
     }
     return _MARK.sub(lambda mark: parts[mark[1]], read("index.html"))
 

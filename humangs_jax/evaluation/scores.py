@@ -306,9 +306,8 @@ def _alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict
 
 
 def _precise_lpips(weights: Lpips, predicted: Any, truth: Any, size: Any = None) -> Scalar:
-    with jax.default_matmul_precision(
-        "highest"
-    ):  # accelerators round the factors of convolutions by default
+    # accelerators round the factors of convolutions by default
+    with jax.default_matmul_precision("highest"):
         return lpips(weights, predicted, truth, size)
 
 

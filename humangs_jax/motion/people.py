@@ -386,9 +386,8 @@ def expected(values: Mapping[Any, Any], pickled: Sequence[str] = ()) -> str:
     first_keys = dict.fromkeys(
         row.arrays.keys[0] for row in MOTIONS.values() if row.arrays is not None
     )
-    first = ", ".join(
-        key for key in first_keys if not key.startswith("(")
-    )  # that of a single array
+    # that of a single array
+    first = ", ".join(key for key in first_keys if not key.startswith("("))
     unread = [f"{key} (a pickled object, which is never read)" for key in pickled]
     keys = ", ".join([*unread, *sorted(map(str, values))][:SHOWN]) or "none"
     return f"no motion: expected one of the keys {first}, got {keys}{hint_for(values)}"

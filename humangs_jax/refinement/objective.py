@@ -42,9 +42,8 @@ FASTER_COMPILATION = {"xla_backend_optimization_level": 1}
 0.9 of the time and run as fast. At level 0 they would run eight times as long.
 """
 
-jax.tree_util.register_static(
-    RefineConfig
-)  # here: its own module is imported by the command line, without JAX
+# here: its own module is imported by the command line, without JAX
+jax.tree_util.register_static(RefineConfig)
 
 
 def _options() -> dict[str, Any] | None:

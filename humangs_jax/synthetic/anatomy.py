@@ -225,9 +225,8 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -
         thigh = build.joints[knee] - build.joints[hip]
         shin = build.joints[ankle] - build.joints[knee]
         bend = _knee_angle(thigh, shin, float(np.linalg.norm(target - start)))
-        across = (
-            turn[:, 0] + orientation[:, 0]
-        )  # knees point between where the pelvis and where the foot looks
+        # knees point between where the pelvis and where the foot looks
+        across = turn[:, 0] + orientation[:, 0]
         chain = thigh + turned(x=bend) @ shin
         upper = _frame(target - start, across) @ _frame(chain, np.asarray([1.0, 0.0, 0.0])).T
         lower = upper @ turned(x=bend)

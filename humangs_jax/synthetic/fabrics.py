@@ -48,9 +48,8 @@ class Spots:
         """
         girth = self.cloth[:, 3]
         turned = np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * girth
-        flat = (
-            np.clip((self.cloth[:, 1] - 0.03) / 0.09, 0, 1) * self._on_trunk
-        )  # 0 where the cloth hangs
+        # 0 where the cloth hangs
+        flat = np.clip((self.cloth[:, 1] - 0.03) / 0.09, 0, 1) * self._on_trunk
         x = self.cloth[:, 0]
         across = np.where(self.template[:, 2] > _SHOULDER_RIDGE, x, np.sign(x) * np.pi * girth - x)
         return turned + flat * (across - turned)

@@ -243,9 +243,8 @@ def above_line(template: Points, line: tuple, shift: float = 0.0) -> Field:
 
     line: azimuths and heights. shift: metres by which the line is raised.
     """
-    azimuths = np.abs(
-        np.arctan2(np.abs(template[:, 0]), template[:, 2] - SKULL[2])
-    )  # 0 in front, pi at the nape
+    # 0 in front, pi at the nape
+    azimuths = np.abs(np.arctan2(np.abs(template[:, 0]), template[:, 2] - SKULL[2]))
     above = template[:, 1] - np.interp(azimuths, *line) - shift
     return np.where((template[:, 1] > 0.2) & (np.abs(template[:, 0]) < 0.12), above, -1.0)
 

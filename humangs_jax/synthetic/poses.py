@@ -322,9 +322,8 @@ def bend_arm(
     twist[:, 0] = rng.uniform(-1.0, 0.8, n)
     flex[:, 1] = -rng.uniform(*wanted.flexed, n)
     pronation[:, 0] = rng.uniform(-0.4, 0.5)
-    about_both = np.stack(
-        [forward[:, 1], down[:, 1], down[:, 2]], 1
-    )  # a hanging arm swings about the axis of both shoulders
+    # a hanging arm swings about the axis of both shoulders
+    about_both = np.stack([forward[:, 1], down[:, 1], down[:, 2]], 1)
     if goal == "hang":
         swing = matrix(about_both)
     else:

@@ -248,9 +248,8 @@ def _foot_at(
         float(a + s * (b - a))
         for a, b in ((here.x, there.x), (here.z, there.z), (here.yaw, there.yaw))
     )
-    pitch = off * (1 - _ease(min(1.0, u / 0.6))) - strike * _ease(
-        (u - 0.4) / 0.6
-    )  # quickly, to clear the ground
+    # quickly, to clear the ground
+    pitch = off * (1 - _ease(min(1.0, u / 0.6))) - strike * _ease((u - 0.4) / 0.6)
     return kin.Foot(*at, pitch=float(pitch), lift=float(gait.lift * np.sin(np.pi * s) ** 2))
 
 
@@ -263,9 +262,8 @@ def _footprint(
     """
     middle = down + 0.5 * _STANCE_SHARE
     yaw, sign = float(heading(middle)), 1 - 2 * side
-    ahead = (
-        build.joints[Joint.LEFT_FOOT, 2] - build.joints[Joint.PELVIS, 2] - 0.04 * build.leg
-    )  # of the ball, standing
+    # of the ball, standing
+    ahead = build.joints[Joint.LEFT_FOOT, 2] - build.joints[Joint.PELVIS, 2] - 0.04 * build.leg
     x, _, z = track(middle) + kin.turned(y=yaw) @ np.asarray([sign * gait.width, 0.0, ahead])
     return kin.Foot(float(x), float(z), float(yaw + sign * gait.turn_out))
 

@@ -360,9 +360,8 @@ def _build(anatomy: Anatomy, surface: Surface) -> Build:
         )
     )
     low = surface.vertices[(surface.vertices[:, 1] < -0.5) & (surface.vertices[:, 1] > -0.9)]
-    spread = (
-        float(np.quantile(np.abs(low[:, 0]), 0.98)) if len(low) else 0.2
-    )  # wide skirts keep the hands away
+    # wide skirts keep the hands away
+    spread = float(np.quantile(np.abs(low[:, 0]), 0.98)) if len(low) else 0.2
     leg_line = float(np.abs(anatomy.joints[Joint.LEFT_KNEE, 0]))
     radii = (
         depth + 0.015,

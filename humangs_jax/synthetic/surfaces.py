@@ -89,9 +89,8 @@ class Folds:
         ):
             angle = points @ k + phase + warp
             crest = np.sin(angle)
-            flank = (
-                np.cos(angle) * crest / np.sqrt(crest * crest + 0.15)
-            )  # of a ridge |sin| with a rounded top
+            # of a ridge |sin| with a rounded top
+            flank = np.cos(angle) * crest / np.sqrt(crest * crest + 0.15)
             total += (np.clip(patch(points) - 0.3, 0, 1) * flank)[:, None] * direction
         return total
 

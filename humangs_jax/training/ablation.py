@@ -311,9 +311,8 @@ def _folder_names(names: Sequence[str]) -> dict[str, str]:
         if not re.search(r"\w", plain[name]) or len(plain[name]) > LONGEST_NAME
     ]
     taken, folders = set[str](), {}
-    for name in sorted(
-        names, key=lambda name: (name != BASE, plain[name] != name)
-    ):  # exact names keep theirs
+    # exact names keep theirs
+    for name in sorted(names, key=lambda name: (name != BASE, plain[name] != name)):
         folder = plain[name]
         if name in unusable or folder.lower() in taken:
             folder = f"{folder.strip('.')[:LONGEST_NAME]}-{zlib.crc32(name.encode()):08x}"
@@ -331,9 +330,8 @@ def _compared(validation: People, body: BodyModel, base: TrainConfig) -> tuple[S
         count = validation
     if not isinstance(found, Sequence):
         return compared_as(base, found), count
-    captured = functools.cache(
-        lambda: captured_people(found, body)
-    )  # photos that are decoded once serve all runs
+    # photos that are decoded once serve all runs
+    captured = functools.cache(lambda: captured_people(found, body))
     return compared_as(base, lambda config: captured()(config)), len(found)
 
 

@@ -109,9 +109,8 @@ class Checkpoints:
         step = int(state.step)
         if step in self._manager.all_steps():
             return
-        if (
-            jax.default_backend() == "cpu"
-        ):  # where the next step would overwrite the memory that is being written
+        # where the next step would overwrite the memory that is being written
+        if jax.default_backend() == "cpu":
             state = jax.tree.map(jnp.copy, state)
         scored = score is not None and not math.isnan(score)
         metrics = {"score": float(score) if scored else UNSCORED, CHECKSUM: _checksum(state)}

@@ -372,9 +372,8 @@ def observe_subject(
     def report(name, values):
         return StageReport(name, values, *sent.get(name, ({}, {})), own.get(name, {}))
 
-    return value, [
-        report(name, given[name]) for name in (*dry.given, "loss")
-    ]  # a transformation sorts what it returns
+    # a transformation sorts what it returns
+    return value, [report(name, given[name]) for name in (*dry.given, "loss")]
 
 
 def diagnose_step(
@@ -437,9 +436,8 @@ def diagnose_run(
     else:
         make_source = training
     body = gaussian_body(body, config.model)
-    checkpoints = Checkpoints(
-        Path(out) / "checkpoints", read_only=True
-    )  # the run may still be writing
+    # the run may still be writing
+    checkpoints = Checkpoints(Path(out) / "checkpoints", read_only=True)
     failed = first_failed_step(Path(out) / "log.jsonl")
     state = init_state(config, variables)
     before = [step for step in checkpoints.steps if failed is None or step <= failed]

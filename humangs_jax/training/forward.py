@@ -178,9 +178,8 @@ def as_validated(config: TrainConfig) -> TrainConfig:
         scattered_share=0.0,
         mixed_pose_share=0.0,
     )
-    without = dataclasses.replace(
-        config.loss, depth=0.0
-    )  # no loss is computed, so no depths are needed
+    # no loss is computed, so no depths are needed
+    without = dataclasses.replace(config.loss, depth=0.0)
     return dataclasses.replace(
         config, views=views, loss=without, target_size=config.model.conventions.image_size
     )

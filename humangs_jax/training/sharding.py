@@ -171,7 +171,6 @@ def join_processes(
             "several processes: give coordinator, number of processes and process index, or none of"
             " them"
         )
-    jax.config.update(
-        "jax_cpu_collectives_implementation", "gloo"
-    )  # CPUs have no others; no matter elsewhere
+    # CPUs have no others; no matter elsewhere
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
     jax.distributed.initialize(coordinator, process_count, process_index)

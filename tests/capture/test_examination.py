@@ -270,9 +270,8 @@ def test_discs_are_where_the_keypoints_are_those_of_outliers_are_hollow_and_line
     assert len(blue) > 30
     np.testing.assert_allclose(blue.mean(0), [2 * 16 - 0.5, 2 * 32 - 0.5 + GAP], atol=1.0)
     y, x = top + 2 * 16, GAP + 2 * 224
-    assert (
-        image[y - 1 : y + 1, x - 1 : x + 1, 2] > 0.9
-    ).all()  # the white photo, or the line, but no red disc
+    # the white photo, or the line, but no red disc
+    assert (image[y - 1 : y + 1, x - 1 : x + 1, 2] > 0.9).all()
     around = image[y - 8 : y + 8, x - 8 : x + 8]
     assert ((around[..., 0] - around[..., 2]) > 0.3).sum() > 10 and TINTS.right[0] > TINTS.right[2]
     x, y = 2 * examination.landmarks[0, LEFT_WRIST] + [GAP, top]

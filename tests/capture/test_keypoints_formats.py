@@ -422,11 +422,8 @@ def test_names(images, names, views):
         ([3, 1], ("cam_1", "cam_2"), [None, 0]),
         ([0, 1, 2], ("f_001", "f_002", "f_003"), [0, 1, 2]),  # ffmpeg counts from 1
         ([0, 1, 2], ("f_100", "f_101", "f_102"), [0, 1, 2]),
-        (
-            [0, 1, 2, 3],
-            ("f_001", "f_002", "f_003"),
-            [None, 0, 1, 2],
-        ),  # who knows: the numbers as they are
+        # who knows: the numbers as they are
+        ([0, 1, 2, 3], ("f_001", "f_002", "f_003"), [None, 0, 1, 2]),
         ([1, 2, 3, 4], ("cam0_rgb", "cam1_rgb", "cam2_rgb", "cam3_rgb"), [0, 1, 2, 3]),
         ([3, 4], ("left_1", "left_2", "right_3", "right_4"), [2, 3]),  # not one for every view
     ],

@@ -323,9 +323,8 @@ def test_cameras_of_stored_pixels_are_turned_with_them(flag, lens, tmp_path):
     [
         *(("shown", flag) for flag in range(1, 9)),
         *(("flagged", flag) for flag in range(1, 9)),
-        *(
-            ("stored", flag) for flag in (1, 5, 6, 7, 8)
-        ),  # others look like masks of the turned photo
+        # others look like masks of the turned photo
+        *(("stored", flag) for flag in (1, 5, 6, 7, 8)),
     ],
 )
 def test_masks_are_turned_to_their_photo(mask, flag, tmp_path):

@@ -385,11 +385,8 @@ def places(*xs):
         ((0.0,), (0.9,), [0]),
         ((0.0, 0.8), (0.3, 1.1), [0, 1]),
         ((0.0, 0.8), (1.1, 0.3), [1, 0]),
-        (
-            (0.0, 1.0),
-            (-1.4, -0.4),
-            [None, None],
-        ),  # one walked to where the other was, whose way is too long
+        # one walked to where the other was, whose way is too long
+        ((0.0, 1.0), (-1.4, -0.4), [None, None]),
         ((0.0, 0.4), (0.2, 9.0), [None, None]),  # who of them went away?
         ((0.0,), (0.1, 0.2), [None]),
     ],

@@ -190,9 +190,8 @@ def test_a_tube_is_made_of_the_body_and_moves_no_joint(body):
     assert (np.diff(tube[:, :, 1], axis=0) < 0).all()  # rows go down
     normals = np.asarray(vertex_normals(worn.template, worn.faces))[count:].reshape(ROWS, -1, 3)
     middle = GAP // 2
-    assert (normals[:, middle, 2] > 0.7).all() and (
-        normals[:, GAP + HALF + middle, 2] < -0.7
-    ).all()  # front and back
+    # front and back
+    assert (normals[:, middle, 2] > 0.7).all() and (normals[:, GAP + HALF + middle, 2] < -0.7).all()
 
 
 def test_a_skirt_bends_between_the_legs(body):

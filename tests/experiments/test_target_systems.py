@@ -323,9 +323,8 @@ def test_corrections_turn_gaussians_about_the_axes_of_the_body():
     half = 0.5**0.5
     gaussians = Gaussians(
         means=jnp.zeros((1, 3)),
-        quats=jnp.asarray(
-            [[half, half, 0.0, 0.0]]
-        ),  # a quarter turn about x: the long z axis points to -y
+        # a quarter turn about x: the long z axis points to -y
+        quats=jnp.asarray([[half, half, 0.0, 0.0]]),
         scales=jnp.asarray([[0.01, 0.01, 0.1]]),
         opacities=jnp.asarray([0.5]),
         colors=jnp.full((1, 3), 0.5),

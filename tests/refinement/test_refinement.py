@@ -458,12 +458,8 @@ def test_a_photo_that_contradicts_the_others_is_left_out_and_named(four, monkeyp
 @pytest.mark.parametrize(
     ("held_out", "psnrs", "loss", "kept"),
     [
-        (
-            0.3,
-            (30.0, 25.0),
-            0.0,
-            0,
-        ),  # the photos that are seen are fitted, the held-out pixels get worse
+        # the photos that are seen are fitted, the held-out pixels get worse
+        (0.3, (30.0, 25.0), 0.0, 0),
         (0.3, (30.0, 31.0), 9.0, 2),
         (0.0, (100.0, 100.0), 0.0, 2),  # nothing is held out: all pixels decide
         (0.0, (100.0, 100.0), 9.0, 0),

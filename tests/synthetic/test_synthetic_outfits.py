@@ -95,9 +95,8 @@ def test_the_person_of_a_subject_is_its_description(body, people):
     assert [g.kind for g in built.person.garments] == [g.kind for g in people[3].garments]
     np.testing.assert_array_equal(built.betas, people[3].betas)
     skin = built.face_materials == 0
-    assert (
-        built.cover[np.unique(built.surface.faces[~skin])] == -1
-    ).all()  # only skin lies under hems
+    # only skin lies under hems
+    assert (built.cover[np.unique(built.surface.faces[~skin])] == -1).all()
     assert built.cover.max() > 0.003  # metres
 
 

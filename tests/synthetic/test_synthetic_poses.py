@@ -83,9 +83,8 @@ def test_all_joints_stay_within_their_limits(drawn):
 
 
 def test_knees_elbows_and_fingers_bend_one_way(drawn):
-    assert (
-        drawn[:, [kin.Joint.LEFT_KNEE, kin.Joint.RIGHT_KNEE], 0] >= -0.03
-    ).all()  # rest knees are not quite straight
+    # rest knees are not quite straight
+    assert (drawn[:, [kin.Joint.LEFT_KNEE, kin.Joint.RIGHT_KNEE], 0] >= -0.03).all()
     assert (drawn[:, kin.Joint.LEFT_ELBOW, 1] < 0).all() and (
         drawn[:, kin.Joint.RIGHT_ELBOW, 1] > 0
     ).all()

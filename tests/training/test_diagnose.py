@@ -79,10 +79,8 @@ def test_the_numbers_are_those_of_the_step(body, batch, variables):
 
 TOKENS = "encoder.tokenizer.linear"
 IN_BATCH = {
-    "inputs.images": (
-        (0, 1, 16, 16, 2),
-        TOKENS,
-    ),  # a pixel of the person; the background is not read
+    # a pixel of the person; the background is not read
+    "inputs.images": ((0, 1, 16, 16, 2), TOKENS),
     "targets.images": ((0, 0, 5, 6, 0), "loss: squared"),
     "targets.masks": ((0, 1, 2, 3), "loss: silhouette"),
     "inputs.betas": ((0, 0), "position maps"),

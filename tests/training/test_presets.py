@@ -56,9 +56,8 @@ def shrunk(name):
         config,
         model=model.with_runtime(token_capacity=16),
         views=dataclasses.replace(config.views, input_counts=(2,), target_count=1),
-        loss=dataclasses.replace(
-            config.loss, structural_scales=1
-        ),  # images of 32 pixels have no third scale
+        # images of 32 pixels have no third scale
+        loss=dataclasses.replace(config.loss, structural_scales=1),
         target_size=SIZE,
         batch_size=4,
         stages=(),

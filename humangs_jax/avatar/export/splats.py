@@ -365,9 +365,8 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
         255 * np.clip(np.concatenate([colors, opacities[:, None]], axis=1), 0, 1)
     )
     rows["rotation"] = np.clip(np.rint(128 * quats + 128), 0, 255)
-    order = np.argsort(
-        -opacities * scales.prod(axis=1), kind="stable"
-    )  # viewers draw the first while the rest loads
+    # viewers draw the first while the rest loads
+    order = np.argsort(-opacities * scales.prod(axis=1), kind="stable")
     write_bytes(path, rows[order].tobytes())
 
 

@@ -294,9 +294,8 @@ def _with_table(data: bytes, notes: list[str]) -> tuple[_Header, list[bytes]]:
     rows = list(TABLE_ROW.iter_unpack(data[place:end]))
     sizes = [header.count * width for width in header.widths]
     filled = [size for size in sizes if size]
-    rows = (
-        rows if len(rows) == len(filled) else [row for row in rows if row[1]]
-    )  # empty streams may be left out
+    # empty streams may be left out
+    rows = rows if len(rows) == len(filled) else [row for row in rows if row[1]]
     if [unpacked for _, unpacked in rows] != filled:
         found = ", ".join(f"{unpacked:,}" for _, unpacked in rows[: len(sizes)]) or "none"
         wanted = ", ".join(f"{size:,}" for size in filled)

@@ -96,9 +96,8 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
     if calibration.per_image:
         unused = unused_photos(find_photos(kept, images, None), images, kept)
         if any(each.why.because.startswith(NO_CAMERA) for each in unused):
-            _refuse_missing(
-                calibration, images, missing[0]
-            )  # their names do not match: which photo is meant?
+            # their names do not match: which photo is meant?
+            _refuse_missing(calibration, images, missing[0])
     noun = "image" if calibration.per_image else "camera"
     whole = counted(len(there), noun)
     line = (

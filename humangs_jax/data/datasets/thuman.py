@@ -265,9 +265,8 @@ def read_scan(file: str | Path) -> Scan:
         image = getattr(getattr(mesh.visual, "material", None), "image", None)
         if uvs is None:
             raise InvalidFileError("no texture coordinates: expected a textured scan")
-        if (
-            image is None or max(image.size) <= 2
-        ):  # trimesh leaves out what it cannot read, or puts a placeholder there
+        # trimesh leaves out what it cannot read, or puts a placeholder there
+        if image is None or max(image.size) <= 2:
             raise InvalidFileError(
                 "no texture image: expected a material (.mtl) beside the scan that names a PNG or"
                 " JPEG file"

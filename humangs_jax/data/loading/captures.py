@@ -79,9 +79,8 @@ def read_summary(
             " parameters of that"
         )
         raise CaptureError(parameter_file, "body", problem)
-    betas, rotations, translations, _ = body_parameters(
-        body, **parameters, file=parameter_file
-    )  # bodies of training are bare
+    # bodies of training are bare
+    betas, rotations, translations, _ = body_parameters(body, **parameters, file=parameter_file)
     views, size = description["views"], None
     check_photos(folder, views, together=False)
     for view in views:
