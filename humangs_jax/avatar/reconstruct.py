@@ -124,7 +124,7 @@ def reconstruct(
     with compiling(("reconstruct", config, views.images.shape)):
         # where masks alone say how many tokens there are, two programs are compiled side by side
         if sized is not None:
-            shapes = jax.eval_shape(_prepare, body, views, config)
+            shapes = _prepare.eval_shape(body, views, config)
             compile_ahead(_reconstruct, variables, sized, body, views, shapes)
 
         # the body as each photo shows it, then the network
@@ -150,7 +150,7 @@ def calls_of_reconstruct(
         moved = np.zeros(body.template.shape, np.float32)
     views, sized = _for_network(capture, moved, config)
     if sized is not None:
-        inputs = jax.eval_shape(_prepare, body, views, config)
+        inputs = _prepare.eval_shape(body, views, config)
         yield _reconstruct, (variables, sized, body, views, inputs)
         yield _prepare, (body, views, config)
 

@@ -22,7 +22,7 @@ import re
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -33,7 +33,12 @@ import numpy as np
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 
-from humangs_jax.core.processes import kept_programs
+from humangs_jax.core.processes import (
+    kept_programs,
+    processor,
+    source_at_start,
+    source_has_changed,
+)
 
 T = TypeVar("T")
 
@@ -43,8 +48,10 @@ MADE_BY = ("jax", "jaxlib", "flax", "numpy", "optax", "optimistix", "equinox", "
 """Packages whose versions are part of a program's name."""
 KNOWN = (PACKAGE.name, "builtins", "types", "collections", *MADE_BY)
 """Packages whose classes and functions may be in the arguments of a program that is kept."""
-SETTINGS = ("enable_x64", "default_matmul_precision", "disable_jit", "debug_nans")
+SETTINGS = ("enable_x64", "default_matmul_precision")
 """Settings of JAX that a program depends on and that a block of code may change."""
+DIGEST = hashlib.sha256().digest_size
+"""Number of bytes of the hash at the beginning of each file. XLA would run a damaged program."""
 HIT = "/jax/compilation_cache/cache_hits"
 """JAX's event of a program that its own cache on disk had."""
 
@@ -68,6 +75,7 @@ class Compiled(Generic[T]):
         self.static = tuple(name for name in static if name in self.signature.parameters)
         self.options = options
         self._programs: dict[Any, Future[Any]] = {}
+        self._functions: dict[Any, Any] = {}
         self._lock = threading.Lock()
 
     @functools.cached_property
@@ -77,19 +85,22 @@ class Compiled(Generic[T]):
         """
         return self._jitted(self.function)
 
-    @functools.cached_property
-    def _kept(self) -> Any:
-        """The function as `jax.jit` compiles it for programs that are kept.
+    def _jitted_for(self, call: "_Call") -> Any:
+        """Returns the function as `jax.jit` compiles it for the program of one call.
 
-        JAX finds programs in memory by the function. This is another function, so that a program
-        that `jitted` has read from JAX's cache is not taken for one that was compiled.
+        JAX finds programs in memory by the function and the types of its arguments. Two of our
+        calls may be one program to JAX (a number of Python and a weak array). With one function for
+        each program, a program that was read from JAX's cache is never taken for one that was
+        compiled.
         """
+        if call.key in self._functions:
+            return self._functions[call.key]
 
         @functools.wraps(self.function)
         def function(*args: Any, **kwargs: Any) -> Any:
             return self.function(*args, **kwargs)
 
-        return self._jitted(function)
+        return self._functions.setdefault(call.key, self._jitted(function))
 
     def _jitted(self, function: Callable[..., Any]) -> Any:
         """Returns a function as `jax.jit` compiles it."""
@@ -119,11 +130,11 @@ class Compiled(Generic[T]):
         """Returns the shapes of the result, as `jax.eval_shape`. They are kept on disk, too."""
         call = self._call(args, kwargs)
         file = None if call is None else self._file(call, "shapes")
-        if file is None:
+        if call is None or file is None:
             return self.jitted.eval_shape(*args, **kwargs)
         with contextlib.suppress(Exception):
             return _read(file)
-        shapes = self._kept.eval_shape(*args, **kwargs)
+        shapes = self._jitted_for(call).eval_shape(*args, **kwargs)
         with contextlib.suppress(Exception):
             _write(file, pickle.dumps(shapes))
         return shapes
@@ -141,7 +152,8 @@ class Compiled(Generic[T]):
         on. None if programs are not kept, or not those of such arguments.
         """
         folder = _folder()
-        if folder is None:
+        # under these settings JAX calls the function itself, to find faults
+        if folder is None or jax.config.jax_disable_jit or jax.config.jax_debug_nans:
             return None
         bound = self.signature.bind(*args, **kwargs)
         names = tuple(self.signature.parameters)
@@ -154,27 +166,29 @@ class Compiled(Generic[T]):
         shapes = tuple(map(_shape, leaves))
         if None in shapes:
             return None
+        # 2 equals 2.0, but their programs differ
+        fixed = tuple((name, type(value), value) for name, value in static.items())
         settings = [getattr(jax.config, f"jax_{name}") for name in SETTINGS]
-        return _Call(
-            folder, bound, dynamic, named, (tree, shapes, tuple(static.items()), *settings)
-        )
+        return _Call(folder, bound, dynamic, named, (tree, shapes, fixed, *settings))
 
     def _program(self, call: "_Call") -> Callable[..., T] | None:
         """Returns the program of a call. If another thread is making it, waits for it. None if
         programs of this kind are not kept.
         """
-        with self._lock:
-            future = self._programs.get(call.key)
-            first = future is None
-            if future is None:
-                future = self._programs[call.key] = Future()
-        if first:
-            try:
-                future.set_result(self._made(call))
-            except BaseException as error:
-                with self._lock:
+        own: Future[Any] = Future()
+        # Ctrl-C may come at any time, and must leave nothing that other threads would wait for
+        try:
+            with self._lock:
+                future = self._programs.setdefault(call.key, own)
+            if future is own:
+                own.set_result(self._made(call))
+        except BaseException as error:
+            with self._lock:
+                if self._programs.get(call.key) is own:
                     del self._programs[call.key]
-                future.set_exception(error)
+            if not own.done():
+                own.set_exception(error if isinstance(error, Exception) else CancelledError())
+            raise
         return future.result()
 
     def _made(self, call: "_Call") -> Callable[..., T] | None:
@@ -187,8 +201,10 @@ class Compiled(Generic[T]):
         # a file that cannot be read is made anew
         with contextlib.suppress(Exception):
             return serialize_executable.deserialize_and_load(*_read(file))
+        jitted = self._jitted_for(call)
+        del self._functions[call.key]  # if this fails, the next attempt gets another function
+        lowered = jitted.lower(*call.bound.args, **call.bound.kwargs)
         hits = _hits.count
-        lowered = self._kept.lower(*call.bound.args, **call.bound.kwargs)
         program = lowered.compile()
         # XLA cannot write what it has read: the file would lack the functions of the program, and
         # the first call of another process would fail
@@ -350,29 +366,40 @@ def _surroundings() -> str:
     """Returns what all programs depend on: the source of the package, the versions of what compiles
     it, and the settings of JAX and XLA in environment variables.
     """
-    source = hashlib.sha256()
-    for file in sorted(PACKAGE.rglob("*.py")):
-        source.update(f"{file.relative_to(PACKAGE)}\0".encode() + file.read_bytes() + b"\0")
     settings = {
         name: value
         for name, value in sorted(os.environ.items())
         if name.startswith(("JAX_", "XLA_")) and "CACHE" not in name
     }
     versions = {name: version(name) for name in MADE_BY}
-    return f"{source.hexdigest()} {versions} {settings}"
+    return f"{source_at_start()} {processor()} {versions} {settings}"
 
 
 def _read(file: Path) -> Any:
     """Returns what a file holds. Files that were not used for longest are deleted first, so that
     the file is noted as used.
     """
-    value = pickle.loads(file.read_bytes())
-    os.utime(file)
+    data = file.read_bytes()
+    if hashlib.sha256(data[DIGEST:]).digest() != data[:DIGEST]:
+        raise ValueError(f"{file}: damaged")
+    value = pickle.loads(data[DIGEST:])
+    with contextlib.suppress(OSError):  # a disk that is read only
+        os.utime(file)
     return value
 
 
 def _write(file: Path, data: bytes) -> None:
-    """Writes a file at once, so that no other process reads a part of it."""
+    """Writes a file at once, so that no other process reads a part of it. Writes nothing if the
+    source has changed since the process began: the program may be that of either source.
+    """
+    if source_has_changed():
+        return
     with tempfile.NamedTemporaryFile(dir=file.parent, suffix="-cache", delete=False) as temporary:
-        temporary.write(data)
-    os.replace(temporary.name, file)
+        try:
+            temporary.write(hashlib.sha256(data).digest() + data)
+            temporary.close()
+            os.replace(temporary.name, file)
+        except BaseException:
+            temporary.close()
+            os.unlink(temporary.name)
+            raise

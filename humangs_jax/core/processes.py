@@ -8,12 +8,14 @@ its pages to be mapped anew. `keep_freed_memory` prevents this.
 
 import contextlib
 import ctypes
+import functools
 import gc
 import hashlib
 import multiprocessing
 import os
 import platform
 import signal
+import stat
 import sys
 import tempfile
 import threading
@@ -253,10 +255,10 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
     # a folder for each version and processor, if it can be written to
     try:
         root = Path(folder or wish or user_cache() / "humangs_jax").expanduser()
-        cache = root / f"jax-{version('jax')}-{version('jaxlib')}-{__version__}-{_processor()}"
+        cache = root / f"jax-{version('jax')}-{version('jaxlib')}-{__version__}-{processor()}"
         cache.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=cache).close()
-        _delete_oldest(root, LARGEST)
+        _delete_oldest(root.glob("jax-*/**/*-cache"), LARGEST)
     except (OSError, RuntimeError):  # RuntimeError: no home
         return None
     # for programs that this one starts, and for a JAX that is imported already
@@ -280,8 +282,8 @@ def keep_programs(cache: Path) -> None:
     before the first computation.
 
     A program is code, and its file is read with `pickle`. So the folder is made for the user alone.
-    Nothing is kept if it belongs to somebody else, or if others may write to it. Windows has no
-    such owners; there the user's cache folder is private.
+    Nothing is kept if it belongs to somebody else or is a link, or if others may write to it or may
+    exchange it for another. Windows has no such owners; there the user's cache folder is private.
 
     Args:
         cache: the folder of JAX's own cache, in which the folder is made.
@@ -289,10 +291,58 @@ def keep_programs(cache: Path) -> None:
     folder = cache / "programs"
     with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, exist_ok=True)
-        status = folder.stat()
-        writable_by_others = bool(status.st_mode & 0o022)
-        if sys.platform == "win32" or (status.st_uid == os.getuid() and not writable_by_others):
+        if sys.platform == "win32" or _is_private(folder):
+            source_at_start()  # before more of the package is imported
+            _delete_oldest(folder.glob("*-cache"), LARGEST)
             _programs[:] = [folder]
+
+
+def _is_private(folder: Path) -> bool:
+    """Returns whether a folder is the user's, and others can neither write to it nor replace it."""
+    own, parent = folder.lstat(), folder.parent.stat()
+    replaceable = parent.st_mode & stat.S_IWOTH and not parent.st_mode & stat.S_ISVTX
+    return (
+        stat.S_ISDIR(own.st_mode)
+        and own.st_uid == os.getuid()
+        and not own.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        and not replaceable
+    )
+
+
+@functools.cache
+def source_at_start() -> str:
+    """Returns a hash of the package's source as it was at the first call."""
+    _times_at_start()
+    root, source = Path(__file__).parents[1], hashlib.sha256()
+    for file in _source_files():
+        with contextlib.suppress(OSError):  # a lock of an editor is a link to nothing
+            source.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes() + b"\0")
+    return source.hexdigest()
+
+
+def source_has_changed() -> bool:
+    """Returns whether the package's source was edited after `source_at_start` was first called."""
+    return _source_times() != _times_at_start()
+
+
+def _source_files() -> list[Path]:
+    """Returns the files of the package's source."""
+    return sorted(Path(__file__).parents[1].rglob("*.py"))
+
+
+def _source_times() -> list[tuple[Path, int, int]]:
+    """Returns the files of the package's source, the times at which they were written, and their
+    sizes.
+    """
+    found = []
+    for file in _source_files():
+        with contextlib.suppress(OSError):
+            found.append((file, file.stat().st_mtime_ns, file.stat().st_size))
+    return found
+
+
+_times_at_start = functools.cache(_source_times)
+"""Returns `_source_times` as it was at the first call."""
 
 
 def kept_programs() -> Path | None:
@@ -316,7 +366,7 @@ def user_cache() -> Path:
     return Path.home() / ".cache"
 
 
-def _processor() -> str:
+def processor() -> str:
     """Returns a short hash of the processor and its instructions. Machines of a cluster share a
     home, but not their compiled programs.
     """
@@ -327,20 +377,20 @@ def _processor() -> str:
     return hashlib.sha256(about.encode()).hexdigest()[:8]
 
 
-def _delete_oldest(root: Path, largest: int) -> None:
-    """Deletes cached programs under `root` until at most `largest` bytes are left. Programs that
-    were not used for longest go first, of any version of JAX.
+def _delete_oldest(programs: Iterable[Path], largest: int) -> None:
+    """Deletes cached programs until at most `largest` bytes are left. Programs that were not used
+    for longest go first.
     """
     files = []
-    for file in root.glob("jax-*/**/*-cache"):
+    for file in programs:
         with contextlib.suppress(OSError):  # another program deletes, too
             files.append((file, file.stat()))
-    total = sum(stat.st_size for _, stat in files)
-    for file, stat in sorted(files, key=lambda item: max(item[1].st_atime, item[1].st_mtime)):
+    total = sum(status.st_size for _, status in files)
+    for file, status in sorted(files, key=lambda item: max(item[1].st_atime, item[1].st_mtime)):
         if total <= largest:
             break
         file.unlink(missing_ok=True)  # another program may be doing the same
-        total -= stat.st_size
+        total -= status.st_size
 
 
 CPU_COMPILER_OPTIONS = {

@@ -114,12 +114,82 @@ def test_another_source_is_another_program(folder, monkeypatch):
     assert len(traces) == 1
 
 
+def test_nothing_is_kept_after_the_source_was_edited(folder, monkeypatch):
+    monkeypatch.setattr(module, "source_has_changed", lambda: True)
+    anew()(CAMERA, np.ones(4, np.float32), 2)
+    assert list(folder.iterdir()) == []
+
+
+def test_an_edit_of_the_source_is_seen(tmp_path, monkeypatch):
+    (tmp_path / "a.py").write_text("x = 1")
+    monkeypatch.setattr(processes, "_source_files", lambda: sorted(tmp_path.glob("*.py")))
+    monkeypatch.setattr(processes, "_times_at_start", functools.cache(processes._source_times))
+    assert not processes.source_has_changed()
+    (tmp_path / "b.py").symlink_to(tmp_path / "a lock of an editor")
+    assert not processes.source_has_changed()
+    (tmp_path / "a.py").write_text("x = 10")
+    assert processes.source_has_changed()
+
+
+def test_a_full_disk_leaves_no_part_of_a_file(folder, monkeypatch):
+    def full(*paths):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(module.os, "replace", full)
+    assert np.array_equal(anew()(CAMERA, np.ones(4, np.float32), 2)[1], np.full(4, 4))
+    assert list(folder.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_is_read(folder, monkeypatch):
+    def read_only(*paths):
+        raise OSError("read-only file system")
+
+    anew()(CAMERA, np.ones(4, np.float32), 2)
+    monkeypatch.setattr(module.os, "utime", read_only)
+    traces.clear()
+    anew()(CAMERA, np.ones(4, np.float32), 2)
+    assert traces == []
+
+
+def test_faults_are_looked_for_as_without_keeping(folder):
+    x = np.ones(4, np.float32)
+    anew()(CAMERA, x, 2)
+    with jax.disable_jit():
+        traces.clear()
+        anew()(CAMERA, x, 2)
+        assert len(traces) == 1
+    with jax.debug_nans(True), pytest.raises(FloatingPointError):
+        anew()(CAMERA, x * np.nan, 2)
+
+
+def test_equal_numbers_of_other_types_are_other_programs(folder):
+    @compiled(static=["power"])
+    def raised(x, power):
+        return x**power
+
+    x = np.arange(4, dtype=np.int32)
+    assert raised(x, 2).dtype == jnp.int32
+    assert raised(x, 2.0).dtype == jnp.float32
+
+
+def test_ctrl_c_leaves_nothing_that_others_wait_for(folder, monkeypatch):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    f, x = anew(), np.ones(4, np.float32)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(module, "_stands_alone", interrupted)
+        f(CAMERA, x, 2)
+    assert np.array_equal(f(CAMERA, x, 2)[1], np.full(4, 4))
+
+
 def test_a_damaged_file_is_made_again(folder):
     x = np.ones(4, np.float32)
     anew()(CAMERA, x, 2)
     (file,) = folder.iterdir()
     whole = file.read_bytes()
-    for damaged in (b"", whole[: len(whole) // 2], pickle.dumps(("a", "b"))):
+    flipped = whole[:-1] + bytes([whole[-1] ^ 1])
+    for damaged in (b"", whole[: len(whole) // 2], pickle.dumps(("a", "b")), flipped):
         file.write_bytes(damaged)
         traces.clear()
         assert np.array_equal(anew()(CAMERA, x, 2)[1], np.full(4, 4))
@@ -182,6 +252,27 @@ def test_nothing_is_read_from_a_folder_that_others_may_write_to(tmp_path, monkey
     assert processes.kept_programs() is None
 
 
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no permissions here")
+def test_nothing_is_read_from_a_folder_that_others_may_exchange(tmp_path):
+    tmp_path.chmod(0o777)
+    processes.keep_programs(tmp_path)
+    assert processes.kept_programs() is None
+    tmp_path.chmod(0o700)
+    (tmp_path / "programs").rename(tmp_path / "elsewhere")
+    (tmp_path / "programs").symlink_to(tmp_path / "elsewhere")
+    processes.keep_programs(tmp_path)
+    assert processes.kept_programs() is None
+
+
+def test_the_folder_does_not_grow_without_end(folder, monkeypatch):
+    for power in (2, 3, 4):
+        anew()(CAMERA, np.ones(4, np.float32), power)
+    one = max(file.stat().st_size for file in folder.iterdir())
+    monkeypatch.setattr(processes, "LARGEST", one)
+    processes.keep_programs(folder.parent)
+    assert len(list(folder.iterdir())) == 1
+
+
 PROGRAM = """
 import sys
 from pathlib import Path
@@ -230,20 +321,23 @@ from humangs_jax.core.processes import enable_compile_cache, keep_programs
 cache = enable_compile_cache()
 
 @module.compiled()
-def product(x):
-    return jnp.sin(x @ x) + 1
+def product(x, factor):
+    return jnp.sin(x @ x) + factor / 2
 
 x = np.eye(64, dtype=np.float32)
 if sys.argv[1] != "keep":
-    product(x)
+    product(x, 2.0)
     module._folder.cache_clear()
 if sys.argv[1] != "do not keep":
     keep_programs(cache)
-print(float(product(x)[0, 0]))
+if sys.argv[1] == "keep what was read as another program":
+    product(x, jnp.asarray(2.0))
+print(float(product(x, 2.0)[0, 0]))
 """
 
 
-def test_a_program_that_was_read_is_not_written(tmp_path):
+@pytest.mark.parametrize("how", ["keep what was read", "keep what was read as another program"])
+def test_a_program_that_was_read_is_not_written(how, tmp_path):
     """XLA writes a program that it has read without its functions, and a process that reads that
     file fails. The second process here has the program in memory, read by an earlier call.
     """
@@ -253,7 +347,7 @@ def test_a_program_that_was_read_is_not_written(tmp_path):
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "HUMANGS_COMPILE_CACHE": str(tmp_path),
     }
-    for what in ("do not keep", "keep what was read", "keep"):
+    for what in ("do not keep", how, "keep"):
         said = subprocess.run(
             [sys.executable, "-c", READ_BEFORE, what],
             env=environment,

@@ -315,7 +315,7 @@ def calls_of_fit(body: BodyModel, kind: KeypointSet, views: int) -> Iterator[Cal
     matrices = (np.broadcast_to(np.eye(n), (*one, n, n)) for n in (3, 4))
     observations = make_observations(np.zeros((*one, k, 2)), np.zeros((*one, k)), *matrices)
     yield fit_frames, (model, observations)
-    fit = jax.eval_shape(fit_frames, model, observations)
+    fit = fit_frames.eval_shape(model, observations)
     of_fit = replace(model, certainty=fit.certainty), replace(observations, noise=fit.noise), fit
     yield _derivatives, of_fit
     yield agreements, (observations, np.asarray(kind.mirror))
