@@ -44,8 +44,8 @@ def calls_of_found_people(photos: int) -> Iterator[Call]:
 
 
 def calls_after_fit(photos: Photos, keypoints: Keypoints) -> Iterator[Call]:
-    """Yields the calls that follow the fit to photos with masks: the fit to the masks, the search
-    for movement between the photos, the avatars that are compared, and the check.
+    """Yields the calls that follow the fit to keypoints if photos have masks: the fit to the masks,
+    the search for movement between the photos, the avatars that are compared, and the check.
     """
     capture = with_usual_body(photos)
     kind = keypoints.set

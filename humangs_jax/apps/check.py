@@ -8,8 +8,8 @@ to the masks. It adds a skirt if the masks show one. `apps.quick_check` names wh
 view.
 
 On the sheet of a fit a disc is a keypoint: blue for the person's left, red for the right, white for
-the middle. A ring is an outlier. A line leads from the keypoint to a cross, which is the landmark
-of the body. Where the body fits, disc and cross coincide.
+the middle. A ring is a keypoint that is an outlier. A line leads from the keypoint to a cross,
+which is the landmark of the body. Where the body fits, disc and cross coincide.
 """
 
 import dataclasses
@@ -280,8 +280,8 @@ def _prepared(capture: Capture) -> PreparedCapture | None:
 def _shown(whole: Capture, small: Capture, vertices: dict[int, Float[Array, "n 3"]]) -> Capture:
     """Returns the capture that the sheet shows. Its photos are cut to the person, and have at most
     512 pixels a side. If no photo shows the person, or if the cut photos would be nearly as large
-    as the whole ones, the result is `small`. whole, small: the capture with its photos, and with
-    reduced photos. vertices: of the posed body, by frame, (n, 3), metres.
+    as the whole ones, the result is `small`. whole: the capture. small: the same capture with
+    reduced photos. vertices: vertices of the posed body, by frame, (n, 3), metres.
     """
     close, _ = around_person(whole, vertices)
     if close is whole:
@@ -403,8 +403,8 @@ def fit_sheet(
     """Writes a sheet of up to 24 views, evenly chosen, as a PNG. Each shows the fitted body and the
     keypoints.
 
-    Arguments: examination: how far this capture's landmarks are from these keypoints. Raises:
-    OSError if the image cannot be written.
+    Arguments: examination: how far this capture's landmarks are from these keypoints.
+    Raises: OSError if the image cannot be written.
     """
     count = capture.view_count
     chosen = np.unique(np.linspace(0, count - 1, min(count, VIEWS)).round().astype(int)).tolist()

@@ -28,8 +28,8 @@ def around_person(
     the same size. Returns the capture, and the upper left corner (x, y) of each window, (v, 2),
     pixels.
 
-    If that window would be more than `LARGEST_SHARE` of the photo, or if no view shows the person,
-    the capture stays as it is and corners are 0.
+    If the windows would be larger than `LARGEST_SHARE` of the photo's area, or if no view shows the
+    person, the capture stays as it is and corners are 0.
 
     Arguments: vertices: of the posed body, by frame, (n, 3), metres. marks: further pixels (x, y)
     of each view that the window has to show.

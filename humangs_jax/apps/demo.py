@@ -78,7 +78,7 @@ def run_demo(
     Files are inputs.png, novel_views.png (truth, feed-forward, error), novel_views.exr,
     animation.mp4 and .gif, avatar.npz, avatar.ply, avatar.html (see docs/viewer.md) and
     report.json. With `refine` there is also refined.png (truth, feed-forward, refined), and the
-    animation and the files of the avatar are made from the refined avatar.
+    animation, novel_views.exr and the files of the avatar are made from the refined avatar.
 
     Arguments:
         weights: file of the network's weights; None: the shipped ones.

@@ -111,8 +111,8 @@ _SHEET = _Sheet()
 _PLAINLY = 0.5
 """Share that decides three comparisons of masks or keypoints. A matched person with less than this
 share of the best score gives way to the best. A person found in a cut photo needs this share of the
-given mask's area. Somebody who has more than this share of the mask on another person's mask is
-taken for that person.
+given mask's area. A person with more than this share of their own mask on another person's mask is
+taken for that other person.
 """
 
 
@@ -228,8 +228,8 @@ def with_masked(
     masks: Sequence[Float[np.ndarray, "_h _w"]],
     on_white: Sequence[Float[np.ndarray, "_h _w 3"]],
 ) -> list[PhotoPeople]:
-    """Returns the photos. The person of each given mask is among the people of its photo, if the
-    detector finds this person.
+    """Makes sure that the person of each given mask is among the people of its photo, if the
+    detector finds this person. Returns the photos.
 
     Where nobody found in a photo matches the mask, the detector looks again at the photo cut to the
     mask. If a person found there has at least half of the mask's area, the person is added to the

@@ -266,10 +266,10 @@ class FromPhotos:
             yield from self._go_on(material, ahead)
 
     def _check_lengths(self, material: PhotoFolder) -> None:
-        """Checks that size and up axis have one source: a calibration or an option.
+        """Checks that the options for size and up axis suit the photos.
 
-        Raises: ArgumentError for a height with a calibration, or for a scale or an axis without
-        one.
+        Raises: ArgumentError for a height if there is a calibration, or for a scale or an up axis
+        if there is none.
         """
         if material.cameras is not None and self.height is not None:
             raise ArgumentError(
@@ -454,7 +454,8 @@ class FromPhotos:
     def resumes(self) -> bool:
         """Returns whether an earlier run left a body from which this one can go on.
 
-        Raises: ArgumentError if `out` is a file, or a folder that may not be replaced.
+        Raises: ArgumentError if `out` is a file, or a folder that cannot be written or may not be
+        replaced.
         """
         ours = (self.out / START_MARK).is_file()
         begun = ours and not (self.out / "body.npz").exists()
@@ -569,8 +570,9 @@ class FromPhotos:
         return moved, record_of_photos(record, first.frames)
 
     def _finish(self, capture: Capture, estimate: HeldOut | None) -> Iterator[Step]:
-        """Checks the capture, then makes, refines and writes the avatar. estimate: how well an
-        avatar of this body reproduces a held-out photo. None: it is measured here.
+        """Checks the capture, then makes, refines and writes the avatar. estimate: how well a
+        refined avatar of this body reproduces a held-out photo. It is measured here if it is None,
+        or if the avatar is not refined.
         """
         forget_decoded()  # the capture has the photos
         with stage("preparing the photos"):

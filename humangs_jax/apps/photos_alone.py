@@ -85,11 +85,10 @@ def import_photos(
         others: folder of masks of other people and of things in front of the person. Only some
             photos need to have one.
         own_masks: whether to write the masks of our detector.
-        reduce: whether large photos may be reduced.
+        reduce: whether large photos may be reduced. Only for photos without `masks` and `others`.
         also: names and contents of JSON files that are written with the capture.
-        Raises: ValueError (one line) if no camera is found, or if photos show several large people
-            and
-        none is chosen. Also as `import_cameras`.
+    Raises: ValueError (one line) if no camera is found, or if photos show several large people and
+    none is chosen. Also as `import_cameras`.
     """
     images, files = photo_files(folder)
     choice = _Choice(person, keypoints, masks, out, others)

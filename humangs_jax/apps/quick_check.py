@@ -219,7 +219,7 @@ def _fault(view: _View) -> tuple[str | None, float]:
 
 def _wrong_exposure(view: _View) -> str | None:
     """Returns what is wrong with the exposure of the person, who may be nearly black or burnt out;
-    None if nothing is.
+    None if nothing is. Without a mask, it is only tested whether the whole photo is nearly black.
     """
     # without its blended edge
     person = view.image if view.mask is None else view.image[view.mask > 0.99]
@@ -297,8 +297,8 @@ def _exchanged_cameras(views: Sequence[_View]) -> dict[int, int]:
 
 
 def _silhouette(view: _View) -> tuple[Cells, float, float]:
-    """Returns the cells that the body covers, the share of its points that are in the image, and
-    its height as a share of the image's height.
+    """Returns the cells that the body covers, the share of the body's points that are in the image,
+    and the body's height as a share of the image's height.
     """
     height, width = view.image.shape[:2]
     pixels = points_in_image(view.points, view.K, view.matrix, width, height)

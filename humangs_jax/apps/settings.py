@@ -71,8 +71,8 @@ class Settings:
     head_steps: RefineSteps = knob(
         0, cost="time in proportion", gain="detail of faces", measured="benchmarks/quality.md"
     )
-    """Further steps on the head alone, see `RefineConfig`. 0: none. Without iterations and steps
-    there are none either.
+    """Further steps on the head alone, see `RefineConfig`. 0: none. There are also none if
+    iterations and steps are both 0.
     """
     refine_size: PhotoSide | None = knob(
         None, cost="detail of the photos", gain="time of a step", measured=MEASURED

@@ -1,5 +1,5 @@
-"""Finds the photos in a folder and the files that an avatar needs, and says which of them are
-missing and which well-known tool makes them.
+"""Finds the photos in a folder and the files that an avatar needs. Says which of these files are
+missing, and which well-known tools make them.
 
 The user need not describe the folder, because its files are found by their names.
 docs/your_photos.md shows the way. The module also measures how well an avatar reproduces a photo
@@ -131,7 +131,8 @@ def inspect_folder(
     names is used instead of the one in `folder`.
 
     Raises: CaptureError (one line) if there is no such folder, if it has no photo, if it is a
-    capture already, or if a named file does not exist.
+    capture already, or if what an argument names does not exist. FileError if the first photo
+    cannot be read.
     """
     _expect_folder(folder)
     if (folder / "capture.json").is_file():
@@ -354,7 +355,7 @@ def held_out_psnr(
 
     Arguments:
         variables, config: of the network.
-        refinement: how the avatar is refined; None: not at all.
+        refinement: how the avatar is refined, always without steps on the head; None: not at all.
         number: which photo is held out. 0 is the photo with the nearest neighbour, 1 the next in
             this order.
         watch: is called before refinement, with the avatar and the photos from which it was made.

@@ -65,7 +65,9 @@ class _Following:
     rarely: int = 8
     """After `patience` frames without the person, only one of this many frames is searched."""
     farthest: float = 0.6
-    """Largest movement of the hips between two frames, as a share of the crop's side."""
+    """Largest movement of the hips between two frames, as a share of the crop's side. Twice as much
+    is allowed if the frame is searched.
+    """
     change: float = 1.6
     """Largest factor by which the crop's side changes between two frames."""
     alike: float = 0.6

@@ -82,7 +82,8 @@ def photos_of_video(video: Path, folder: Path) -> str:
     """Writes the chosen frames into `folder / "images"`, and returns a line that describes them. If
     an earlier run has made the folder from this video, the folder stays as it is.
 
-    Raises: CaptureError that names the video, or that names the folder if it holds something else.
+    Raises: CaptureError. It names the video if the video cannot be read or shows nothing. It names
+    the folder if the folder exists and was not made from the video as it is now.
     """
     with reading(video, "video", CaptureError):
         status = video.stat()
@@ -156,7 +157,7 @@ def seconds_of_photos(folder: Path, names: Sequence[str]) -> Float[np.ndarray, "
 def _by_direction(video: Path, sharpness: Float[np.ndarray, " n"]) -> list[int]:
     """Chooses sharp frames that see the person from different directions, and returns their
     numbers. Returns an empty list if the person does not turn, or is found in less than half of the
-    offered frames.
+    offered frames, or if `followed` ends early.
     """
     offered, worth = offered_frames(sharpness)
     # the person is followed in frames of 640 pixels: twice what the landmark network looks at

@@ -104,7 +104,7 @@ def execute(arguments: Sequence[str]) -> int:
     """Runs a command line in this process and returns the exit code. arguments: words after
     `humangs`.
 
-    Raises: SystemExit for --help.
+    Raises: SystemExit for --help, or if there are no words.
     """
     from humangs_jax.cli import screen
     from humangs_jax.cli.options import check_options
@@ -177,7 +177,8 @@ def _parsed(arguments: list[str]) -> Command:
 
     Only the module of that command is imported, which is faster.
 
-    Raises: SystemExit after --help; UsageError for an unknown command or option, or a wrong value.
+    Raises: SystemExit after --help, or if there are no words; UsageError for an unknown command or
+    option, or a wrong value.
     """
     from humangs_jax.core.progress import say
 

@@ -359,7 +359,7 @@ class Render:
         wrote(self.out, f"{what} of {len(gaussians.means):,} Gaussians")
 
     def _require_one_kind_of_cameras(self) -> None:
-        """Refuses options that choose cameras in another way than --capture or --camera does.
+        """Refuses options that do not go with --capture or --camera.
 
         Raises: UsageError, which names the first such option.
         """

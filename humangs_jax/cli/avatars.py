@@ -324,7 +324,7 @@ class Refine:
 
 def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
     """Returns the capture folders by name: given folders that are captures, and captures inside of
-    other given folders.
+    other given folders. A given folder without captures is returned, too.
 
     Raises: UsageError if two of them have the same name.
     """

@@ -329,7 +329,7 @@ class Check:
     def _found(self, capture: Any, keypoints: Any) -> tuple[Any, Any]:
         """Finds missing masks and keypoints in the photos. Returns capture and keypoints with them.
 
-        No file is written.
+        No file is written, except the sheet of people if it is unclear who is meant.
         """
         import numpy as np
 

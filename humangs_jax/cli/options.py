@@ -216,8 +216,8 @@ def types_in(kind: Any) -> list[Any]:
 
 
 def _value_shown(kind: Any) -> str | None:
-    """Returns how --help shows the values of a type, without None. Returns None where tyro's own
-    text is used.
+    """Returns the text by which --help shows the values of a type. The text does not list None.
+    Returns None where tyro's own text is used.
     """
     if get_origin(kind) is tuple:
         return None
@@ -236,7 +236,7 @@ def _value_shown(kind: Any) -> str | None:
 def check_options(command: Any) -> None:
     """Checks that options are in the ranges of their annotations, and that outputs can be written.
 
-    Raises: UsageError if one is not.
+    Raises: UsageError if an option is out of its range, or if an output cannot be written.
     """
     cls = type(command)
     hints = {
