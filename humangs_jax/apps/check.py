@@ -1,5 +1,5 @@
-"""Checks a capture before its use, or a fit. Draws the posed body over each photo, and computes
-numbers that show what is wrong.
+"""Checks a capture before it is used, and checks a fit. Draws the posed body over each photo, and
+computes numbers that show what is wrong.
 
 Blue is the person's left side, red is the right side, and the green line is the boundary of the
 body. Photo and body should coincide. A yellow line is the boundary of the displaced body that
@@ -104,7 +104,9 @@ class ViewCheck:
     iou: float | None
     """Intersection over union of body and mask, 0 to 1; None without masks."""
     outside: float | None
-    """Share of the body's pixels that are more than one pixel off the mask; None without masks."""
+    """Share of the body's pixels that are more than one pixel off the mask, in a photo of at most
+    512 pixels a side; None without masks.
+    """
     inside: float
     """Share of the body that is inside the image, 0 to 1."""
     warning: str | None = None
@@ -138,7 +140,7 @@ class CheckReport:
         return not (self.warnings or any(view.warning for view in self.views))
 
     def __str__(self) -> str:
-        """Returns a table with a row for each view, then the warnings."""
+        """Returns a table with a row for each view, then notes and warnings."""
         # views with a warning end in an exclamation mark
         rows = [["view", "silhouette IoU", "body outside mask", "body in frame"]]
         for view in self.views:

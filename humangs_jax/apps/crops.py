@@ -1,5 +1,5 @@
-"""Cuts photos to the person, for sheets. In the photos of a camera dome a person covers only about
-200 of 1,920 pixels.
+"""Cuts photos to the person, for sheets. In photos of 1,920 pixels from a camera dome a person is
+only about 200 pixels large.
 """
 
 import dataclasses
@@ -31,8 +31,8 @@ def around_person(
     If the windows would be larger than `LARGEST_SHARE` of the photo's area, or if no view shows the
     person, the capture stays as it is and corners are 0.
 
-    Arguments: vertices: of the posed body, by frame, (n, 3), metres. marks: further pixels (x, y)
-    of each view that the window has to show.
+    Arguments: vertices: vertices of the posed body, by frame, (n, 3), metres. marks: further pixels
+    (x, y) of each view that the window has to show.
     """
     height, width = capture.images.shape[1:3]
     photo, count = np.asarray([width, height]), len(capture.images)
@@ -85,7 +85,8 @@ def _box(
     marks: Sequence[Float[np.ndarray, "_k 2"]] | None,
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]] | None:
     """Returns the least and the largest (x, y), each (2,), of the pixels of body, mask and marks
-    that lie in a photo. None if there are none. vertices: in the world, (n, 3), metres.
+    that lie in a photo. None if there are none. vertices: vertices of the posed body in the world,
+    (n, 3), metres.
     """
     K, pose = (
         np.asarray(x[view], float) for x in (capture.cameras.K, capture.cameras.cam_from_world)

@@ -56,8 +56,8 @@ _PICTURES = (
     "novel_views.exr",
 )
 FILES = ("report.json", *_PICTURES, "avatar.npz", "avatar.ply", "avatar.html")
-"""Names of the files that the demonstration writes. The first one marks a folder as one of the
-demonstration.
+"""Names of the files that the demonstration writes; refined.png only with refinement. The first one
+marks a folder as one of the demonstration.
 """
 REPORTED = frozenset(("psnr", "views", "baseline_psnr"))
 """Keys that report.json has at least. A folder whose report.json has them is one of the
@@ -132,7 +132,7 @@ def summary(report: dict[str, Any]) -> str:
 def _calls_until_refined(
     variables: Variables, config: HumanGSConfig, inputs: Capture, truth: Capture
 ) -> Iterator[Call]:
-    """Yields what the demonstration calls before refinement, in this order, for background
+    """Yields the calls of the reconstruction and then of the painted body, for background
     compilation.
     """
     yield from calls_of_reconstruct(variables, config, inputs)

@@ -599,8 +599,9 @@ def _mask_name(photo: str) -> str:
 
 
 def _is_ours(file: Path) -> bool:
-    """Returns whether an existing file was written by `write_found`. capture.json always counts as
-    ours, since it belongs to the capture whose photos get the masks.
+    """Returns whether an existing file is one that `write_found` may replace: keypoints in our
+    format, or an image with our mark. capture.json always counts as ours, since it belongs to the
+    capture whose photos get the masks.
     """
     if file.name == KEYPOINTS_FILE:
         with contextlib.suppress(OSError, ValueError):

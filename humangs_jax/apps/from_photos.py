@@ -1,6 +1,6 @@
 """Makes an avatar from a folder of photos or from a video. Cameras, masks and keypoints are used if
-the folder has them. If it has none, they are found in the photos, which needs LiteRT. This is what
-`humangs start` does, as a function.
+the folder has them. Those that are missing are found in the photos, which needs LiteRT. This is
+what `humangs start` does, as a function.
 """
 
 import dataclasses
@@ -153,7 +153,7 @@ def avatar_from_photos(
             file of keypoints, or on people.png if there is no such file.
         height: height of the person, metres. It gives the scale if there is no calibration. None:
             the height of an average person.
-        scale: metres per unit of the calibration. None: 1.
+        scale: metres per unit of the calibration. None: see `import_cameras`.
         up: axis of the calibration's world that points up, such as "+z". None: the axis that the
             calibration's format defines.
         without_masks: whether masks are not used, because there is only white behind the person.
@@ -167,7 +167,7 @@ def avatar_from_photos(
     Raises:
         ValueError: if something is missing or wrong. The message is one line that names the file or
             the argument.
-        OSError: if another process writes `out`.
+        OSError: if another process writes `out`, or if a file cannot be written.
         KeyboardInterrupt: if refinement was interrupted.
 
     Examples:
@@ -228,7 +228,7 @@ class FromPhotos:
     height: float | None = None
     """Height of the person, metres, if there is no calibration. None: an average person's."""
     scale: float | None = None
-    """Metres per unit of the calibration. None: 1."""
+    """Metres per unit of the calibration. None: see `import_cameras`."""
     up: str | None = None
     """The axis of the calibration's world that points up. None: the axis that the calibration's
     format defines.

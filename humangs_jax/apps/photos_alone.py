@@ -2,7 +2,8 @@
 and from the chosen person the cameras.
 
 `capture.fitting.person_cameras` finds the cameras, and `apps.detect` decides who is who. Large
-photos are reduced first, because later steps look at no more than some hundred pixels of a person.
+photos may be reduced first, because later steps look at no more than some hundred pixels of a
+person.
 """
 
 import dataclasses
@@ -72,8 +73,8 @@ def import_photos(
     reduce: bool = False,
     also: Mapping[str, object] | None = None,
 ) -> PhotosImported:
-    """Writes the capture folder `out`, with keypoints.json and people.png, from photos alone.
-    Existing files are replaced.
+    """Writes the capture folder `out`, with keypoints.json and people.png, from photos alone. An
+    existing capture folder is replaced.
 
     Arguments:
         person: number of the person on people.png, needed if photos show several large people. With

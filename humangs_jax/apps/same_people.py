@@ -43,7 +43,7 @@ class PersonInPhoto(NamedTuple):
     """Row and column of the first pixel of the mask in the photo."""
     area: float
     """Number of pixels of the person. If other people may cover the person, it is at least a tenth
-    of the detector's crop. That is about the area of a person who stands free.
+    of the area of the detector's crop. That is about the area of a person who stands free.
     """
     mirrored: bool = False
     """Whether the detector exchanged left and right of the landmarks, as other views showed. The

@@ -263,7 +263,7 @@ class Reconstruct:
     def _read(self, folder: Path, views: int | str | None) -> "PreparedCapture":
         """Reads the views of a capture that the network is to use.
 
-        Raises: ValueError if none shows the person; UsageError for --refine without masks.
+        Raises: ValueError if no view shows the person; UsageError for --refine without masks.
         """
         prepared = _read_capture(folder, self.check, self.fit_masks, views)
         if self.refine not in (None, "0") and prepared.capture.masks is None:

@@ -141,7 +141,7 @@ class ImportCameras:
     Photos that show none need no mask.
     """
     scale: float | None = None
-    """Metres per unit of the source. Default: 1."""
+    """Metres per unit of the source. Default: the unit of its format, or one that fits."""
     up: str | None = None
     """Axis of the source's world that points up, like --up=+z or --up=-y. Default: the format's."""
     pixel_centers: Literal["integer", "half"] | None = None

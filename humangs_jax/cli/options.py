@@ -5,8 +5,9 @@ Checks raise an error of one line that names the option.
 Places of results are checked before the work begins, and before anything heavy is imported. All
 commands have the same rules. A single file that exists is replaced as a whole, once the work is
 done. The file of an avatar replaces only an avatar, and no command replaces a file that it reads.
-The folder of a capture is replaced only with --overwrite. Commands such as `demo`, `detect`,
-`render`, `synth` and `train` add files to their folders.
+The folder of a capture is replaced only with --overwrite, or by `start` if its earlier run has not
+finished. Commands such as `demo`, `detect`, `render`, `synth` and `train` add files to their
+folders.
 """
 
 import dataclasses

@@ -62,7 +62,7 @@ class Start:
     Default: an average person's.
     """
     scale: float | None = None
-    """Metres per unit of the calibration. Default: 1."""
+    """Metres per unit of the calibration. Default: the unit of its format, or one that fits."""
     up: str | None = None
     """Axis of the calibration's world that points up, like --up=+z or --up=-y.
 

@@ -102,8 +102,8 @@ def pack(
     for sliders of shape; None: there are no sliders. motion_name: name that the page shows.
 
     Raises: ValueError (one line) for numbers that are not finite or out of range, for an avatar
-    without Gaussians or with more than 256 joints, for a motion of another number of joints, or for
-    a body that does not explain the avatar's vertices.
+    without Gaussians or vertices, or with more than 256 joints, for a motion of another number of
+    joints, or for a body that does not explain the avatar's vertices.
     """
     # a page with wrong numbers would show nothing and not say why
     check_values(
@@ -220,7 +220,9 @@ def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any,
 
 
 def _pack_gaussians(avatar: Avatar, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    """Adds Gaussians, skinning and light to the header and to the arrays, in 16 bits or fewer."""
+    """Adds Gaussians, skinning and light to the header and to the arrays, in 16 bits or fewer. Adds
+    the joints in the T-pose, too, in 32 bits.
+    """
     g = avatar.gaussians
     means, quats, scales, opacities, colors = (
         np.asarray(x, np.float64) for x in (g.means, g.quats, g.scales, g.opacities, g.colors)
@@ -317,8 +319,8 @@ def page_html(
     """Returns the page as text.
 
     motion: None for the walk that comes with the package; there is no motion if the walk has
-    another number of joints than the avatar. The page has at most 60 frames per second, and the
-    person stands on the floor. title, motion_name: names that the page shows.
+    another number of joints than the avatar. The page's motion has at most 60 frames per second,
+    and the person stands on the floor. title, motion_name: names that the page shows.
 
     Raises: ValueError (one line) for an avatar or a motion that cannot be drawn, see `pack`.
     """
@@ -452,8 +454,8 @@ def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
 
 def known_body(avatar: Avatar) -> BodyModel | None:
     """Returns the shipped body that has the avatar's vertices, for sliders of shape. Returns None
-    if no shape of that body has these vertices, if the faces differ, or if refinement has added
-    Gaussians.
+    if no shape of that body has these vertices, if joints or faces differ, or if refinement has
+    added Gaussians.
     """
     if avatar.parents != PARENTS:
         return None

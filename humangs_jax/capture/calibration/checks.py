@@ -67,7 +67,7 @@ class Checks:
     """Number of observations."""
     distance: float | None
     """Median distance from the cameras to the point where their optical axes meet, measured along
-    the axes, metres. None if the axes are parallel, or if there is one camera.
+    the axes, metres. None if the axes are nearly parallel, or if there is one camera.
     """
     warnings: tuple[str, ...]
     """Properties that look wrong, one line each."""
@@ -125,7 +125,7 @@ def likely_unit(calibration: Calibration) -> tuple[float, str | None]:
     The unit is the one that the format states, or the metre if the format states none. If the
     cameras would then stand too near to the person or too far away, another unit of `UNITS` is
     chosen. It is the one that brings the cameras nearest to `USUAL_DISTANCE`. If no unit brings
-    them within `DISTANCES`, the first unit is kept.
+    them within `DISTANCES`, no other unit is chosen.
     """
     # how far the cameras stand from the point where they look, in the calibration's unit
     known = calibration.unit or 1.0
@@ -223,9 +223,9 @@ def _miss(poses: Float[np.ndarray, "v 4 4"]) -> float:
 
 
 def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> list[str]:
-    """Returns a warning if the cameras do not all look at one place in front of them, or else an
-    empty list. If they would do so with another convention for the matrices in the file, the
-    warning names this convention.
+    """Returns a warning if the cameras do not all look at one place in front of them. Returns an
+    empty list if they do, or if their axes are nearly parallel. If the cameras would look at one
+    place with another convention for the matrices in the file, the warning names this convention.
 
     poses: cam_from_world as the source has them, (v, 4, 4). convention: the convention in which the
     matrices were read.
@@ -250,7 +250,9 @@ def _convention_warnings(poses: Float[np.ndarray, "v 4 4"], convention: str) -> 
 
 def _up_warnings(poses: Float[np.ndarray, "v 4 4"], up: str) -> list[str]:
     """Returns a warning if the mean upward direction of the photos is more than `TILT_LIMIT` from
-    +y, or else an empty list. Most photos are upright, so this direction shows which axis is up.
+    +y, or else an empty list. Most photos are upright, so this direction shows which axis is up. If
+    the upward directions differ so much that the length of their mean is below 0.5, the list is
+    empty, too.
 
     poses: cam_from_world, (v, 4, 4). up: axis of the source that was turned to y.
     """

@@ -164,15 +164,15 @@ def import_cameras(
         pixel_centers: position of the first pixel's centre in the source. "integer" means (0, 0),
             and "half" means (0.5, 0.5). None: as the format says.
         every: step between the frames of videos.
-        frames: largest number of frames of videos. None: all.
+        frames: largest number of frames of each video. None: all.
         overwrite: whether a capture at `out` is replaced as a whole.
         also: contents of JSON files, by their name, that are written to the folder together with
             the capture.
 
     Returns: what was imported, and how.
 
-    Raises: ArgumentError for a wrong option. CaptureError for everything else, one line with file,
-    field, and what was expected.
+    Raises: ArgumentError for a wrong option. CaptureError for wrong files, one line with file,
+    field, and what was expected. OSError if writing fails.
     """
     source, images, out = Path(source), Path(images), Path(out)
     masks = None if masks is None else Path(masks)
@@ -427,8 +427,7 @@ def _write(
     """Writes photos, masks, masks of unknown pixels, and capture.json.
 
     Arguments: in_front: for a photo, its mask of other people and of things in front.
-    Returns: the names of the photos in which the person touches the edge of the area that the
-    camera has seen.
+    Returns: the names of the photos in which the person is cut off, see `is_cut_off`.
     """
     (folder / "images").mkdir(parents=True)
     if photos[0].mask is not None:

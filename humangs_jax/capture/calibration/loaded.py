@@ -1,5 +1,5 @@
 """Loads cameras of other tools, with their lenses, for scenes of Gaussians (`load_cameras`). The
-cameras keep the axes of their world.
+cameras keep the axes of their world, unless the y axis has to point up.
 """
 
 import dataclasses

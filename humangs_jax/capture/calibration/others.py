@@ -1,6 +1,6 @@
-"""Finds the pixels of photos in which the person may be hidden or was not photographed. In some of
-them other people or things are in front of the person. Others were added by the import, beyond what
-the camera has seen.
+"""Finds the pixels of photos in which the person may be hidden or was not photographed. Some of
+these pixels show other people or things in front of the person. The rest were added by the import,
+beyond what the camera has seen.
 
 A capture calls both kinds unknown (docs/capture_format.md).
 """

@@ -77,9 +77,9 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
     """Returns the calibration without the cameras that have no photo, and a line about these
     cameras. The line is None if every camera has a photo.
 
-    Raises: CaptureError if no camera has a photo. It is also raised for a calibration with a camera
-    for each image if images are missing while the folder has photos that no camera names: their
-    names do not match.
+    Raises: CaptureError if no camera has a photo. If the calibration has a camera for each image,
+    it is also raised if an image is missing and the folder has a photo that no camera names,
+    because the names do not match then.
     """
     if calibration.per_image:
         there = [_photo_at(images, camera.name) is not None for camera in calibration.cameras]
@@ -450,7 +450,7 @@ def mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, 
 
     flag: EXIF flag of the photo. stored and shown: width and height of the photo before and after
     it is turned, pixels.
-    Raises: CaptureError if the mask has neither size.
+    Raises: CaptureError in all other cases.
     """
     own, size = read_checked(orientation, mask), photo_size(mask)
     size = size if own < 5 else size[::-1]
@@ -571,7 +571,7 @@ _EMPTY = "the mask is empty, the photo will be left out"
 
 def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
     """Checks masks, which are files or alpha channels. Returns a warning for each kind of fault,
-    with the names of the photos.
+    with the names of the files.
 
     Raises: CaptureError if a mask is not valid, if no mask shows anybody, or if there are no mask
     files and only some photos have an alpha channel.

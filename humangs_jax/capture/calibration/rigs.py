@@ -185,8 +185,8 @@ def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> Calibrate
 
 
 def _lens(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
-    """Returns the fields of `CalibratedCamera` that describe the lens. A fisheye lens gets an error
-    among them, which is raised by commands that need photos without distortion.
+    """Returns the fields of `CalibratedCamera` that describe the lens. The fields of a fisheye lens
+    include an error, which is raised later by commands that need photos without distortion.
     """
     coefficients, at, refusal = None, "", None
     for key, value in values.items():

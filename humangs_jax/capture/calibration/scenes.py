@@ -399,9 +399,8 @@ def _frame_intrinsics(
 
 
 def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str, Any]:
-    """Returns the fields of `CalibratedCamera` that describe the lens. A lens that cannot be
-    undistorted gets an error among them, which is raised by commands that need photos without
-    distortion.
+    """Returns the fields of `CalibratedCamera` that describe the lens. The fields of a fisheye lens
+    include an error, which is raised later by commands that need photos without distortion.
 
     Raises: CaptureError if the lens is not supported.
     """

@@ -106,9 +106,8 @@ def photos_of_videos(
         every: step between frames, or between moments of several videos. The first frame or moment
             is 0.
         most: largest number of photos of a camera. None: all.
-    Raises: CaptureError. With `masks`, it is raised for a camera that has a video of only one kind,
-    of photos or of masks. It is raised without videos if `every` or `most` is given. It is raised
-    with the name of a video that cannot be read.
+    Raises: CaptureError if `every` or `most` is given and there is no video, if `masks` is given
+    and a camera has only a video of photos or only one of masks, or if a video cannot be read.
     """
     # videos of photos, and those of masks, where there are any
     asked = every != 1 or most is not None

@@ -24,10 +24,12 @@ _HAND_POINTS = 21
 _LEAST_PRESENCE = 0.5
 """A face or a hand counts as found if the network gives it at least this probability."""
 _ENLARGED = {"face": 1.5, "palm": 2.0}
-"""Factor by which the bounding square of the landmarks is enlarged to the region."""
+"""Factors by which the bounding squares of the landmarks of a face and of a palm are enlarged to
+regions.
+"""
 _HAND_REGIONS = (1.9, 2.7)
-"""Sides of the two regions in which a hand is looked for, one after the other. The unit is twice
-the length from the wrist to the knuckles.
+"""Sides of the two regions in which a hand is looked for. The second one is used if no hand is
+found in the first. The unit is twice the length from the wrist to the knuckles.
 
 Mediapipe uses 2.7. Of 54 visible hands of synthetic people, 2.7 finds 35, 1.9 finds 47, and both
 together find 51. A hand that points at the camera needs the larger region.
@@ -171,8 +173,8 @@ def hand_columns(
     The columns are x and y in pixels, the presence, and x, y and z in metres. The rows of a hand
     that was not found are 0. None if neither was found.
 
-    body: BlazePose's landmarks in space, (33, 3), metres. The positions of a hand begin at its
-    wrist.
+    body: BlazePose's landmarks in space, (33, 3), metres. Each hand is moved so that its wrist lies
+    at the wrist of the body.
     """
     if hands == (None, None):
         return None

@@ -96,14 +96,14 @@ class Crop(NamedTuple):
 
 
 class Detection(NamedTuple):
-    """A person in a window."""
+    """A person that the detector has found in a window of the photo."""
 
     score: float
     """Score of the detector, in [0, 1]."""
     hips: Float[np.ndarray, "2"]
-    """Middle of the hips, (2,), pixels."""
+    """Middle of the hips, (2,), pixels of the photo."""
     head: Float[np.ndarray, "2"]
-    """Point whose distance from the hips is the body's size, (2,), pixels."""
+    """Point whose distance from the hips is the body's size, (2,), pixels of the photo."""
 
     def crop(self) -> Crop:
         """Returns the square of the photo that the landmark network looks at for this person."""

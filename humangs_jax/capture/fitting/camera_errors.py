@@ -6,8 +6,8 @@ free point (Triggs et al. 2000, "Bundle Adjustment").
 
 A detector's landmarks have errors too, but these differ from landmark to landmark. So a camera is
 only reported if its correction exceeds several standard errors. The standard errors come from the
-scatter over landmarks (a sandwich estimate, clustered by landmark). The smallest number of cameras
-is turned that explains the residuals.
+scatter over landmarks (a sandwich estimate, clustered by landmark). Cameras are turned one after
+the other, as long as each turn clearly explains residuals.
 """
 
 import dataclasses
@@ -82,7 +82,7 @@ class CameraError:
     """Indices of the camera's views."""
     names: tuple[str, ...]
     """Names of the cameras that may be the cause: first this camera, then other cameras that would
-    explain the residuals almost as well. The name is the one of the camera's first view.
+    explain the residuals almost as well. The name of a camera is the name of its first view.
     """
     rotation: tuple[float, float, float]
     """Rotation that corrects the camera, as axis-angle in the camera's axes, radians."""

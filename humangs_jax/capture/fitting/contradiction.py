@@ -191,8 +191,8 @@ def _agrees(found: Agreement) -> bool:
 def _remedies(
     K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], height: int
 ) -> dict[str, tuple[Float[np.ndarray, "v 3 3"], Float[np.ndarray, "v 4 4"]]]:
-    """Returns K and cam_from_world after the correction of one usual mistake. The key is the
-    correction in words. height: height of the images, pixels.
+    """Returns K and cam_from_world after the correction of each usual mistake, by the correction in
+    words. height: height of the images, pixels.
     """
     other = np.diag([1.0, -1.0, 1.0, 1.0])
     upwards = K.copy()

@@ -306,7 +306,7 @@ def _radius(points: Float[np.ndarray, "*m k 3"]) -> Float[np.ndarray, "*m"] | np
 
 def _steady(values: Float[np.ndarray, "m ..."], fps: float) -> Float[np.ndarray, "m ..."]:
     """Returns values of frames, (m, ...), without outliers (median of 5 frames), and smoothed over
-    time (Gaussian of 0.1 s).
+    time by a Gaussian with a standard deviation of 0.1 s, or half a frame if that is longer.
     """
     kept = median_filter(values, size=(5, *[1] * (values.ndim - 1)), mode="nearest")
     # over a tenth of a second, or half a frame
@@ -597,7 +597,8 @@ def _standing(
     fps: float,
 ) -> MotionFit:
     """Returns the motion in a world that is turned so that the person stands along y, and moved so
-    that the floor is at y = 0.
+    that the floor is at y = 0. If the person leans by 50 degrees or more, the person is taken to
+    lie, and the world is not turned.
     """
     shape = jnp.asarray(betas, jnp.float32)
     joints = np.asarray(_landmarks(model, shape, poses)[1], np.float64)

@@ -77,8 +77,8 @@ COARSE = 1e-3
 less than this share.
 """
 _STILL = 1e-6
-"""Number that is added to the diagonal of the normal equations. It keeps unknowns in place on which
-no residual depends.
+"""Number that is added to the diagonal of the normal equations. Unknowns on which no residual
+depends then stay as they are.
 """
 _FURTHEST = 5.0
 """Largest absolute change of the logarithm of a depth in one step, and of the logarithm of a focal

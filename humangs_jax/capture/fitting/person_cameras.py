@@ -235,7 +235,7 @@ def _in_world(
     seen: PersonViews, rig: Rig, height: float | None
 ) -> tuple[tuple[Camera, ...], Float[np.ndarray, "k 3"]]:
     """Returns the cameras, and the landmarks, (k, 3), metres, in a world in which the person stands
-    upright at the origin. If no photo shows a part of the legs, it is assumed to have its usual
+    upright at the origin. A part of the legs that no photo shows is assumed to have its usual
     length. height: see `cameras_from_person`.
     """
     points, rotations, places, focal = rig.landmarks, rig.rotations, rig.places, rig.focal
@@ -292,8 +292,8 @@ def _in_world(
 def _lengths(
     points: Float[np.ndarray, "k 3"], names: Sequence[str]
 ) -> dict[tuple[str, str], float]:
-    """Returns the lengths of trunk, thigh and shin, in the unit of `points`. The key is the pair of
-    joints at the ends. A part is left out if landmarks at its ends are missing.
+    """Returns the lengths of trunk, thigh and shin, in the unit of `points`, by the pair of joints
+    at the ends. A part is left out if landmarks at its ends are missing.
     """
     found = {}
     for first, last in _SHARES:

@@ -283,8 +283,8 @@ def _with_others(
 
 
 def _different(seen: PersonViews) -> tuple[int, ...]:
-    """Returns the photos that decide whether there is one moment, so that they show the person from
-    different sides.
+    """Returns the indices of the photos that decide whether there is one moment. They show the
+    person from different sides.
 
     The photo that shows most of the person is chosen first. Each next photo is the one with the
     direction that differs most from the directions of all chosen photos.

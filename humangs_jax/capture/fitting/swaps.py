@@ -132,7 +132,7 @@ def find_swaps(
 
 def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[Swap, ...]:
     """Returns a swap for each view in which the keypoints of each hand lie at the other hand's
-    wrist. It is empty if the set of keypoints has no roots of hands.
+    wrist. The result is empty if the set of keypoints lacks roots of hands or wrists.
     """
     wanted = ("left_hand_root", "right_hand_root", "left_wrist", "right_wrist")
     if not set(wanted) <= set(keypoints.set.names):

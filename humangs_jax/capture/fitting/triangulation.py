@@ -103,7 +103,7 @@ def reprojection_errors(
     observations: Observations, points: Float[Array, "k 3"]
 ) -> Float[Array, "c k"]:
     """Returns the distances between projected points and the detections, (c, k), pixels. They are
-    1e6 for points behind a camera.
+    1e6 for points behind a camera or less than 1 cm in front of it.
     """
     seen = in_cameras(observations, points)
     depth = seen[..., 2]
@@ -185,7 +185,9 @@ class _SameWay:
     this, as a share of the largest allowed movement.
     """
     far: float = 3.0
-    """Longer movements count as this one, as a multiple of the largest allowed movement."""
+    """Largest movement that is compared, as a multiple of the largest allowed movement. Longer and
+    unknown movements are set to it.
+    """
     still_degrees: float = 10.0
     """Two views count as one camera only if the rotation between them is at most this, degrees."""
     still_metres: float = 0.3
@@ -234,10 +236,9 @@ class Match(NamedTuple):
 
 
 def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
-    """Returns a match for each person in some views of one moment.
+    """Returns a match for each person in the views of one moment.
 
-    People who are seen in most views come first, and people who are seen in a single view come
-    last.
+    People who are seen in more views come first. People who are seen in a single view come last.
 
     Arguments: mirror: for each landmark the index of its mirror image, (k,).
     """

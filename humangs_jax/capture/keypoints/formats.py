@@ -375,8 +375,8 @@ def recognizes_easymocap(source: KeypointFile) -> bool:
 
 def read_easymocap(source: KeypointFile, format: SourceFormat) -> Detections:
     """Returns the people of one image, ordered by their personID. An ID counts if it is a whole
-    number from 0 to 63 and no earlier person has it. People without such an ID get the lowest
-    numbers that are free.
+    number from 0 to 63 and no earlier person has it. If an entry has no ID, its index in the list
+    takes the place of the ID. People whose ID does not count get the lowest numbers that are free.
 
     Raises: CaptureError if the file is not valid.
     """

@@ -78,8 +78,8 @@ class KeypointSet:
     image.
     """
     places: tuple[LandmarkDefinition, ...] = ()
-    """Where points lie on the body, if this can differ from `body.landmarks`. The detector is known
-    to see a point elsewhere, or a fit can find that it does.
+    """Places of the points that need not lie where `body.landmarks` has them: the detector is known
+    to see them elsewhere, or a fit may find that it does.
     """
     certainty: tuple[float, ...] = ()
     """Certainty of each point as a fit has found it, (k,). It is the noise of all points, divided

@@ -72,7 +72,7 @@ class _Known:
 
     shorter: float = 1.15
     """An order is clear only if every other order makes the mean length of the bones larger by at
-    least this factor. It does so for 99 % of single people in random poses, seen from anywhere,
+    least this factor. This holds for 99 % of single people in random poses, seen from anywhere,
     with errors of 1 % of their height.
     """
     longest: float = 0.36

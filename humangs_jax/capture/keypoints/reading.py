@@ -41,8 +41,8 @@ class _Plausible:
     """Limits for numbers that can be pixels or scores of keypoints."""
 
     least_extent: float = 2.0
-    """At least one coordinate in any view has to reach this, pixels. If none does, the coordinates
-    are shares of the image, and are refused.
+    """At least one of the coordinates of all views has to reach this, pixels. If none does, the
+    coordinates are shares of the image, and are refused.
     """
     largest_pixel: float = 1e6
     """Larger coordinates are replaced by this one, pixels. They have no meaning, and could become
@@ -70,7 +70,7 @@ def read_detections(path: Path) -> Detections:
     """Returns the people in the images of a file or folder. The format is one of `KEYPOINTS`, and
     is found from the content.
 
-    If it is a folder, all JSON files in it and in its subfolders are read together.
+    If `path` is a folder, all JSON files in it and in its subfolders are read together.
     Raises: CaptureError if there is no such file or folder, or if the content is not valid.
     InvalidFileError if a limit is exceeded.
     """
@@ -231,8 +231,8 @@ def _chosen_people(
     person. If `person` is given, it is the index. If it is None, the person with the largest sum of
     confidences is chosen, and all others have to be ghosts.
 
-    Raises: CaptureError if `person` is None and a view shows several people, or if no view has so
-    many people.
+    Raises: CaptureError if `person` is None and a view shows several people, or if `person` is
+    given and no view has that many people.
     """
     body = np.asarray([name in _TRUNK_AND_LIMBS for name in kind.names])
     chosen: list[int | None] = []
@@ -441,8 +441,8 @@ def _recounted_videos(
     names: Sequence[str],
     find: Callable[[str | int], list[int]],
 ) -> dict[str | int, list[int]]:
-    """Returns the views of video frames that are counted from 0 if the photos are counted from 1,
-    or the reverse. The key is the image's name. Other images are left out. found: the views of each
+    """Returns, by name of the image, the views of video frames that are counted from 0 if the
+    photos are counted from 1, or the reverse. Other images are left out. found: the views of each
     image without such a correction.
     """
     videos: dict[str, list[tuple[int, str]]] = {}

@@ -36,8 +36,8 @@ AnyArray = Float[Array, "m c ..."] | Float[np.ndarray, "m c ..."]
 NEAR = 0.05
 """Smallest depth, metres. Smaller depths are clamped to it."""
 NOISE = 0.005
-"""Expected standard deviation of detections, as a share of the person's height in the photo. It is
-2 pixels for a person of 400 pixels.
+"""Expected standard deviation of detections, as a share of the person's size in the photo. It is 2
+pixels for a person of 400 pixels.
 """
 LEAST_NOISE = 0.3
 """The expected standard deviation of detections is at least this, pixels."""
@@ -355,8 +355,8 @@ def frame_residuals(
     scale: Float[Array, ""] | float,
     targets: Targets | None = None,
 ) -> dict[str, Float[Array, "..."]]:
-    """Returns all residuals of one frame. The key is the kind of residual. Half the sum of their
-    squares is the negative log posterior, up to a constant.
+    """Returns all residuals of one frame by kind. Half the sum of their squares is the negative log
+    posterior, up to a constant.
 
     scale: robust scale of keypoints, in standard deviations. targets: triangulated landmarks, or
     None.
