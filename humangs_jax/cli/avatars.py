@@ -326,7 +326,7 @@ def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
     """Returns the capture folders by name: given folders that are captures, and captures inside of
     other given folders. A given folder without captures is returned, too.
 
-    Raises: UsageError if two of them have the same name.
+    Raises: UsageError if a folder is given twice, or if two captures have the same name.
     """
     folders = []
     for path in given:
@@ -336,12 +336,16 @@ def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
         folders += [file.parent for file in inside if not file.parent.name.startswith(".")] or [
             path
         ]
-    named = {folder.absolute().name: folder for folder in folders}
-    if len(named) < len(folders):
-        twice = next(folder for folder in folders if named[folder.absolute().name] != folder)
-        raise UsageError(
-            f"{named[twice.absolute().name]} and {twice}: expected captures of different names"
-        )
+
+    # the avatars are named after the captures
+    named: dict[str, Path] = {}
+    for folder in folders:
+        name = folder.absolute().name
+        if name in named and named[name] == folder:
+            raise UsageError(f"{folder}: given twice")
+        if name in named:
+            raise UsageError(f"{named[name]} and {folder}: expected captures of different names")
+        named[name] = folder
     return named
 
 

@@ -99,8 +99,10 @@ def test_each_capture_is_answered_in_order_and_alone_where_its_batch_fails(netwo
         ("reconstruct people --out x.npz", "--out x.npz: expected a folder"),
         (
             "reconstruct people/a people/b/../a",
-            "people/b/../a and people/a: expected captures of different names",
+            "people/a and people/b/../a: expected captures of different names",
         ),
+        ("reconstruct people/a people/a", "people/a: given twice"),
+        ("reconstruct people people/a", "people/a: given twice"),
         ("reconstruct", "CAPTURES: expected at least one folder"),
         ("reconstruct people --shard 3/3", "--shard 3/3: expected I/N"),
         (

@@ -141,6 +141,15 @@ def test_ghosts_beside_the_person_are_no_people(tmp_path, ghost):
         assert keypoints.points[0, 0, 0] == 100.5
 
 
+def test_a_ghost_of_hands_is_no_person(tmp_path):
+    """A ghost of COCO-WholeBody's 133 points, of which only the hands are sure."""
+    person, ghost = entry(count=133), entry(count=133, shift=50)
+    person["keypoints"][17 * 3 + 2 :: 3] = [0.0] * 116
+    ghost["keypoints"][2 : 91 * 3 : 3] = [0.0] * 91
+    for people in ([ghost, person], [person, ghost]):
+        assert read(tmp_path / "k.json", people).points[0, 0, 0] == 100.5
+
+
 def test_a_person_can_be_chosen(tmp_path):
     people = [entry(), entry("back", shift=20), entry(shift=50)]
     first, second = (read(tmp_path / "k.json", people, person=i) for i in (0, 1))

@@ -229,7 +229,7 @@ def _chosen_people(
 ) -> list[int | None]:
     """Returns the index of the chosen person in each view. None if the view does not show this
     person. If `person` is given, it is the index. If it is None, the person with the largest sum of
-    confidences is chosen, and all others have to be ghosts.
+    confidences of trunk and limbs is chosen, and all others have to be ghosts.
 
     Raises: CaptureError if `person` is None and a view shows several people, or if `person` is
     given and no view has that many people.
@@ -250,7 +250,9 @@ def _chosen_people(
                 others = "or crop the photos, or delete the others from the file"
                 problem = f"{clear} people: expected one. {choice}; {others}"
                 raise CaptureError(image.file, f"view {name}", problem)
-            chosen.append(int(usable[..., 2].sum(axis=1).argmax()))
+            # a set may have neither trunk nor limbs
+            counted = body if body.any() else np.ones_like(body)
+            chosen.append(int(usable[:, counted, 2].sum(axis=1).argmax()))
     if person is not None and all(which is None for which in chosen):
         most = max([1, *(len(usable) for usable in people if usable is not None)])
         problem = f"no view has this many people: expected 0 to {most - 1}"
