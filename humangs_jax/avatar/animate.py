@@ -152,9 +152,9 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
         Posed Gaussians, metres.
 
     Raises:
-        ValueError: if the pose has another number of joints than the avatar, or is a batch of
-            poses. Outside of JAX transformations also if values are not finite or out of range; the
-            message names the array.
+        ValueError: as `skin`; also if the pose has another number of joints than the avatar, or is
+            a batch of poses. Outside of JAX transformations also if values are not finite or out of
+            range; the message names the array.
 
     Examples:
         >>> image = hg.render(hg.animate(avatar, capture.pose(0)), camera).rgb
@@ -224,7 +224,8 @@ def with_pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Avatar:
     keeps its own low-pass if that is for smaller pixels than the photos' pixels.
 
     The avatar looks as before. Where its own low-pass was larger, the difference is now an ordinary
-    part of the scales, which a fit can reduce.
+    part of the scales, which a fit can reduce. An avatar without a low-pass is changed as by
+    `with_pixel_footprint`.
     """
     return replace(avatar, gaussians=_pixel_footprint_of(avatar, views))
 

@@ -70,13 +70,14 @@ lids.
 BESIDE = 8
 """The largest number of neighbours from which the stretch of a vertex is computed."""
 RIDGE = 0.01
-"""Weight of the ridge, relative to the sum of the squared lengths of the edges at a vertex. It
-keeps skin from being stretched along its normal, because the edges hardly extend in this direction.
+"""Weight of the ridge, relative to the sum of the squared lengths of the edges at a vertex. Edges
+hardly extend along the normal of the skin. Without the ridge, skin would be stretched in this
+direction.
 """
 NEAR = {"mouth": 0.06, "lid": 0.04}
-"""Radii around the middle of the mouth's parts and around the middle of a lid, metres. Where the
-vertices within a radius lie on the avatar, compared with the mean body, decides where the parts are
-put.
+"""Radii around the middle of the mouth's parts and around the middle of a lid, metres. The parts
+are moved by the affine map that takes the vertices within the radius from the mean body to the
+avatar.
 """
 FEWEST = 12
 """The least number of vertices from which an affine map is computed. If fewer are within the
@@ -89,8 +90,8 @@ radius, the `FEWEST` nearest vertices are taken.
 
 
 def shipped_network() -> HumanGSConfig:
-    """Returns the configuration of the shipped weights, without reading their tensors. If no
-    weights are shipped, it is the default configuration.
+    """Returns the default configuration with the conventions of the shipped weights, without
+    reading their tensors. If no weights are shipped, the conventions are the default ones, too.
     """
     with resources.as_file(resources.files("humangs_jax") / SHIPPED) as file:
         metadata = {}
@@ -206,7 +207,7 @@ def _stretching(
 ) -> tuple[Int[np.ndarray, "m k"], Float[np.ndarray, "m k 3"]]:
     """Returns the neighbours of each vertex that moves, and their vectors w (see `avatar.face`).
     Neighbours are given as rows among the vertices that move, (m, BESIDE). vertices: indices of the
-    vertices that move. row: the row of each vertex of the avatar among them, m for a vertex that
+    vertices that move. row: for each vertex of the avatar, its row among these vertices, or m if it
     stays.
     """
     edges, _ = mesh_edges(np.asarray(avatar.faces))

@@ -107,8 +107,8 @@ def log_brightness(
 def turned_normals(
     normals: Float[Array, "g 3"], linear: Float[Array, "g 3 3"]
 ) -> Float[Array, "g 3"]:
-    """Returns the unit normals of surfaces after linear maps. A normal is 0 where the map has rank
-    1 or 0.
+    """Returns the unit normals of surfaces after linear maps. A normal is 0 where the map takes the
+    surface to a line or a point.
     """
     # the inverse transpose, up to a positive factor: rows of cofactors
     rows = [jnp.cross(linear[:, (i + 1) % 3], linear[:, (i + 2) % 3]) for i in range(3)]
@@ -119,9 +119,9 @@ def turned_normals(
 def relit(
     colors: Float[Array, "g 3"], light: Light, linear: Float[Array, "g 3 3"]
 ) -> Float[Array, "g 3"]:
-    """Returns the colors of Gaussians after their surfaces were turned by `linear`.
+    """Returns the colors of Gaussians after the linear maps `linear` of their surfaces.
 
-    Colors do not exceed 1, except those that do so in the photos.
+    Colors do not exceed 1, except those that did before.
     """
     terms = light_terms(turned_normals(light.normals, linear))
     change = jnp.clip(log_brightness(terms, light.coefficients) - light.shading, -LIMIT, LIMIT)
@@ -319,7 +319,8 @@ class Avatar(Batchable):
 
         Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and for
         Gaussians with deformations, because an avatar in T-pose has none; FileError if `load` would
-        refuse the file, for example for numbers that are not finite; OSError.
+        refuse the arrays of the Gaussians, the body or the light, for example for numbers that are
+        not finite; OSError.
         """
         require_concrete("Avatar.save", "writes a file", self)
         # a file holds one avatar in the T-pose
@@ -368,10 +369,11 @@ class Avatar(Batchable):
     def load(cls, path: str | os.PathLike[str]) -> "Avatar":
         """Read what `save` wrote.
 
-        Raises: FileNotFoundError if there is no such file; FileError, naming file and key, if it is
-        no avatar of this version, a key is missing, shapes do not fit each other, numbers are not
-        finite or out of range, indices do not exist, or the arrays do not have the checksum in the
-        header. The first files have no checksum, and are read without this check.
+        Raises: FileNotFoundError if there is no such file; FileError, which names the file, if it
+        is no avatar of this version, a key is missing, shapes do not fit each other, numbers are
+        not finite or out of range, indices do not exist, or the arrays do not have the checksum in
+        the header. The error names the key if one array is wrong. The first files have no checksum,
+        and are read without this check.
         """
         with reading(path, "avatar file"):
             return _load(cls, path)
@@ -393,7 +395,7 @@ def recorded_source(path: str | os.PathLike[str]) -> str | None:
 def _read(
     path: Any, wanted: Callable[[str], bool] | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Returns the arrays of an avatar file by key, without checks, and its header.
+    """Returns the arrays of an avatar file by key, and its header. The arrays are not checked.
 
     wanted: function that returns whether the array of a key is read. None: all are read.
     """
@@ -522,7 +524,7 @@ def _read_face(of_face: dict[str, np.ndarray], arrays: Mapping[str, np.ndarray])
 
 
 _RANGES = {"skinning_weights": UNIT, "light_normals": SIGNED_UNIT}
-"""Ranges of arrays in files, by key, where the ranges of the records are wider or missing."""
+"""Ranges of arrays in files, by key, for arrays whose annotations have a wider range or none."""
 
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], j: int) -> None:

@@ -45,8 +45,8 @@ FOLLOWING = 0.5
 camera follows a walk, but not the swing of steps and arms, which takes about a second.
 """
 WIDEST = 2
-"""The largest standard deviation of this kernel, as a multiple of the number of frames. Already
-then less than 1e-8 is left of anything but a straight line.
+"""The largest standard deviation of this kernel, as a multiple of the number of frames. With this
+standard deviation, less than 1e-8 is left of anything in the path but a straight line.
 """
 TRACKED = 1024
 """Number of Gaussians, evenly spread, on which a person's extent is measured."""
@@ -57,7 +57,7 @@ MOST_TRACKED = 1 << 25
 400 MB. A motion of more than 32,768 frames is measured on fewer Gaussians.
 """
 A_POSE = 48.0
-"""Degrees by which the arms hang down in the A-pose, as in the page."""
+"""Degrees by which the arms hang down in the A-pose, as in the viewer's page."""
 
 posed = compiled()(skin)
 
@@ -359,7 +359,8 @@ def turntable_views(
     """Returns a batch of copies of a pose, one for each view, and cameras on a circle that starts
     at the azimuth of the shot.
 
-    Raises: ValueError if `views` is less than 1.
+    Raises: ValueError if `views` is less than 1 or beyond the limit `frames`, or if the shot is out
+    of range.
     """
     if views < 1:
         raise ValueError(f"views {views}: expected at least 1")
@@ -448,8 +449,8 @@ def without_unseen(
     """Returns the avatar without the Gaussians whose blending weight is less than `ALPHA_MIN` on
     every pixel of all these images.
 
-    All images are drawn once to find these Gaussians, which pays if they are drawn several times.
-    docs/video.md has the error and the time.
+    All images are drawn once to find these Gaussians. This pays if the images are drawn several
+    times. docs/video.md has the error and the time.
     """
     most = np.zeros(len(avatar.gaussians.means), np.float32)
     drawn = draw(avatar, poses, cameras, how=dataclasses.replace(how, visibility=True))

@@ -53,8 +53,8 @@ COVERED = 0.5
 RGBA = ("R", "G", "B", "A")
 DEPTH = "Z"
 WIDE = (DEPTH, "position.")
-"""Channels whose names begin so keep 32 bits when the others have 16. They are lengths in metres,
-and half floats have steps of 4 mm beyond 4 m.
+"""Channels whose names begin with one of these keep 32 bits when the others have 16. They are
+lengths in metres, and half floats have steps of 4 mm beyond 4 m.
 """
 
 
@@ -124,8 +124,9 @@ def write_views(
     The files appear together when all are drawn. Images view_*.png and a views.exr of an earlier
     call are removed. Returns the number of views.
 
-    Raises: ValueError if the layers of all views have more bytes than the limit for arrays (see
-    docs/security.md); OSError if the files cannot be written.
+    Raises: ValueError if a layer does not exist, if the layers of all views have more bytes than
+    the limit for arrays (see docs/security.md), or if a file of the same name was not written by
+    humangs; OSError if the files cannot be written.
     """
     out, count = Path(out), len(poses)
     if names is None:

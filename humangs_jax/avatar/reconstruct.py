@@ -93,12 +93,12 @@ def reconstruct(
 
     Worlds that are not y-up are turned for the network. The avatar then has no light, because its
     directions would be those of another world. For a network that looks at the person's pixels
-    alone, the body is displaced first, unless `Runtime.displacement` is False. It takes the
-    displacement of the capture. If the capture has none, but masks, the body is moved to the edges
-    of the masks if it does not fit them, or in any case if `Runtime.displacement` is True. If the
-    masks show a skirt, the body of the avatar has one (`data.skirt`). What no photo shows is
-    guessed from what photos show (`avatar.unseen`). If the network has a driver, which corrects
-    Gaussians for each frame, the avatar is without these corrections.
+    alone, the body is displaced first, unless `Runtime.displacement` is False. If the capture has a
+    displacement, it is used. If it has masks only, the body is moved to their edges if it does not
+    fit them, or in any case if `Runtime.displacement` is True. If the masks show a skirt, the body
+    of the avatar has one (`data.skirt`). What no photo shows is guessed from what photos show
+    (`avatar.unseen`). If the network has a driver, which corrects Gaussians for each frame, the
+    avatar is without these corrections.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -197,10 +197,9 @@ def reconstruct_batch(
 
     A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the
     number of people. People in skirts are reconstructed alone, because their bodies have more
-    vertices. The others of a batch must be like the first of them to be reconstructed together:
-    they must have the same body model, and a world with y up if the first has one, else a world
-    with another axis up. Whoever differs is reconstructed alone. A capture that cannot be used does
-    not stop the others.
+    vertices. The other people of a batch are reconstructed together with the first of them if they
+    have the same body model, and if y is up either in both worlds or in neither. Anyone else is
+    reconstructed alone. A capture that cannot be used does not stop the others.
 
     Args:
         variables: of the network; with `config`, what `load_weights` returns.
@@ -210,8 +209,8 @@ def reconstruct_batch(
         batch: captures at a time.
 
     Yields:
-        Each capture with its avatar, in the order of the captures. If a capture, or the function
-        that loads it, raises a ValueError or OSError, there is this error instead of both.
+        Each capture with its avatar, in the order of the captures. If a function raises a
+        ValueError or OSError, or if a capture cannot be used, the item has this error instead.
 
     Examples:
         >>> made = hg.reconstruct_batch(*hg.load_weights(), captures)

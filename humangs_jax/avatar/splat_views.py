@@ -36,8 +36,9 @@ may be outliers, far away.
 NEARLY_ALL = 0.999
 """Share of the opaque Gaussians that stands for all of them, because a few may be outliers."""
 COMPACT = 3.0
-"""All opaque Gaussians are shown if the radius of nearly all of them is less than this many times
-the radius of the share `SHOWN`. There are no outliers then, as around a person.
+"""All opaque Gaussians are shown if the radius that contains nearly all of them is less than this
+many times the radius that contains the share `SHOWN`. There are no outliers then, as around a
+person.
 """
 ROOM = 1.1
 """Factor on the least distance from which the cameras see the Gaussians."""
@@ -109,7 +110,7 @@ def write_splat_views(
     """Write an image NAME.png for each camera into a folder. The images appear together, and other
     files stay. Returns the number of images.
 
-    Raises: OSError.
+    Raises: ValueError if a file of the same name was not written by humangs; OSError.
     """
 
     def write(folder: Path) -> None:

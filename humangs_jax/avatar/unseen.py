@@ -314,7 +314,8 @@ def guess_line(capture: Capture) -> str | None:
 
 
 def unseen_sides(capture: Capture) -> list[str]:
-    """Returns the names of the `SIDES` and `PARTS` that hardly any photo shows.
+    """Returns the names of the `SIDES` and `PARTS` of which photos show less than the share
+    `LEAST_SHOWN`.
 
     This runs on the host, and does not consider that other limbs may be in front.
     """

@@ -105,8 +105,8 @@ def write_video(
 
     Raises:
         ValueError: if there is no frame, they differ in shape, a number is not in [0, 1], they hold
-            integers other than uint8, `fps` is not positive, or the suffix is another one or has no
-            alpha.
+            integers other than uint8, `fps` is not positive, the suffix is another one or has no
+            alpha, or a PNG file that would be replaced was not written by humangs.
         OSError: if the file cannot be written; also what `frames` raises.
 
     Examples:

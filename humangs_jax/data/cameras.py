@@ -28,8 +28,8 @@ from humangs_jax.data.unknown import binary_kind, described
 from humangs_jax.io.reading import limits, reading
 
 ROUNDED_ROTATION = 5e-3
-"""The largest deviation of R R^T from 1 for matrices that are written with three decimals
-(EasyMocap). Such matrices are replaced by the nearest rotation.
+"""The largest deviation of R R^T from the identity for matrices that are written with three
+decimals (EasyMocap). Such matrices are replaced by the nearest rotation.
 """
 LARGEST_COEFFICIENT = 1e100
 """The largest coefficient of a lens. Products of larger ones are not finite."""
@@ -305,8 +305,8 @@ def in_capture_convention(
 
 
 def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """Returns the rotation nearest to a rounded rotation matrix. A matrix that deviates by more
-    than rounding explains is returned as it is.
+    """Returns the rotation nearest to a rounded rotation matrix. A matrix that mirrors, or that
+    deviates by more than rounding explains, is returned as it is.
     """
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > ROUNDED_ROTATION or np.linalg.det(matrix) < 0:
         return matrix

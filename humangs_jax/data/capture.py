@@ -208,7 +208,7 @@ def capture_from_arrays(
         translations: (m, 3) metres.
         betas: (s,) shape coefficients.
         shape_names: (s,) names of the body's shape directions that betas belong to. None: betas
-            belong to all directions without expressions, or to the first ones of SMPL-X.
+            belong to all directions except expressions, or to the first shape directions of SMPL-X.
         masks: (v, h, w) in [0, 1], or None.
         frames: (v,) which of the m poses each view shows; may be left out when m is 1.
         names: (v,) names of the views, which are file names without suffix. None: "000", "001" and
@@ -382,6 +382,7 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
     Raises:
         CaptureError: if the capture is not valid, or `path` is a folder with something in it (with
             `overwrite`: with something else than a capture).
+        OSError: if the folder cannot be written.
 
     Examples:
         >>> hg.save_capture("me", capture)

@@ -267,7 +267,8 @@ def shape_coefficients(
     `BodyModel.shape_names`. None: betas belong to SMPL-X's shape directions, or to all of the
     body's directions except expressions.
 
-    Raises: CaptureError for a coefficient that is not 0 if the body has no such direction.
+    Raises: CaptureError for a coefficient that is not 0 if the body has no such direction, and if
+    there is not one name for each coefficient.
     """
     directions = body.shape_names or tuple(
         f"shape_{i}" for i in range(body.shape_directions.shape[-1])

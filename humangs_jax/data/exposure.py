@@ -56,7 +56,7 @@ BLUR = 3
 USABLE = (0.06, 0.95)
 """Range of the values of a color that tell a gain. Darker and brighter values are left out."""
 LEAST_POINTS = 50
-"""Points that two photos must share to be compared."""
+"""Least number of points that two photos must share to be compared."""
 ALIKE = 50
 """Number of neighbouring points with nearly the same error. So many points count as one independent
 measurement.
@@ -220,9 +220,9 @@ FITS = 16
 the fit before.
 """
 REDESCENDING = 8
-"""In this number of fits, the last ones, the weights are Cauchy's, so that parts that differ lose
-nearly all influence. If the first fits used them, too, the result would depend on where the search
-starts.
+"""Number of fits, the last of `FITS`, whose weights are Cauchy's. Parts that differ then lose
+nearly all influence. If the first fits used these weights, too, the result would depend on where
+the search starts.
 """
 
 

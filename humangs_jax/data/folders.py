@@ -179,8 +179,8 @@ def photo_of_mask(name: str) -> str | None:
     """Returns the name of the photo that a mask belongs to, with or without suffix. Returns None if
     the name is not the name of a mask.
 
-    "1.jpg.mask.png" and "mask_1.jpg.png" are masks of "1.jpg", "1_mask.png" and "1-matte.png" of
-    "1".
+    "1.jpg.mask.png" and "mask_1.jpg.png" are masks of "1.jpg". "1_mask.png" and "1-matte.png" are
+    masks of "1".
     """
     stem = Path(name).stem
     found = _MASK_BEHIND.fullmatch(stem) or _MASK_BEFORE.fullmatch(stem)

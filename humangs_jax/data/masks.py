@@ -47,15 +47,17 @@ LEAST_MOVE = 0.5
 MOST_PIXELS = 400
 """Height of the person at which the photo is searched, pixels. Larger photos are reduced to it."""
 LEAST_PART = 0.005
-"""Connected parts of a mask that are smaller, as a share of the largest one's area, are specks and
-not the person.
+"""Connected parts of a mask that have less than this share of the largest part's area are specks
+and not the person.
 """
 WHITE = 0.98
 """A photo shows no background if nothing around the mask, beyond `REACH`, is darker than this. Then
 no edge can be found.
 """
 SECTORS = 16
-"""Parts of the silhouette, of equal numbers of points, by the angle about its middle."""
+"""Number of sectors. Sectors divide the silhouette by the angle about its middle, and have equally
+many points.
+"""
 SECTOR_POINTS = 8
 """The least number of points of a sector. Where points are few, there are fewer sectors."""
 AGREE = 0.7
@@ -79,8 +81,8 @@ pixels.
 CLEAR = 1.3
 """Distance from an edge, pixels, from which on the colors are not blurred by it."""
 THIN = 0.0007
-"""Masks are not moved if they have many parts too thin for masks that have grown by their excess.
-This is the largest area of such parts, as a share of the area that the masks would lose.
+"""A mask that has grown by its excess has no part thinner than twice the excess. Masks are not
+moved if thinner parts have more than this share of the area that the masks would lose.
 """
 
 

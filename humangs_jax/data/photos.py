@@ -508,7 +508,7 @@ def read_view(
 
 
 def read_mask(file: Path, owner: str, width: int, height: int) -> Float[np.ndarray, "h w"]:
-    """Read a mask, see `io.images.read_grey`. owner: names in errors what has this width and
+    """Read a mask, see `io.images.read_grey`. owner: what errors call the image of this width and
     height.
 
     Raises: CaptureError, also for another size, and for labels in place of coverage from 0 to 255.

@@ -40,7 +40,7 @@ class PreparedCapture:
     given: Capture
     """The capture as it came: all its views, in its own colors and its own world."""
     capture: Capture
-    """The views to use: those that show the person, in equal exposure, in a world with y up."""
+    """The views to use, in equal exposure, in a world with y up. All of them show the person."""
     left_out: dict[str, str]
     """The reasons why views do not show the person, by the names of the views. These views are not
     in `capture`.
@@ -84,15 +84,15 @@ class PreparedCapture:
         return self.up != "y"
 
     def select(self, views: Sequence[int] | Int[np.ndarray, " any"]) -> "PreparedCapture":
-        """Returns the capture with some of the views to use, in this order. It has no body, which
-        depends on the views.
+        """Returns the capture with some of the views to use, in this order. The body is left out,
+        because it depends on the views.
         """
         chosen = self.capture.select(views)
         return PreparedCapture(self.given, chosen, self.left_out, self.up, chosen=True)
 
     def resized(self, longest: int) -> "PreparedCapture":
-        """Returns the capture with photos whose longest side has `longest` pixels. It has no body,
-        which depends on the photos.
+        """Returns the capture with photos whose longest side has `longest` pixels. The body is left
+        out, because it depends on the photos.
         """
         smaller = self.capture.resized(longest)
         return PreparedCapture(self.given, smaller, self.left_out, self.up, self.chosen)
@@ -132,7 +132,7 @@ def prepare_capture(
     *,
     views: int | str | None = None,
 ) -> PreparedCapture:
-    """Decide which photos are used and how, once for `reconstruct`, `refine` and `check`.
+    """Decide which photos are used and how, once for `reconstruct`, `refine` and `check_capture`.
 
     What is prepared is not prepared again. A `PreparedCapture` loses views if `views` asks for
     fewer, and gets the body for `config` if it was prepared for another network or for none.

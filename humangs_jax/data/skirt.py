@@ -56,15 +56,15 @@ SKIRT_VERTICES = ROWS * 2 * (GAP + HALF)
 """Number of vertices of a skirt. They are the last ones of a body that has a skirt."""
 BESIDE = 0.02
 """A point between the legs counts if it is farther than this from the skin of both legs in the
-photo, metres. Trousers reach as far from the skin.
+photo, metres. Trousers may reach this far from the skin.
 """
 SHOWN = 0.8
 """A row is part of a skirt if at least this share of its counted points is inside the masks."""
 VOTES = 4
 """A row is judged if at least this many of its points count, in all photos together."""
 LEAST_ROWS = 4
-"""The least number of rows of a skirt that have a point inside a mask and `CLEAR` of both legs.
-Wide trousers have fewer, and would look worse with a skirt.
+"""The least number of rows of a skirt that have a point inside a mask and farther than `CLEAR` from
+the skin of both legs. Wide trousers have fewer, and would look worse with a skirt.
 """
 CLEAR = 0.06
 """Least distance from the skin of both legs at which a point is certainly cloth of a skirt, metres,

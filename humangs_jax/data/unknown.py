@@ -33,9 +33,11 @@ CONVERTED = {
     ('"shots"', '"cameras"'): "a model of OpenSfM (`opensfm export_colmap` converts it)",
     ('"poseId"', '"intrinsicId"'): "a model of Meshroom (`aliceVision_exportColmap` converts it)",
 }
-"""Words of calibrations of programs that can also write a format that is read, and how."""
+"""Words in calibrations that are not read -> the kind of the calibration, and how to convert it to
+a format that is read.
+"""
 POSE = re.compile(r"extrinsics?|rotation|translation|[rt]vecs?|[RT]", re.IGNORECASE)
-"""Matches a key of where a camera stands."""
+"""Matches the keys of the place and the rotation of a camera."""
 PARTS = ("rows", "cols", "dt", "data")
 """Keys inside of a matrix of OpenCV, which tell nothing about a file."""
 KEY = re.compile(r"""^[ \t]*["']?([A-Za-z_][\w .-]*?)["']?[ \t]*[:=]""", re.MULTILINE)

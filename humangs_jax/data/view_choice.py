@@ -29,9 +29,9 @@ def best_views(capture: Capture, count: int | None) -> list[int]:
     """Returns the indices of the `count` photos that together show the body best, in ascending
     order. If there are no more than `count`, all are returned.
 
-    The choice is greedy. The sum that it raises is, over the vertices, the vertex's area times the
-    best `view_quality` among the chosen photos. Each further photo is the one that adds most to the
-    sum. The sum is submodular, so the choice reaches at least 63 % of the best one (Nemhauser,
+    The choice is greedy: each further photo is the one that adds most to a sum over the vertices.
+    The term of a vertex is its area times the best `view_quality` among the chosen photos. The sum
+    is submodular, so the choice reaches at least 63 % of the largest possible sum (Nemhauser,
     Wolsey, Fisher 1978, https://doi.org/10.1007/BF01588971). What a photo shows outside its mask
     does not count.
 

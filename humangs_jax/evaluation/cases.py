@@ -340,10 +340,11 @@ def predict_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Pr
 
 
 def _avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
-    """Returns the method that draws one avatar, or the avatar PERSON.npz of a folder. People
-    without such a file are missing.
+    """Returns the method that draws one avatar, or the avatar PERSON.npz of a folder. For people
+    without such a file, there are no images, and the file is listed as missing.
 
-    Raises: ValueError for one avatar and several people; OSError.
+    Raises: ValueError for one avatar and several people, and as `Avatar.load`; FileNotFoundError if
+    there is no such file.
     """
     folder = None
     if not isinstance(avatar, Avatar):

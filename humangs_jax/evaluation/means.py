@@ -15,7 +15,7 @@ Row = dict[str, float | None]
 CONFIDENCE = 0.95
 """The probability with which an interval contains the true mean."""
 RESAMPLES = 2000
-"""Resamples of the bootstrap."""
+"""Number of resamples of the bootstrap."""
 BLOCKS = 20
 """Number of parts in which the resamples are computed, to save memory."""
 

@@ -220,7 +220,7 @@ def _posed(
 def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
     """Returns the moving skeleton of a GLB file, with its face, or poses with a face alone.
 
-    There are poses if the animation moves a face and turns no joint.
+    Poses are returned if the animation moves a face and turns no joint.
 
     Raises: OSError; InvalidFileError, and what damaged numbers raise.
     """

@@ -124,7 +124,7 @@ def as_arkit(track: FaceTrack) -> tuple[FaceTrack | None, tuple[str, ...]]:
 
 
 def clipped(values: Float[np.ndarray, "m e"]) -> Float[np.ndarray, "m e"]:
-    """Limits coefficients to -1 to 2, because trackers overshoot.
+    """Limits coefficients to the range from -1 to 2, because trackers overshoot.
 
     Values that are not finite stay.
     """

@@ -255,7 +255,9 @@ def are_rotations(array: np.ndarray) -> bool:
 
 
 def _off_rotations(array: np.ndarray) -> float:
-    """Returns the largest difference of R R^T from the identity; infinite if not numbers."""
+    """Returns the largest difference of R R^T from the identity; infinite if the array does not
+    hold real numbers.
+    """
     if array.dtype.kind not in "fiu":
         return np.inf
     return float(np.abs(array @ np.swapaxes(array, -1, -2) - np.eye(3)).max(initial=0))

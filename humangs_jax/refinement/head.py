@@ -266,8 +266,8 @@ def _squares(
     in each view, (v, 2), pixels; and the side of a square, pixels, that contains the points in each
     of the s views.
 
-    A view shows the points if their middle lies in the image and their square is no larger than the
-    image. `OUTLIERS` percent of the points at each side are ignored.
+    A view shows the points if their middle lies in the image and the side of their square is no
+    longer than the image's longer side. `OUTLIERS` percent of the points at each side are ignored.
     """
     low, high = np.percentile(np.clip(pixels, -FAR, FAR), (OUTLIERS, 100 - OUTLIERS), axis=1)[
         ..., ::-1

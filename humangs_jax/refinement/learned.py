@@ -370,8 +370,8 @@ def calls_of_update(
     graph: Graph,
     splat: SplatConfig,
 ) -> Iterator[Call]:
-    """Yields the long programs of `learned_update` and their arguments, in the order of
-    their use.
+    """Yields the programs of `learned_update` that take long to compile, with their arguments, in
+    the order of their use.
     """
     photo, used = photos[0], min(len(photos), MOST_PHOTOS)
     drawing = parameters, avatar, photo, splat

@@ -71,7 +71,7 @@ respect to the parameters and to the brightness of each Gaussian.
 
 def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
     """Returns the parameters of Gaussians that refinement moves. The low-pass is removed from the
-    scales. `gaussians_of` makes the Gaussians again, with the limits of `unconstrain`.
+    scales. `gaussians_of` makes the Gaussians again, within the limits of `unconstrain`.
 
     Raises: ValueError for harmonics or deformations.
     """

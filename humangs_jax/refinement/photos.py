@@ -17,8 +17,8 @@ from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 
 MARGIN = 8
-"""Pixels around the mask that a crop contains. The window of structural similarity has 11 pixels,
-and Gaussians beyond the silhouette cost alpha there.
+"""Width of the margin around the mask that a crop also contains, pixels. The window of structural
+similarity has 11 pixels, and Gaussians beyond the silhouette cost alpha there.
 """
 MULTIPLE = 16
 """Sides of crops are multiples of this number of pixels, so that few sizes are compiled. A crop is

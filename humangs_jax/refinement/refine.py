@@ -55,7 +55,7 @@ class Refinement:
     photos that were fitted.
     """
     psnr: tuple[float, float]
-    """The PSNR of these two avatars over the crops, dB."""
+    """The PSNR of these two avatars over the crops of the same photos, dB."""
     kept: bool
     """Whether the loss has become smaller. If not, the avatar is unchanged."""
     interrupted: bool = False
@@ -119,8 +119,9 @@ def refine(
         avatar: of the person in the photos, on the body of the capture.
         capture: photos with masks, in any poses, or the result of `prepare_capture`.
         config: the settings. None: `RefineConfig()`.
-        seconds: limit in seconds. With `seconds` or `steps`, both replace the limits of the
-            configuration. The seconds become a number of steps before the first step.
+        seconds: limit in seconds. If `seconds` or `steps` is given, these two arguments replace
+            both limits of the configuration. The seconds become a number of steps before the first
+            step.
         steps: limit in steps, which repeats a run exactly on the same machine. 0: iterations and
             steps on the head alone.
         progress: show a bar.

@@ -149,8 +149,8 @@ def ablate(
         seeds: number of runs of the base and of each variant.
         people: people to train on. They are given as a number of synthetic people, who are rendered
             during training, as capture folders, or as a function that makes a source.
-        validation: other people to compare on, in the same three forms. Of a function's source the
-            first eight people are used, of a number or of folders all. All variants are compared on
+        validation: other people to compare on, in the same three forms. If it is a function, the
+            first eight people of its source are used, else all people. All variants are compared on
             the photos and targets of the base.
         out: folder of the runs.
         metric: name of the metric of validations to compare, such as "psnr", "psnr_fg" or "ssim".

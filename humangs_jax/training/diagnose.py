@@ -427,8 +427,8 @@ def diagnose_run(
     The run is repeated from the newest checkpoint before that step, or from its start. If the log
     has no such step, the step after the newest checkpoint is diagnosed. body, training, networks,
     variables: as the run had them. Batches are functions of seed and step, so the step is repeated
-    bit for bit on the device that the run had.
-    Raises: FileNotFoundError if `out` holds no run.
+    bit for bit on the device that the run had. Raises: FileNotFoundError if `out` holds no run;
+    ValueError if its configuration, log or checkpoints cannot be used.
     """
     config = load_config(out)
     if isinstance(training, Sequence):

@@ -261,11 +261,11 @@ def update(
     count the steps so far that were skipped or not finite. dropped_tokens and overflow count what
     did not fit its buffers in this step.
 
-    Arguments: batch: an `Example` with a leading axis of subjects. body: decimated already.
-    networks: networks of the losses that need one. seed: from `seed_numbers`. config: static, of
-    one stage. mesh: static; with a mesh, state, batch, body and networks lie on it, see `sharding`.
-    Raises: ValueError if parameters have fewer than 32 bits, if the subjects of a device cannot be
-    divided into microbatches, or if the network of a loss is missing.
+    Arguments: batch: an `Example` with a leading axis of subjects. body: the body that carries the
+    Gaussians. networks: networks of the losses that need one. seed: from `seed_numbers`. config:
+    static, of one stage. mesh: static; with a mesh, state, batch, body and networks lie on it, see
+    `sharding`. Raises: ValueError if parameters have fewer than 32 bits, if the subjects of a
+    device cannot be divided into microbatches, or if the network of a loss is missing.
     """
     for name, leaf in inexact_leaves(state.params):
         if jnp.finfo(leaf.dtype).bits < 32:

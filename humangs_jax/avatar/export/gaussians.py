@@ -260,7 +260,7 @@ def save_gaussians(
 
     Raises:
         ValueError: Another suffix or version, numbers that files cannot hold, or harmonics that the
-            format does not.
+            format does not hold.
 
     Examples:
         >>> hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply", y_up=True), y_up=True)
@@ -445,8 +445,8 @@ def export(
         `.obj`) are not included.
 
     Raises:
-        ValueError: for another suffix, for a format that cannot hold what is asked for, or if
-            `numbers` has not one number for each frame.
+        ValueError: for another suffix, for a format that cannot hold what is asked for, for numbers
+            that files cannot hold, or if `numbers` has not one number for each frame.
 
     Examples:
         >>> hg.export("person.glb", avatar, hg.load_motion("dance.bvh"), mesh=True)

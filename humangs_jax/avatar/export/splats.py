@@ -91,7 +91,7 @@ def write_ply(
     """Write a 3DGS `.ply`. If writing fails, the path stays as it was.
 
     rest_fields: write all 45 `f_rest_*` fields, which some importers (Unity) require. Fields of
-    harmonics that the Gaussians do not have are 0.
+    harmonics that the Gaussians do not have are 0. Raises: ValueError as `plain_arrays`; OSError.
     """
     import plyfile
 
@@ -351,7 +351,7 @@ def write_splat(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
     """Write a `.splat`. If writing fails, the path stays as it was. Colors, opacities and
     quaternions are rounded to bytes.
 
-    Raises: ValueError for Gaussians with harmonics.
+    Raises: ValueError for Gaussians with harmonics, and as `plain_arrays`; OSError.
     """
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
     if harmonics.size:
@@ -483,6 +483,8 @@ def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
 
     Viewers that do not know the extension draw points in the colors of COLOR_0. These colors are
     linear, as glTF wants them, while the extension's coefficients are of sRGB colors.
+
+    Raises: ValueError if there are no Gaussians, and as `plain_arrays`; OSError.
     """
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
     if not len(means):

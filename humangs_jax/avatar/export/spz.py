@@ -112,7 +112,8 @@ def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Versi
     Scales change by up to 3 %. Colors, harmonics and opacities are rounded to 8 bits, components of
     quaternions to 10 bits. Harmonics are clipped to [-1, 1].
 
-    Raises: ValueError if a coordinate of a Gaussian exceeds 8,388,607 m.
+    Raises: ValueError if a coordinate of a Gaussian exceeds 8,388,607 m, and as `plain_arrays`;
+    OSError.
     """
     means, quats, scales, opacities, colors, harmonics = plain_arrays(gaussians)
     # places have 24 bits: as many behind the point as the farthest Gaussian leaves
@@ -250,8 +251,8 @@ def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header
 
 
 def _of_stream(data: bytes) -> tuple[_Header, list[bytes]]:
-    """Returns the header and the six arrays of a file of version 1 to 3. It is a gzip, or what the
-    gzip held, which downloads unpack if the server declares the gzip as an encoding.
+    """Returns the header and the six arrays of a file of version 1 to 3. The file is a gzip, or the
+    unpacked content of a gzip. Downloads unpack it if the server declares gzip as their encoding.
     """
     packed = io.BytesIO(data)
     with packed if data.startswith(b"NGSP") else gzip.GzipFile(fileobj=packed) as file:

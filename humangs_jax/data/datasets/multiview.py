@@ -494,8 +494,8 @@ class _Smc:
             self.file = h5py.File(path, "r")
 
     def _at(self, key: str) -> Any:
-        """Returns the group or data set under a key, or None if there is none. Links are refused,
-        since they can lead into other files.
+        """Returns the HDF5 group or data set under a key, or None if there is none. Links are
+        refused, since they can lead into other files.
         """
         found = self.file
         for part in key.split("/"):

@@ -55,7 +55,7 @@ WHITE = 250 / 255
 pixels may be a little below 1, since 8-bit JPEG images ripple by a few levels.
 """
 KEPT_FRAMES = 64
-"""Poses of a scene that are kept in memory."""
+"""Number of poses of a scene that are kept in memory."""
 SIGNIFICANT = 9
 """Digits of the numbers in lists, as many as float32 has."""
 

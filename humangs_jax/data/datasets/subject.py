@@ -295,7 +295,9 @@ computed from them by averaging whole blocks.
 Photo = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]
 """An image on white, (h, w, 3), and its mask, (h, w), as bytes."""
 THREADS = os.cpu_count() or 1
-"""Threads that decode the photos of one request. JPEG decoding releases the interpreter's lock."""
+"""Number of threads that decode the photos of one request. Decoding JPEG files releases the
+interpreter's lock.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -305,7 +307,7 @@ class Subject:
     name: str
     """The name in errors and manifests."""
     K: Float[np.ndarray, "v 3 3"]
-    """The camera matrix of the photo as it is, (v, 3, 3), pixels, centres at +0.5."""
+    """The camera matrix of each photo as it is, (v, 3, 3), pixels, with pixel centres at +0.5."""
     cam_from_world: Float[np.ndarray, "v 4 4"]
     """From the world to the camera, (v, 4, 4), metres, OpenCV axes."""
     sizes: Int[np.ndarray, "v 2"]

@@ -41,9 +41,9 @@ from humangs_jax.io.reading import InvalidFileError, read_text, reading
 
 Kind = Literal["A", "B", "C"]
 PCA_NUMBERS = 12
-"""Numbers of a hand pose in principal components."""
+"""How many principal components describe a hand pose."""
 HAND_NUMBERS = 45
-"""Numbers of a hand pose in axis-angles: 15 joints."""
+"""How many numbers a hand pose has as axis-angles: three for each of 15 joints."""
 FIT = "smplx_param.pkl"
 """File of the body that was fitted to a scan."""
 FIT_MESH = "mesh_smplx.obj"

@@ -347,8 +347,9 @@ class CaptureSource:
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """The people of whom something could not be used so far: what was first found wrong with
-        each, by name. If only a photo of a person is wrong, other views are still used.
+        """The faults found so far. For each person of whom something could not be used, by name,
+        what was first found wrong. If only a photo of a person is wrong, other views are still
+        used.
         """
         return {str(name): problem for name, problem in self.cache.broken.items()}
 
@@ -368,7 +369,7 @@ class CaptureSource:
         wrong, or there may be too few views for the largest number of input views, or too small
         photos.
 
-        No decoded photo is kept. Raises: ValueError if no person can be used.
+        No decoded photo is kept. Raises: ValueError if the files of all people are wrong.
         """
         problems = {}
         for i in range(len(self.cache)):

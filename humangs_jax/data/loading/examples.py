@@ -130,8 +130,8 @@ class Source(Protocol):
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """The people of whom something could not be used so far: what was first found wrong with
-        each, by name.
+        """The faults found so far. For each person of whom something could not be used, by name,
+        what was first found wrong.
         """
         ...
 
@@ -370,8 +370,8 @@ class Mixture:
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """The people of whom something could not be used so far, of all sources: what was first
-        found wrong with each, by name.
+        """The faults found so far in all sources. For each person of whom something could not be
+        used, by name, what was first found wrong.
         """
         return {name: problem for source in self.sources for name, problem in source.broken.items()}
 

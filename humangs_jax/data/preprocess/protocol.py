@@ -55,13 +55,13 @@ NEAR_FACTORS = (2.0, 2.0)
 all sets.
 """
 VIEWS = 60
-"""Views of every scan."""
+"""Number of views of every scan."""
 SIZE = 512
 """Side of the images, pixels."""
 TRAIN = 2300
-"""Scans to train with."""
+"""Number of scans to train with."""
 TEST = 145
-"""Scans to test with."""
+"""Number of scans to test with."""
 SPLIT_SEED = 42
 """Seed of the split into train and test, as published."""
 EVALUATION_SEED = 777
