@@ -4,9 +4,10 @@ size.
 
 A renderer adds `EPS2D` pixels^2 to the projected variances of each Gaussian, whatever the size of
 the image. Gaussians that fit images of one size are therefore too wide in smaller images, and too
-narrow in larger ones. Here `EPS2D - MIP_EPS2D` pixels^2 are added to the squared scales, with the
-pixels of the images that the Gaussians fit (after Mip-Splatting, https://arxiv.org/abs/2311.16493).
-`Gaussians.pixel_footprint` holds the size of these pixels, and renderers then add only `MIP_EPS2D`.
+narrow in larger ones. Here `EPS2D - MIP_EPS2D` pixels^2 are added to the squared scales. These are
+pixels of the images that the Gaussians were fitted to (after Mip-Splatting,
+https://arxiv.org/abs/2311.16493). `Gaussians.pixel_footprint` holds the size of these pixels, and
+renderers then add at most `MIP_EPS2D`.
 """
 
 import jax.numpy as jnp
@@ -40,8 +41,8 @@ from humangs_jax.rendering.gaussians import (
 
 @checked_arguments
 def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
-    """Returns the avatar in a pose, differentiable in avatar and pose. Affine skinning leaves its
-    linear part in `deformations`.
+    """Returns the avatar in a pose, differentiable in avatar and pose. With affine skinning,
+    `deformations` holds the linear part of the blended transforms.
 
     Args:
         avatar: one person.

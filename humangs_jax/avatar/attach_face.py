@@ -53,15 +53,15 @@ side of its quadrangle.
 """
 LID_LIFT = 0.003
 """The Gaussians of lids are moved out along their normals by this distance, metres, because the
-Gaussians of the eye are about as thick.
+Gaussians of the eye are about that thick.
 """
 EYE = (0.0165, 0.0095, 0.005, 0.03)
 """Four lengths in metres: half of the width and half of the height of the opening between the lids,
 then the range of distances in front of the eye's centre in which Gaussians show the eye.
 """
 SOFT = 0.3
-"""Gaussians outside of the opening belong to the eye in part, until they are this share of the
-opening's radius beyond its edge.
+"""Width of the rim around the opening, as a share of the opening's radius. Across the rim, the
+share by which Gaussians belong to the eye falls from 1 to 0.
 """
 AROUND_EYE = (0.02, 0.045)
 """Range of distances from an eye's centre, metres. Skin within the range gives its color to the

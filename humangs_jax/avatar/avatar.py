@@ -68,8 +68,8 @@ zero.
 """
 ITERATIONS = 10
 TINY = 1e-24
-"""The least squared length by which a normal is divided. It keeps the gradient finite where a
-normal vanishes.
+"""Least squared length of a normal. Before a normal is divided by its length, the squared length is
+raised to this, so that the gradient is finite where the normal vanishes.
 """
 
 
@@ -237,8 +237,8 @@ class Avatar(Batchable):
     joint_names: tuple[str, ...] = static_field()
     """The name of each joint, in their order."""
     skinning: Literal["affine", "rotation"] = static_field(default="affine")
-    """Which part of the blended transform acts on a Gaussian. "affine": the full linear part.
-    "rotation": only the rotation.
+    """What the linear part of the blended transform acts on. "affine": the whole covariance of a
+    Gaussian. "rotation": its quaternion alone, see `skin_gaussians`.
     """
     rendering: Literal["exact", "inria"] = static_field(default="exact")
     """How the Gaussians are splatted: the preset that they were trained for, a name in

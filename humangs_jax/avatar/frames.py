@@ -220,7 +220,7 @@ def shot_cameras(
 
 def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.ndarray, "m 3"]:
     """Returns a path smoothed by a Gaussian kernel with a standard deviation of `frames` frames.
-    Before, the path is extended at both ends, by its reflection in the end point.
+    First the path is extended beyond both ends, by its reflection in the end point.
     """
     frames = min(frames, WIDEST * len(path))
     reach = int(np.ceil(3 * frames))
@@ -277,8 +277,8 @@ def trim_and_resample(
     """Returns a motion from `start` to `stop` (seconds), resampled to another frame rate and
     repeated `loop` times.
 
-    Every repetition starts where the one before has ended, at the same height. Raises: ValueError
-    naming what is out of range.
+    Every repetition starts at the place on the ground where the one before has ended. Heights are
+    repeated as they are. Raises: ValueError naming what is out of range.
     """
     count = len(motion.translations)
     length = count / motion.fps

@@ -273,9 +273,10 @@ def stack_captures(
         these photos, and without light if no world is y-up.
 
     Raises:
-        ValueError: if there is no capture, if one has no view or values that are not finite or out
-            of range, or if the bodies differ. Also if `config` wants light and only some of the
-            worlds are y-up, because in a batch all avatars have a light or none has.
+        ValueError: if there is no capture, if one has no view, none that shows the person, or
+            values that are not finite or out of range, or if the bodies differ. Also if `config`
+            wants light and only some of the worlds are y-up, because in a batch all avatars have a
+            light or none has.
 
     Examples:
         >>> body, views, config = hg.stack_captures(config, captures)

@@ -26,9 +26,9 @@ Frame = Float[np.ndarray, "h w c"] | UInt8[np.ndarray, "h w c"]
 CHANNELS = (3, 4)
 """The numbers of channels that a frame may have: colors, or colors and alpha."""
 CONSTANT_RATE_FACTOR = 17
-"""x264's quality; 18 counts as visually lossless."""
+"""x264's constant rate factor. Lower is better, and 18 counts as visually lossless."""
 VP9_QUALITY = 18
-"""libvpx's constant quality, 0 to 63. 18 is about as good as 18 of x264."""
+"""libvpx's constant quality, 0 to 63. Lower is better, and 18 is about as good as 18 of x264."""
 LARGEST_GIF = 1 << 30
 """The largest size of the frames of a GIF, bytes, with three bytes for each pixel. All frames are
 kept in memory, because one palette is chosen for all.
@@ -350,7 +350,7 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple
 LARGEST_ERROR = 0.25
 """Mean absolute difference of the channels for which the last of `ERROR_COLORS` stands."""
 GAP = 4
-"""White pixels between tiles."""
+"""Width of the white gap between tiles, pixels."""
 TEXT_SHARE = 1 / 14
 """Height of the letters as a share of the width of a tile."""
 SMALLEST_TEXT = 10

@@ -47,20 +47,20 @@ OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 It is its own inverse.
 """
 CAM_FROM_WORLD = "cam_from_world, OpenCV axes"
-"""Convention of matrices that take points of the world to the camera's axes x right, y down, z
-forward.
+"""Convention of matrices that take points of the world to the axes of the camera (x right, y down,
+z forward).
 """
 WORLD_FROM_CAM = "world_from_cam, OpenCV axes"
-"""Convention of matrices that take points from the camera's axes x right, y down, z forward to the
-world.
+"""Convention of matrices that take points from the axes of the camera (x right, y down, z forward)
+to the world.
 """
 CAM_FROM_WORLD_OPENGL = "cam_from_world, OpenGL axes"
-"""Convention of matrices that take points of the world to the camera's axes x right, y up, z
-backward.
+"""Convention of matrices that take points of the world to the axes of the camera (x right, y up, z
+backward).
 """
 WORLD_FROM_CAM_OPENGL = "world_from_cam, OpenGL axes"
-"""Convention of matrices that take points from the camera's axes x right, y up, z backward to the
-world.
+"""Convention of matrices that take points from the axes of the camera (x right, y up, z backward)
+to the world.
 """
 CONVENTIONS = {
     CAM_FROM_WORLD: lambda matrix: matrix,
@@ -100,8 +100,8 @@ class CalibratedCamera:
     lens: str = "pinhole"
     """The kind of the lens, as `geometry.lens` names it."""
     refusal: CaptureError | None = None
-    """The error to raise if photos have to be undistorted, but this package cannot undistort photos
-    of this lens (fisheyes, more than five coefficients). None: it can.
+    """The error to raise if photos of this camera have to be undistorted. It is set if this package
+    cannot undistort them (fisheyes, more than five coefficients). None: it can.
     """
 
 
@@ -150,8 +150,8 @@ class Calibration:
     mask_key: str | None = None
     """The key under which the file names masks; None if it does not."""
     upright: bool = False
-    """Whether the cameras belong to the photos as they look after turning by their EXIF
-    orientation. If False, the sizes of photos and cameras decide this.
+    """Whether the cameras belong to photos that were turned by their EXIF orientation. If False,
+    the sizes of photos and cameras decide this.
     """
     estimated: bool = False
     """Whether the cameras were found from the person."""
@@ -191,8 +191,8 @@ class CalibrationFile:
     path: Path
     """The path of a file, or of the folder where a format has several files."""
     photo_size: Callable[[str], tuple[int, int]]
-    """Returns the width and the height of the photo with a name, for formats that do not have
-    them.
+    """Takes the name of a photo, and returns its width and height, for formats that do not have
+    these.
     """
 
     @functools.cached_property

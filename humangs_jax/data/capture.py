@@ -208,7 +208,8 @@ def capture_from_arrays(
         translations: (m, 3) metres.
         betas: (s,) shape coefficients.
         shape_names: (s,) names of the body's shape directions that betas belong to. None: betas
-            belong to all directions except expressions, or to the first shape directions of SMPL-X.
+            belong to the body's directions that are no expressions, see
+            `capture_checks.shape_coefficients`.
         masks: (v, h, w) in [0, 1], or None.
         frames: (v,) which of the m poses each view shows; may be left out when m is 1.
         names: (v,) names of the views, which are file names without suffix. None: "000", "001" and

@@ -157,7 +157,7 @@ def floats(
     value: Any, file: object, field: str, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "*shape"]:
     """Returns finite float64 numbers, nested in any way, reshaped to `shape` in row-major order.
-    Raises: CaptureError for another count of numbers.
+    Raises: CaptureError for another count of numbers, and if they are not finite.
     """
     array = file_numbers(value, file, field)
     if array.size != np.prod(shape):
@@ -264,8 +264,9 @@ def shape_coefficients(
     is given. Missing ones before it are 0.
 
     Arguments: betas: the coefficients. names: for each of betas, the name of its direction, as in
-    `BodyModel.shape_names`. None: betas belong to SMPL-X's shape directions, or to all of the
-    body's directions except expressions.
+    `BodyModel.shape_names`. None: betas belong to the first of the body's directions that are no
+    expressions. If these are not the directions of SMPL-X, all of them have to be given, or betas
+    have to be 0.
 
     Raises: CaptureError for a coefficient that is not 0 if the body has no such direction, and if
     there is not one name for each coefficient.

@@ -42,7 +42,7 @@ from humangs_jax.geometry.camera import Camera, project
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 EXPOSURE_SIZE = 256
-"""Pixels a side of the crops around the person that are compared."""
+"""Side of the crops around the person that are compared, pixels."""
 FACING = 0.5
 """A photo shows a point where the cosine between normal and ray is at least this."""
 THICKNESS = 0.02
@@ -150,8 +150,8 @@ def calls_of_exposure(capture: Capture) -> Iterator[Call]:
 def gains_of(
     colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the gains of views, found from the colors of common points. All are 1 where the
-    colors hardly differ, or where views have nothing in common.
+    """Returns the gains of views, found from the colors of common points. All are 1 if the colors
+    hardly differ, or if no two views share enough points.
 
     colors: in [0, 1]. seen: which points each view shows.
     """

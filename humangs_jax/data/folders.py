@@ -34,13 +34,13 @@ OTHER_PICTURES = (
     ".ppm",
     ".pgm",
 )
-"""Pictures that are not read, but that somebody may take for photos."""
+"""File types of pictures that are not read, but that somebody may take for photos."""
 RAW_PICTURES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 """File types of raw pictures, which cameras write besides JPEG and which are not read."""
 OTHER_VIDEOS = (".webm", ".mts", ".m2ts", ".3gp", ".wmv", ".mpg")
-"""Videos that are not read."""
+"""File types of videos that are not read."""
 SYSTEM_FOLDERS = ("__MACOSX", "@eaDir")
-"""Folders of previews, which archives of macOS and disks of Synology have."""
+"""Names of folders of previews, which archives of macOS and disks of Synology have."""
 NAMES_SHOWN = 3
 """The number of files of each unused kind that are named."""
 

@@ -56,9 +56,9 @@ Background = Literal["photo", "white"]
 LEAST_UNKNOWN = 0.5
 """Least value of a pixel that is unknown, in an image that marks the unknown pixels."""
 OFF_CENTER = 0.05
-"""K belongs to the photo as turned by its EXIF orientation if the principal point is nearer to the
-middle of the turned photo than to the middle of the stored one by more than this, as a share of a
-side.
+"""K belongs to the photo turned by its EXIF orientation if the principal point is nearer to the
+middle of the turned photo than to the middle of the stored photo. The two distances have to differ
+by more than this, as a share of a side.
 """
 LARGEST_LABEL = 20 / 255
 """A mask with no value above this holds labels (0 and 1, or numbers of parts of a person). It does

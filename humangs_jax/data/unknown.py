@@ -43,7 +43,7 @@ PARTS = ("rows", "cols", "dt", "data")
 KEY = re.compile(r"""^[ \t]*["']?([A-Za-z_][\w .-]*?)["']?[ \t]*[:=]""", re.MULTILINE)
 """A key of JSON, YAML or TOML at the beginning of a line."""
 KEYS_SHOWN = 6
-"""The most keys that an error names."""
+"""Largest number of keys that an error names."""
 
 
 def binary_kind(file: Path) -> str | None:

@@ -15,7 +15,7 @@ from humangs_jax.network.parts import subject_unit
 from humangs_jax.network.reader import project_vertices, visible_vertices
 
 SELECTION_SIZE = 128
-"""Pixels a side of the depth maps: enough to know which side of the body a photo shows."""
+"""Side of the depth maps, pixels. It is enough to know which side of the body a photo shows."""
 SELECTION_VERTICES = 2000
 """The number of vertices of the body on which photos are compared."""
 LEAST_GAIN = 0.03

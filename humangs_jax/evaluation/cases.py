@@ -472,8 +472,8 @@ def choose_method(
     predictions: str | Path | None = None,
     method: Method | None = None,
 ) -> tuple[str, Method]:
-    """Returns the method that is asked for, and its name for reports. The shipped weights are used
-    if nothing is given.
+    """Returns the name, for reports, of the method that is asked for, and the method itself. The
+    shipped weights are used if nothing is given.
 
     Raises: ValueError if more than one is given.
     """

@@ -29,8 +29,8 @@ from humangs_jax.io.arrays import SHORT, checksum, file_checksum
 from humangs_jax.io.reading import read_json, write_json
 
 LONGEST_NAME = 40
-"""The most characters of a person's name in a file name. The name is for readers; the key tells
-people apart.
+"""Largest number of characters of a person's name in a file name. The name is for readers; the key
+tells people apart.
 """
 
 CaseKey = Callable[[Case], str]

@@ -192,7 +192,7 @@ PAGE_IMAGES = 120
 are only rows of its table.
 """
 LISTED = 5
-"""The most missing files that a note names."""
+"""Largest number of missing files that a note names."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

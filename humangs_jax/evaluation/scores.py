@@ -170,8 +170,7 @@ class EvaluationProtocol:
     lpips_crop: Crop | None = None
     """The part of the image that LPIPS compares; None: the same part, `crop`."""
     masked: bool = False
-    """Whether predictions are first cut out by the true mask, which hides errors of the
-    silhouette.
+    """Whether predictions are first cut out by the true mask. This hides errors of the silhouette.
     """
     lpips: tuple[Net, ...] = ("vgg",)
     """The networks of LPIPS."""

@@ -236,9 +236,9 @@ STANDING = -0.5
 this.
 """
 BETTER_TILT = np.radians(10)
-"""Angle, radians. In some files the hips hang on other joints than the pelvis. These joints give
-the rotation of the pelvis if they agree better with the trunk: if their mean angle to it is smaller
-than the mean angle of the pelvis's joint by more than this.
+"""In some files the hips hang on other joints than the pelvis. These joints give the rotation of
+the pelvis if they agree better with the trunk. Their mean angle to the trunk has to be smaller than
+that of the pelvis's joint by more than this, radians.
 """
 LARGEST_BEND = np.radians(60)
 """Largest mean angle between pelvis and lowest spine over the frames, radians. If the angle is
@@ -248,8 +248,8 @@ RATE_ROUNDING = 1e-4
 """Relative error of a frame rate. Some BVH files give the time of a frame in only four digits."""
 
 SHORT_STEPS = 0.1
-"""Share of the steps between keys of a GLB file that have to be shorter than a frame at the mean
-rate of the keys, for a higher rate to be taken.
+"""A higher rate than the mean rate of the keys of a GLB file is taken if at least this share of the
+steps between keys is shorter than a frame at the mean rate.
 """
 FRAMES_A_KEY = 16
 """Largest number of frames for each key, where keys are not evenly spaced."""
@@ -266,8 +266,8 @@ Between two axes, only the one with the larger share has a floor, if the other s
 number and at most half as large.
 """
 TREADMILL = 0.8
-"""Share of the frames. If nothing rests on a floor along either axis, the unusual axis has a floor
-if the lowest joint is at one height in at least this share.
+"""If nothing rests on a floor along either axis, the unusual axis has a floor if the lowest joint
+is at one height in at least this share of the frames.
 """
 MOST_FRAMES = 1000
 """Largest number of pairs of successive frames, evenly spread, in which a floor is looked for."""
@@ -285,8 +285,9 @@ def frame_times(keys: Sequence[Float[np.ndarray, " _"]]) -> tuple[np.ndarray, fl
     """Returns evenly spaced times of frames (m,), seconds, and their rate in frames per second.
 
     The rate is that of the track with most keys. Optimizers leave out keys that lie on a line
-    between others, and animators set few keys: where a share of SHORT_STEPS of the steps between
-    keys are shorter than a frame at that rate, the rate is that of these steps.
+    between others, and animators set few keys. So if at least the share `SHORT_STEPS` of the steps
+    between keys is shorter than a frame at that rate, the rate becomes that of the short steps, but
+    at most `FRAMES_A_KEY` times as high.
 
     keys: increasing times of the keys of each track, seconds. Returns None if tracks have very
     different lengths.

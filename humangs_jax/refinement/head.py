@@ -1,5 +1,5 @@
-"""Refines the head, or another region, alone, by steps on crops of the photos around it: people
-look there for detail.
+"""Refines one region alone, usually the head, by steps on crops of the photos around it. People
+look at the head for detail.
 
 Only Gaussians of the head move. Gaussians around it are drawn, but stay. Colors are compared inside
 of the masks, and alpha beyond a mask costs more than in steps on the whole person, so that little

@@ -108,8 +108,8 @@ class RunLog:
     ) -> None:
         """Logs the metrics of the last step done, with times and rates since the call before.
 
-        done: number of steps done. subjects: number of subjects in a step. waiting: time that the
-        loop has waited for data, seconds. broken: number of capture folders that could not be used.
+        done: number of steps done. subjects: number of subjects in a step. waiting: how long the
+        loop has waited for data so far. broken: number of capture folders that could not be used.
         """
         numbers = {name: float(value) for name, value in metrics.items()}
         before, began, waited = self._previous

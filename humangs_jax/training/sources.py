@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 SYNTHETIC = "humangs_jax.synthetic"
 """Name of the package of synthetic people. A run without synthetic people does not import it."""
 SourceFactory = Callable[[TrainConfig], Source]
-"""Function that takes the configuration of a stage, and returns a source of examples of its
+"""Function that takes the configuration of a stage, and returns a source of examples of the stage's
 sizes.
 """
 

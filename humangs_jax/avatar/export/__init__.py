@@ -28,7 +28,8 @@ class ExportFormat(Format):
     up: Up = "y"
     """The axis that points up for the programs that read this format."""
     mesh: bool = False
-    """Whether the format holds the body as a textured mesh, not Gaussians."""
+    """Whether the format holds the body as a textured mesh, or its motion alone, and no Gaussians.
+    """
     animated: bool = False
     """Whether one file holds all frames of a motion."""
     rest_fields: bool = False

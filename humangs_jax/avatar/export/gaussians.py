@@ -127,7 +127,8 @@ def _matrix(turn: tuple[float, float, float, float]) -> Float[np.ndarray, "3 3"]
 
 def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
     """Returns Gaussians moved along y so that the lowest centre of a seen Gaussian lies on y = 0. A
-    Gaussian is seen if its opacity is at least `SEEN`, or the largest of all if that is less.
+    Gaussian is seen if its opacity is at least `SEEN`. If no opacity is that large, the Gaussians
+    with the largest opacity are seen.
     """
     means, opacities = np.asarray(gaussians.means), np.asarray(gaussians.opacities)
     seen = opacities >= min(SEEN, opacities.max(initial=0.0))
@@ -261,6 +262,7 @@ def save_gaussians(
     Raises:
         ValueError: Another suffix or version, numbers that files cannot hold, or harmonics that the
             format does not hold.
+        OSError: The file cannot be written.
 
     Examples:
         >>> hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply", y_up=True), y_up=True)
@@ -447,6 +449,7 @@ def export(
     Raises:
         ValueError: for another suffix, for a format that cannot hold what is asked for, for numbers
             that files cannot hold, or if `numbers` has not one number for each frame.
+        OSError: if a file cannot be written.
 
     Examples:
         >>> hg.export("person.glb", avatar, hg.load_motion("dance.bvh"), mesh=True)

@@ -47,7 +47,9 @@ from humangs_jax.rendering.mesh.atlas import fill_gaps, texels, unwrap
 from humangs_jax.rendering.mesh.rasterizer import vertex_normals
 
 TEXTURE_SIZE = 1024
-"""Texels along a side, each about 2 mm on an adult. Gaussians are 5 to 10 mm apart."""
+"""Number of texels along a side of the texture. A texel is about 2 mm wide on an adult. Gaussians
+are 5 to 10 mm apart.
+"""
 NEIGHBOURS = 32
 """The number of Gaussians that color a point. They are the ones with the nearest means."""
 CHUNK = 16384
@@ -64,8 +66,8 @@ WEIGHTS = 4
 
 @dataclasses.dataclass(frozen=True)
 class BodyMesh:
-    """A textured mesh in T-pose. A vertex of the body occurs once for each chart of the texture
-    that contains it.
+    """A textured mesh of the body, in T-pose unless `posed` has made it. A vertex of the body
+    occurs once for each chart of the texture that contains it.
     """
 
     vertices: Float[np.ndarray, "u 3"]
@@ -197,7 +199,7 @@ def write_animation(
     path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
 ) -> None:
     """Write a whole motion into one `.glb`, see `write_mesh_glb`. Expressions are written if the
-    avatar's body is known.
+    avatar has a face or if its body is known.
     """
     avatar = faced(avatar)
     write_mesh_glb(path, avatar, body_mesh(avatar), motion, name, up)

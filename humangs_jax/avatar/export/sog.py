@@ -29,7 +29,7 @@ VERSION = 2
 USUAL = "default"
 """The usual `model` of a file; other models are "antialiased" and "2dgs"."""
 LEVELS = 256
-"""The most numbers in a codebook."""
+"""Largest number of entries in a codebook."""
 FIRST_PLACE = 252
 """Alpha of a quaternion whose largest component is w. The next three values are for x, y and z."""
 COLUMNS = 64

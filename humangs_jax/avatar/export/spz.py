@@ -69,14 +69,14 @@ Gaussians farther than 8 m from the origin have fewer.
 COLOR_SCALE = 0.15
 """Factor on the harmonic of degree 0 before it becomes a byte."""
 SCALE_STEPS = 16.0
-"""The number of steps of its byte by which a scale grows by the factor e."""
+"""The byte of a scale grows by this number of steps when the scale grows by the factor e."""
 SCALE_ZERO = 10.0
 """The number that is added to the logarithm of a scale in metres, so that the byte is not
 negative.
 """
 HARMONIC_STEPS = 128.0
-"""The number of steps of its byte by which a harmonic grows by 1. It is also the byte that stands
-for 0.
+"""The byte of a harmonic grows by this number of steps when the harmonic grows by 1. It is also the
+byte that stands for 0.
 """
 QUATERNION_STEPS = 511
 
@@ -228,8 +228,8 @@ def read_spz(data: bytes, notes: list[str]) -> Gaussians:
 
 
 def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header:
-    """Returns the header of a file of `size` bytes. Before, it checks version, degree, and number
-    of Gaussians, and that a file of this size may unpack to the size in the header.
+    """Returns the header of a file of `size` bytes, after checks. They check version, degree, and
+    number of Gaussians, and that a file of this size may unpack to the bytes of so many Gaussians.
 
     start: the first bytes of the file, unpacked. versions: the versions that are read.
 
@@ -252,7 +252,8 @@ def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header
 
 def _of_stream(data: bytes) -> tuple[_Header, list[bytes]]:
     """Returns the header and the six arrays of a file of version 1 to 3. The file is a gzip, or the
-    unpacked content of a gzip. Downloads unpack it if the server declares gzip as their encoding.
+    unpacked content of a gzip. A download unpacks the gzip if the server declares it as an
+    encoding.
     """
     packed = io.BytesIO(data)
     with packed if data.startswith(b"NGSP") else gzip.GzipFile(fileobj=packed) as file:
