@@ -499,7 +499,8 @@ def with_blended_leg_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Av
     changed so that Gaussians keep their places in `pose`, the pose of the first photo. reach: as
     `blend_leg_weights` takes it, metres.
 
-    The shapes of Gaussians are not corrected. Gradients do not pass through the weights.
+    Gaussians whose blended transform collapses keep their weights, see `SMALLEST_VOLUME`. The
+    shapes of Gaussians are not corrected. Gradients do not pass through the weights.
     """
     gaussians, vertices, own = avatar.gaussians, avatar.rest_vertices, avatar.skinning_weights
     per_vertex = len(gaussians.means) // len(vertices)

@@ -124,8 +124,8 @@ class MaskedView:
     high: Float[np.ndarray, "2"]
     """The largest x and y of points in the window that count as inside the photo, (2,), pixels."""
     hidden: Float[np.ndarray, "h w"] | None = None
-    """How much of each pixel or its neighbours somebody in front may hide, (h, w), in [0, 1]. The
-    ends of masks say nothing there. None: nothing is hidden.
+    """The largest share that somebody in front may hide of a pixel or of one of its neighbours, for
+    each pixel, (h, w), in [0, 1]. The ends of masks say nothing there. None: nothing is hidden.
     """
 
     @functools.cached_property

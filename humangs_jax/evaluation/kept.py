@@ -57,8 +57,8 @@ class KeptScores:
     def __call__(
         self, case: Case, score: Callable[[], dict[str, Any]]
     ) -> tuple[dict[str, Any], bool]:
-        """Returns the results of a person, and whether they were read from the folder. Otherwise
-        they are computed by `score`, and kept.
+        """Returns the results of a person, and whether they were read from the folder. If the
+        folder does not have them, `score` computes them, and they are kept.
         """
         key = checksum({}, self._before, case_key(case), self._method(case))
         if self._ordered:

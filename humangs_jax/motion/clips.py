@@ -314,7 +314,8 @@ def _joints(
     """Returns the nodes that are joints, and the matrices of the joints when the skin was bound.
 
     If there are skins, the joints belong to the skin with most joints. Otherwise all nodes are
-    joints. The matrices (4, 4) are by node. The dict is empty if the skin has no matrices.
+    joints. The matrices (4, 4) are by node. The dict is empty if the skin has no matrices, or if it
+    lists a joint twice.
 
     Raises: InvalidFileError for a joint that is no node, or for numbers that are not finite.
     """

@@ -60,7 +60,9 @@ factor.
 EXCESS = 1.0
 """Weight of alpha beyond the mask in the loss."""
 OPAQUE = 0.1
-"""Gaussians of the head with more opacity than this have to lie in the crops."""
+"""Gaussians of the head with more opacity than this have to lie in the crops, except outliers
+(`OUTLIERS`).
+"""
 OUTLIERS = 1.0
 """Percent of the opaque Gaussians of the head that may lie outside of the crops, at each side."""
 FAR = 1e4

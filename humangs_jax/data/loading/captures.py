@@ -231,7 +231,7 @@ class PeopleCache:
     def some_views(self, index: int, views: Sequence[int]) -> StoredSubject:
         """Returns person `index` with only these views, in this order.
 
-        Raises: ValueError naming file and field.
+        Raises: as `StoredPerson.summary`.
         """
         person, name = self.people[index], self.name(index)
         with self._lock:
