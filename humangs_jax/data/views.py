@@ -78,8 +78,8 @@ class SubjectViews:
 
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
-    """Returns `count` views: the given ones, then copies of the last one as padding. Subjects with
-    different numbers of views can thus share a batch. `depths` and `unknown` are not padded.
+    """Returns `count` views: the given ones, then copies of the last one as padding. So subjects
+    with different numbers of views can share a batch. `depths` and `unknown` are not padded.
 
     Raises: ValueError if there are no views, or more than `count`.
     """

@@ -1,5 +1,5 @@
 """Means of scores, first over the images of a frame, then over the frames of a person, then over
-people. Thus a person counts once, however often photographed.
+people. So each person counts once, whatever the number of photos.
 
 Intervals are computed for the mean over people. If there is one person, they are computed over
 frames, and if there is one frame, over images.

@@ -68,7 +68,9 @@ class Clip:
 
 
 def bytes_of_clip(frames: int, joints: int) -> int:
-    """Returns the approximate number of bytes that a clip of so many frames and joints takes."""
+    """Returns the approximate number of bytes that a clip with these numbers of frames and joints
+    takes.
+    """
     return 96 * frames * joints
 
 

@@ -78,7 +78,8 @@ class Crops(NamedTuple):
     """Which Gaussians belong to the head, (g,)."""
     drawn: Int[np.ndarray, " d"]
     """The indices of the Gaussians that are drawn, (d,), ascending. These are all that the crops
-    show, all of the head, and so many others that d is a power of two, or all Gaussians.
+    show, all of the head, and further ones until d is a power of two. If there are not enough, all
+    Gaussians are drawn.
     """
     views: SubjectViews
     """The crops."""

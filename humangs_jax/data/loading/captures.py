@@ -347,9 +347,8 @@ class CaptureSource:
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """The faults found so far. For each person of whom something could not be used, by name,
-        what was first found wrong. If only a photo of a person is wrong, other views are still
-        used.
+        """The first fault that was found in each person so far, by the person's name. If only a
+        photo of a person is wrong, other views are still used.
         """
         return {str(name): problem for name, problem in self.cache.broken.items()}
 
@@ -361,7 +360,7 @@ class CaptureSource:
         return self._found(seed, index, input_count)[1]
 
     def describe(self, seed: int, index: int, input_count: int) -> str:
-        """Returns the name of the person whom the example shows, see `Source`."""
+        """Returns the name of the person that the example shows, see `Source`."""
         return str(self._found(seed, index, input_count)[0])
 
     def unusable(self) -> dict[str, str]:

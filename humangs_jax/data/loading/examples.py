@@ -130,8 +130,8 @@ class Source(Protocol):
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """The faults found so far. For each person of whom something could not be used, by name,
-        what was first found wrong.
+        """The first fault that was found in each person so far, by the person's name. People
+        without a fault are not listed.
         """
         ...
 
@@ -370,8 +370,8 @@ class Mixture:
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """The faults found so far in all sources. For each person of whom something could not be
-        used, by name, what was first found wrong.
+        """The first fault that was found in each person of all sources so far, by the person's
+        name.
         """
         return {name: problem for source in self.sources for name, problem in source.broken.items()}
 
