@@ -12,10 +12,11 @@ With fewer photos, blocks of pixels are held out instead, and there are no trial
 after small moves, see `losses.alignment`, because photos are seldom of one moment.
 """
 
+import collections
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
@@ -260,6 +261,15 @@ class Candidate(NamedTuple):
     """Whether the state is the best so far."""
 
 
+class _Trial(NamedTuple):
+    """A fit that leaves out one photo, which then says whether the fit helps."""
+
+    left_out: int
+    """The index of the photo."""
+    begin: Candidate
+    """The state from which the steps of the trial begin."""
+
+
 def prepare(
     avatar: Avatar, views: SubjectViews, config: RefineConfig, clock: Clock
 ) -> tuple[Task, Candidate, Comparison]:
@@ -412,42 +422,34 @@ def _search_by_photo(
     photos. The fit has the iterations and the steps that helped in the trials. losses: the loss of
     the start on each photo.
     """
-    config, clock, everybody = task.config, task.clock, np.arange(len(losses))
+    clock = task.clock
     # iterations alone need no trial, unless one photo contradicts the others
-    if config.steps == 0 and np.max(losses) < SUSPICIOUS * np.median(losses):
+    if task.config.steps == 0 and np.max(losses) < SUSPICIOUS * np.median(losses):
         clock.planned = 0
-        yield iterated(task, start, everybody)[0]
+        yield iterated(task, start, np.arange(len(losses)))[0]
         return
-    # whether the iterations help: each photo that is asked is left out of one trial
-    asked = [int(view) for view in np.argsort(losses, kind="stable")[:ASKED]]
-    best, trials, ahead = start, dict.fromkeys(asked[:2], start), 0.0
-    choices = ()
-    if config.iterations:
-        choices = everybody, np.delete(everybody, int(np.argmax(losses)))
-    for used in choices:
-        begun, tried = clock.elapsed(), {}
-        if photos_agree(_trial_gains(task, start, used, asked, tried), -ALLOWED_LOSS_OF_ITERATIONS):
-            best, trials = tried[asked[0]]._replace(used=used), tried
-            # iterations with all photos are still to come
-            ahead = (clock.elapsed() - begun) / len(tried) * len(used) / (len(used) - 1)
-            break
+
+    # whether the iterations help, and on which photos
+    best, trials, ahead = _iterations_that_help(task, start, losses)
     used = best.used
     if best.iterations:
         yield best
 
-    # how many of the steps help: the steps of the trial are shared by the photos that were asked
-    total = clock.plan(lambda: stepped(task, best.state, used[used != asked[0]][0]), ahead)
+    # how many of the steps help: the trials continue with an equal number of steps each
+    first_photo = used[used != trials[0].left_out][0]
+    total = clock.plan(lambda: stepped(task, best.state, first_photo), ahead)
     length = round(TRIAL * total / len(trials))
-    gains: dict[float, list[float]] = {}
-    for number, (view, begin) in enumerate(trials.items()):
-        before = psnr_of(task, begin, [task.given[view]])
+    gains = collections.defaultdict(list)
+    for number, (left_out, begin) in enumerate(trials):
+        before = psnr_of(task, begin, [task.given[left_out]])
         shown = TRIAL * number / len(trials), TRIAL * (number + 1) / len(trials)
-        for found in steps(task, begin, used[used != view], length, length, shown):
-            gain = psnr_of(task, found, [task.given[view]]) - before
-            gains.setdefault(int(found.state.done) / length, []).append(gain)
+        for found in steps(task, begin, used[used != left_out], length, length, shown):
+            gain = psnr_of(task, found, [task.given[left_out]]) - before
+            gains[int(found.state.done)].append(gain)
             yield found._replace(kept=False)
-    helpful = [share for share, each in gains.items() if np.mean(each) > -ALLOWED_LOSS]
-    share = max(helpful, default=0.0 if length else 1.0)
+    share = _share_that_helps(gains, length)
+
+    # the fit to all photos, with what helped
     begin = start
     if best.iterations:
         begin, _ = iterated(task, start, used)
@@ -456,21 +458,65 @@ def _search_by_photo(
     yield from steps(task, begin, used, left, round(share * left), (TRIAL, 1.0))
 
 
-def _trial_gains(
-    task: Task,
-    start: Candidate,
-    used: Int[np.ndarray, " n"],
-    asked: Sequence[int],
-    tried: dict[int, Candidate],
-) -> Iterator[float]:
-    """Yields the decibels that each photo in `asked` gains by iterations on the other photos of
-    `used`. The state after these iterations is stored in `tried` under the photo's number.
+def _iterations_that_help(
+    task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
+) -> tuple[Candidate, list[_Trial], float]:
+    """Returns whether and where the learned update helps: a state, trials, and seconds.
+
+    The state comes from the first trial, and its `used` are the photos on which the update helps.
+    The steps continue the trials. The update on all of `used` will take the seconds.
+
+    The update is tried on all photos, then without the photo of the largest loss. If neither helps,
+    or if there are no iterations, the state is the start, two trials begin at the start, and the
+    seconds are 0.
     """
-    for view in asked:
-        photo = [task.given[view]]
-        before = psnr_of(task, start, photo)
-        tried[view], _ = iterated(task, start, used[used != view])
-        yield psnr_of(task, tried[view], photo) - before
+    asked = [int(view) for view in np.argsort(losses, kind="stable")[:ASKED]]
+    all_photos = np.arange(len(losses))
+    choices = []
+    if task.config.iterations:
+        choices = [all_photos, np.delete(all_photos, int(np.argmax(losses)))]
+    for used in choices:
+        began = task.clock.elapsed()
+        trials = _trials_of_iterations(task, start, used, asked)
+        if trials:
+            # a trial has one photo fewer than the update that is still to come
+            seconds_of_trial = (task.clock.elapsed() - began) / len(trials)
+            ahead = seconds_of_trial * len(used) / (len(used) - 1)
+            return trials[0].begin._replace(used=used), trials, ahead
+    return start, [_Trial(view, start) for view in asked[:2]], 0.0
+
+
+def _trials_of_iterations(
+    task: Task, start: Candidate, used: Int[np.ndarray, " n"], asked: Sequence[int]
+) -> list[_Trial]:
+    """Returns trials of the learned update on the photos `used`; none if the update does not help.
+    Each trial leaves out one of the photos `asked`, until it is certain whether the update helps.
+    """
+    trials = []
+
+    def gains() -> Iterator[float]:
+        """Yields the decibels that each photo gains when it is left out."""
+        for view in asked:
+            before = psnr_of(task, start, [task.given[view]])
+            found, _ = iterated(task, start, used[used != view])
+            trials.append(_Trial(view, found))
+            yield psnr_of(task, found, [task.given[view]]) - before
+
+    if photos_agree(gains(), -ALLOWED_LOSS_OF_ITERATIONS):
+        return trials
+    return []
+
+
+def _share_that_helps(gains: Mapping[int, Sequence[float]], length: int) -> float:
+    """Returns the largest share of the steps that helps, in [0, 1]; 1 if no step was tried.
+
+    gains: the decibels that the photos have gained after a number of steps of the trials, by this
+    number. length: the number of steps of a trial.
+    """
+    if length == 0:
+        return 1.0
+    helpful = [done for done, each in gains.items() if np.mean(each) > -ALLOWED_LOSS]
+    return max(helpful, default=0) / length
 
 
 def steps(
