@@ -13,7 +13,7 @@ silhouette, in the view and in all views, have an edge where it would move and n
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -100,6 +100,29 @@ class _Shift(NamedTuple):
     unit: float = 1.0
     votes: tuple[int, int] = (0, 0)
     thin: float = 0.0
+
+
+class _Seen(NamedTuple):
+    """What a photo shows at points along the silhouette.
+
+    values: the colors of the points, (n, 3), or how much their colors change, (n,). counts: whether
+    a point counts, (n,).
+    """
+
+    values: np.ndarray
+    counts: np.ndarray
+
+
+class _Edge(NamedTuple):
+    """The strongest edge of a sector.
+
+    depth: how far inside of the silhouette it is, pixels. change: the mean change of colors across
+    it. clear: whether colors change much less at most other depths.
+    """
+
+    depth: float
+    change: float
+    clear: bool
 
 
 def masks_at_edges(
@@ -227,71 +250,121 @@ def _sector_votes(
     white.
     """
     distances = signed_distance(mask)
-    # points on the end of the mask, with the direction inwards, in sectors around the middle
+    # points on the end of the mask, with the direction inwards
     normal = np.stack(np.gradient(ndimage.gaussian_filter(distances, 1.0)))
     pixels = np.nonzero(np.abs(distances) < 0.5)
     if not len(pixels[0]):
         return 0, 0
     normal = normal[:, *pixels] / np.maximum(np.linalg.norm(normal[:, *pixels], axis=0), 1e-6)
     points = np.stack(pixels) - distances[pixels] * normal
+    # sectors have equal numbers of points, by their angles about the middle
     angles = np.arctan2(*(points - points.mean(axis=1, keepdims=True)))
     count = max(1, min(SECTORS, len(angles) // SECTOR_POINTS))
     sectors = np.argsort(np.argsort(angles)) * count // len(angles)
 
-    def colors(depth):
-        """Returns the colors `depth` pixels inside of the points, and which of them count. Colors
-        beyond the middle of a limb or outside of the image do not count.
-        """
-        at = points + depth * normal
+    def colors(depth: float) -> _Seen:
+        """Returns the colors `depth` pixels inside of the points."""
+        return _colors_at(image, distances, points + depth * normal, depth)
 
-        def sample(values):
-            return ndimage.map_coordinates(values, at, order=1, mode="nearest")
-
-        seen = (np.abs(sample(distances) - depth) < 0.75) & (at >= 0).all(axis=0)
-        seen &= (at <= np.subtract(mask.shape, 1)[:, None]).all(axis=0)
-        return np.stack([sample(image[..., c]) for c in range(3)], axis=-1), seen
-
-    def change(one, other):
-        return np.linalg.norm(one[0] - other[0], axis=-1), one[1] & other[1]
-
-    # how much colors change across each depth: the highest change in a sector is its edge
-    steps = np.arange(-REACH, REACH + STEP / 2, STEP) * unit
-    line = [colors(depth) for depth in [steps[0] - STEP * unit, *steps, steps[-1] + STEP * unit]]
-    profile = np.zeros((count, len(steps)))
-    for i, (one, other) in enumerate(zip(line, line[2:], strict=False)):
-        size, seen = change(one, other)
-        total = np.bincount(sectors[seen], size[seen], count)
-        profile[:, i] = total / np.maximum(np.bincount(sectors[seen], minlength=count), 1)
-    best, highest = steps[np.argmax(profile, axis=1)], profile.max(axis=1)
-    clear = highest >= 2 * np.median(profile, axis=1)
-
-    # across the mask's end, and twice beside it on the side where there is no edge if the mask is
-    # off
+    edges = _sector_edges(colors, sectors, count, unit)
+    # on both sides of the mask's end, then two steps farther, where a mask that is off has no edge
     lag = min(unit, max(abs(whole) - CLEAR, 0.5))
-    beside = [colors(-np.sign(whole) * lag * i) for i in (-1, 1, 3, 5)]
-    (across, over), *textures = [change(one, other) for one, other in itertools.pairwise(beside)]
-    # a sector votes if its edge stands out from the texture beside it
-    votes = [0, 0]
-    for sector in range(count):
-        chosen = over & (sectors == sector)
-        if 2 * chosen.sum() < SECTOR_POINTS or all(
-            np.median(x[chosen].min(axis=-1)) >= WHITE for x, _ in beside[:2]
-        ):
+    ends = [colors(-np.sign(whole) * lag * i) for i in (-1, 1, 3, 5)]
+    return _votes(edges, ends, sectors, whole, unit)
+
+
+def _colors_at(
+    image: Float[np.ndarray, "h w 3"],
+    distances: Float[np.ndarray, "h w"],
+    places: Float[np.ndarray, "2 n"],
+    depth: float,
+) -> _Seen:
+    """Returns the colors at places (rows, columns) that should be `depth` pixels inside of the
+    silhouette. Places beyond the middle of a limb or outside of the image do not count.
+
+    distances: see `signed_distance`.
+    """
+
+    def sample(values: Float[np.ndarray, "h w"]) -> Float[np.ndarray, " n"]:
+        return ndimage.map_coordinates(values, places, order=1, mode="nearest")
+
+    last_pixel = np.subtract(distances.shape, 1)[:, None]
+    framed = ((places >= 0) & (places <= last_pixel)).all(axis=0)
+    before_middle = np.abs(sample(distances) - depth) < 0.75
+    colors = np.stack([sample(image[..., channel]) for channel in range(3)], axis=-1)
+    return _Seen(colors, before_middle & framed)
+
+
+def _change(one: _Seen, other: _Seen) -> _Seen:
+    """Returns how much the colors of each point differ. A point counts if it does in both."""
+    return _Seen(np.linalg.norm(one.values - other.values, axis=-1), one.counts & other.counts)
+
+
+def _sector_edges(
+    colors: Callable[[float], _Seen], sectors: Int[np.ndarray, " n"], count: int, unit: float
+) -> list[_Edge]:
+    """Returns the edge of each of the `count` sectors: where colors change most from one step
+    outside of a depth to one step inside of it.
+
+    colors: returns the colors of the points at a depth, pixels. sectors: the sector of each point,
+    (n,), from 0.
+    """
+    depths = np.arange(-REACH, REACH + STEP / 2, STEP) * unit
+    line = [colors(depths[0] - STEP * unit)]
+    line += [colors(depth) for depth in depths]
+    line += [colors(depths[-1] + STEP * unit)]
+    profile = np.zeros((count, len(depths)))
+    for i in range(len(depths)):
+        change = _change(line[i], line[i + 2])  # line[i + 1] is at the depth
+        own = sectors[change.counts]
+        total = np.bincount(own, change.values[change.counts], count)
+        profile[:, i] = total / np.maximum(np.bincount(own, minlength=count), 1)
+    edges = []
+    for changes in profile:
+        highest = changes.max()
+        edges.append(_Edge(depths[changes.argmax()], highest, highest >= 2 * np.median(changes)))
+    return edges
+
+
+def _votes(
+    edges: Sequence[_Edge],
+    ends: Sequence[_Seen],
+    sectors: Int[np.ndarray, " n"],
+    whole: float,
+    unit: float,
+) -> tuple[int, int]:
+    """Returns the numbers of sectors for and against a move, see `_sector_votes`.
+
+    edges: the edge of each sector. ends: the colors on both sides of the mask's end, then at two
+    more depths beside it. sectors: the sector of each point, (n,).
+    """
+    across, *textures = [_change(one, other) for one, other in itertools.pairwise(ends)]
+    votes_for = votes_against = 0
+    for sector, edge in enumerate(edges):
+        own = sectors == sector
+        # where both sides are white, or too few points count, the photo says nothing
+        counted = across.counts & own
+        if 2 * counted.sum() < SECTOR_POINTS:
             continue
-        texture = np.concatenate([size[seen & (sectors == sector)] for size, seen in textures])
+        if all(np.median(side.values[counted].min(axis=-1)) >= WHITE for side in ends[:2]):
+            continue
+
+        # there is an edge at the mask's end if it stands out from the texture beside it
+        texture = np.concatenate([beside.values[beside.counts & own] for beside in textures])
         least = np.inf
         if len(texture):
-            least = (1 + OF_TEXTURE) * np.median(texture) + EDGE * highest[sector]
-        ends = abs(whole) >= SEEN_APART and np.median(across[chosen]) > least
-        if ends or clear[sector]:
-            votes[
-                bool(
-                    ends
-                    or abs(best[sector] - whole) > SEEN_APART * unit
-                    or abs(best[sector]) <= LEAST
-                )
-            ] += 1
-    return votes[0], votes[1]
+            least = (1 + OF_TEXTURE) * np.median(texture) + EDGE * edge.change
+        at_end = abs(whole) >= SEEN_APART and np.median(across.values[counted]) > least
+
+        if not (at_end or edge.clear):
+            continue
+        elsewhere = abs(edge.depth - whole) > SEEN_APART * unit
+        too_near = abs(edge.depth) <= LEAST
+        if at_end or elsewhere or too_near:
+            votes_against += 1
+        else:
+            votes_for += 1
+    return votes_for, votes_against
 
 
 def _thin_parts(mask: Float[np.ndarray, "h w"], excess: float) -> float:
