@@ -10,6 +10,7 @@ be little of the mask beside the body near a hole: it would be an arm or a leg w
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -64,6 +65,22 @@ SHOWN = 0.3
 """The mask has to show more than this share of the body's silhouette. If not, most of the body
 would be a guess, and no holes are looked for.
 """
+
+
+class _Photo(NamedTuple):
+    """A photo of at most `LONGEST` pixels, with the silhouette of the posed body. Its arrays are
+    (h, w).
+
+    mask: where the person is seen. known: where the photo says something. body: the silhouette.
+    beside: the part of the mask that is farther than `LOOSE` from the silhouette. per_metre: pixels
+    per metre at the median depth of the body.
+    """
+
+    mask: np.ndarray
+    known: np.ndarray
+    body: np.ndarray
+    beside: np.ndarray
+    per_metre: float
 
 
 def with_hidden_parts(capture: Capture) -> Capture:
@@ -130,10 +147,27 @@ def hidden_parts(capture: Capture) -> Bool[np.ndarray, "v h w"] | None:
 def _hidden_part(
     capture: Capture, view: int, vertices: Float[np.ndarray, "n 3"], faces: np.ndarray
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns `hidden_parts` of one photo. vertices: the vertices of the posed body, (n, 3),
-    metres.
+    """Returns `hidden_parts` of one photo. vertices: those of the posed body, (n, 3), metres."""
+    assert capture.masks is not None
+    height, width = capture.masks.shape[1:]
+    nowhere = np.zeros((height, width), bool)
+    photo = _reduced_photo(capture, view, vertices, faces)
+    if photo is None or not _shows_body(photo):
+        return nowhere
+    hole = _holes(photo)
+    if not hole.any():
+        return nowhere
+    return resized(_with_rim(hole, photo).astype(np.float32), width, height) > MASK_THRESHOLD
+
+
+def _reduced_photo(
+    capture: Capture, view: int, vertices: Float[np.ndarray, "n 3"], faces: np.ndarray
+) -> _Photo | None:
+    """Returns a photo with the silhouette of the posed body; None if a part of the body is not
+    before the camera, or if no part is in the photo. vertices: see `_hidden_part`.
     """
     assert capture.masks is not None
+    # the photo is reduced to `LONGEST`, and its camera with it
     height, width = capture.masks.shape[1:]
     scale = min(1.0, LONGEST / max(height, width))
     columns, rows = max(1, round(scale * width)), max(1, round(scale * height))
@@ -141,44 +175,64 @@ def _hidden_part(
     known = np.ones_like(mask)
     if capture.unknown is not None:
         known = resized(capture.unknown[view].astype(np.float32), columns, rows) == 0
-    nowhere = np.zeros((height, width), bool)
-
-    # the silhouette of the body, if all of it is before the camera
     K = np.asarray(capture.cameras.K, float)[view] * [[columns / width], [rows / height], [1]]
-    matrix = np.asarray(capture.cameras.cam_from_world, float)[view]
-    seen = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-    if seen[:, 2].min() <= 0:
-        return nowhere
-    pixels = (seen / seen[:, 2:] @ K.T)[:, :2]
-    per_metre = float(np.sqrt(K[0, 0] * K[1, 1]) / np.median(seen[:, 2]))
-    body = silhouette(pixels, faces, mask.shape) > 0
-    outside = np.inf
-    if body.any():
-        outside = ndimage.distance_transform_edt(~body)
-    beside = mask & (outside > LOOSE * per_metre)
-    on_body = (mask & body).sum()
-    if beside.sum() > (1 - AGREES) * mask.sum() or on_body <= SHOWN * (body & known).sum():
-        return nowhere
 
-    # holes that are thick, large and well inside, and what is connected to them up to the edge
-    depth = ndimage.distance_transform_edt(np.pad(body, 1, mode="edge"))[1:-1, 1:-1]
-    missing = ~mask & known
-    core = _opened(missing & (depth > INSIDE * per_metre), THICK * per_metre)
-    labels, count = ndimage.label(missing & (depth > EDGE * per_metre))
-    hole = np.zeros_like(mask)
+    # the silhouette of the body
+    cam_from_world = np.asarray(capture.cameras.cam_from_world, float)[view]
+    seen = vertices @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
+    depths = seen[:, 2:]
+    if depths.min() <= 0:
+        return None
+    pixels = (seen / depths @ K.T)[:, :2]
+    body = silhouette(pixels, faces, mask.shape) > 0
+    if not body.any():
+        return None
+
+    per_metre = float(np.sqrt(K[0, 0] * K[1, 1]) / np.median(depths))
+    outside = ndimage.distance_transform_edt(~body)
+    beside = mask & (outside > LOOSE * per_metre)
+    return _Photo(mask, known, body, beside, per_metre)
+
+
+def _shows_body(photo: _Photo) -> bool:
+    """Returns whether the mask agrees with the body (`AGREES`) and shows enough of it (`SHOWN`)."""
+    if photo.beside.sum() > (1 - AGREES) * photo.mask.sum():
+        return False
+    shown = photo.mask & photo.body
+    could_be_shown = photo.body & photo.known
+    return bool(shown.sum() > SHOWN * could_be_shown.sum())
+
+
+def _holes(photo: _Photo) -> Bool[np.ndarray, "h w"]:
+    """Returns the pixels of holes in the mask that are thick, large and well inside of the body,
+    and what is connected to them up to the edge.
+    """
+    per_metre = photo.per_metre
+    # the border of the photo is not an edge of the body
+    inside = ndimage.distance_transform_edt(np.pad(photo.body, 1, mode="edge"))[1:-1, 1:-1]
+    missing = ~photo.mask & photo.known
+    core = _opened(missing & (inside > INSIDE * per_metre), THICK * per_metre)
+    labels, count = ndimage.label(missing & (inside > EDGE * per_metre))
+
+    hole = np.zeros_like(photo.mask)
     for label in range(1, count + 1):
         part = labels == label
         area = int((part & core).sum())
         if area < AREA * per_metre**2:
             continue
-        around = ndimage.distance_transform_edt(~part) < NEARBY * per_metre
-        if (beside & around).sum() <= BESIDE * area:
+        # a limb of the person that the body has elsewhere would be seen beside the body
+        nearby = ndimage.distance_transform_edt(~part) < NEARBY * per_metre
+        if (photo.beside & nearby).sum() <= BESIDE * area:
             hole |= part
-    if not hole.any():
-        return nowhere
+    return hole
+
+
+def _with_rim(hole: Bool[np.ndarray, "h w"], photo: _Photo) -> Bool[np.ndarray, "h w"]:
+    """Returns the holes enlarged by `RIM`, but on the mask only by `INTO_MASK`."""
     away = ndimage.distance_transform_edt(~hole)
-    hidden = (away < RIM * per_metre) & (~mask | (away < INTO_MASK * per_metre))
-    return resized(hidden.astype(np.float32), width, height) > MASK_THRESHOLD
+    in_rim = away < RIM * photo.per_metre
+    at_hole = away < INTO_MASK * photo.per_metre
+    return in_rim & (~photo.mask | at_hole)
 
 
 def _opened(where: Bool[np.ndarray, "h w"], radius: float) -> Bool[np.ndarray, "h w"]:
