@@ -299,30 +299,48 @@ def _farthest(
     rays: Float[np.ndarray, "r 3"],
 ) -> sparse.csr_array:
     """Returns the last point of a surface along each horizontal ray, in barycentric coordinates: a
-    matrix (r, n) of weights of the vertices (Moller and Trumbore 1997).
+    matrix (r, n) of weights of the vertices.
+
+    A ray meets the triangle (v0, v1, v2) where origin + t ray = (1 - u - v) v0 + u v1 + v v2. By
+    Cramer's rule
+
+        t = (qvec . edge2) / det,    u = (pvec . tvec) / det,    v = (qvec . ray) / det,
+
+    with edge1 = v1 - v0, edge2 = v2 - v0, tvec = origin - v0, pvec = ray x edge2,
+    qvec = tvec x edge1 and det = pvec . edge1.
+
+    Names as in the paper: Moller and Trumbore 1997, "Fast, minimum storage ray-triangle
+    intersection", https://doi.org/10.1080/10867651.1997.10487468.
 
     Raises: ValueError where a ray does not meet the surface.
     """
+    # only triangles at the height of the rays can be met
     heights = vertices[faces, 1]
     faces = faces[(heights.min(axis=1) <= origin[1]) & (heights.max(axis=1) >= origin[1])]
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    u, v = b - a, c - a
-    across = np.cross(rays[:, None], v)
-    determinant = (across * u).sum(-1)
-    scale = 1 / np.where(np.abs(determinant) < 1e-15, np.inf, determinant)
-    start = origin - a
-    turned = np.cross(start, u)
-    beta, gamma = (across * start).sum(-1) * scale, rays @ turned.T * scale
-    distance = (turned * v).sum(-1) * scale
-    hit = (beta >= -1e-6) & (gamma >= -1e-6) & (beta + gamma <= 1 + 1e-6) & (distance > 0)
+
+    # t, u and v of each ray and triangle, (r, f)
+    v0, v1, v2 = np.moveaxis(vertices[faces], 1, 0)
+    edge1, edge2 = v1 - v0, v2 - v0
+    pvec = np.cross(rays[:, None], edge2)
+    det = (pvec * edge1).sum(-1)
+    # a ray parallel to a triangle has t = 0, so it does not meet it
+    inv_det = 1 / np.where(np.abs(det) < 1e-15, np.inf, det)
+    tvec = origin - v0
+    u = (pvec * tvec).sum(-1) * inv_det
+    qvec = np.cross(tvec, edge1)
+    v = rays @ qvec.T * inv_det
+    t = (qvec * edge2).sum(-1) * inv_det
+    hit = (u >= -1e-6) & (v >= -1e-6) & (u + v <= 1 + 1e-6) & (t > 0)
     if not hit.any(axis=1).all():
         raise ValueError(
             "body: expected legs whose skin is around the lines from hip to knee to ankle"
         )
-    rows = np.arange(len(rays))
-    face = np.argmax(np.where(hit, distance, -np.inf), axis=1)
-    beta, gamma = beta[rows, face], gamma[rows, face]
-    weights = np.stack([1 - beta - gamma, beta, gamma], axis=1)
+
+    # each ray's farthest triangle, and its vertices' weights
+    ray = np.arange(len(rays))
+    last = np.argmax(np.where(hit, t, -np.inf), axis=1)
+    u, v = u[ray, last], v[ray, last]
+    weights = np.stack([1 - u - v, u, v], axis=1)
     return sparse.csr_array(
-        (weights.ravel(), (rows.repeat(3), faces[face].ravel())), (len(rays), len(vertices))
+        (weights.ravel(), (ray.repeat(3), faces[last].ravel())), (len(rays), len(vertices))
     )
