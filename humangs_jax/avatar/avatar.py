@@ -319,8 +319,7 @@ class Avatar(Batchable):
 
         Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and for
         Gaussians with deformations, because an avatar in T-pose has none; FileError if `load` would
-        refuse the arrays of the Gaussians, the body or the light, for example for numbers that are
-        not finite; OSError.
+        refuse the joints or an array, for example for numbers that are not finite; OSError.
         """
         require_concrete("Avatar.save", "writes a file", self)
         # a file holds one avatar in the T-pose
@@ -358,11 +357,13 @@ class Avatar(Batchable):
             name: np.asarray(x if name == "faces" else at_least_float32(x))
             for name, x in values.items()
         }
-        if self.face is not None:
-            values |= _face_arrays(self.face)
+        of_face = {} if self.face is None else _face_arrays(self.face)
         # files that `load` would refuse are not written
         with reading(path, "avatar"):
+            check_joints(self.parents, self.joint_names)
             _check_arrays(values, len(self.parents))
+            _read_face(of_face, values)
+        values |= of_face
         write_npz(path, {"header": json.dumps(header | {"checksum": checksum(values)})} | values)
 
     @classmethod

@@ -66,12 +66,8 @@ def check_video(
             "path",
             f"{path}: {suffix} has no transparency: expected {others} for PNG files, or a color",
         )
-    if suffix == ".gif" and frames * width * height * 3 > LARGEST_GIF:
-        raise ArgumentError(
-            "path",
-            f"{path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or"
-            " .webm",
-        )
+    if suffix == ".gif":
+        _check_gif(path, frames, width, height)
     # what is there already
     if suffix and path.is_dir():
         raise ArgumentError("path", f"{path}: is a folder: expected a file name")
@@ -311,12 +307,31 @@ def _commonest(pixels: np.ndarray) -> tuple[int, int, int]:
     return common >> 16, common >> 8 & 255, common & 255
 
 
+def _check_gif(path: Path, frames: int, width: int, height: int) -> None:
+    """Raises ArgumentError if the frames of a GIF would not fit into memory."""
+    if frames * width * height * 3 > LARGEST_GIF:
+        raise ArgumentError(
+            "path",
+            f"{path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or"
+            " .webm",
+        )
+
+
 def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
-    """Write a GIF, with one palette for all frames."""
+    """Write a GIF, with one palette for all frames.
+
+    Raises: ArgumentError if the frames do not fit into memory.
+    """
     from PIL import Image
 
+    # of too many frames a second, every second or third
     step = int(np.ceil(fps / LARGEST_GIF_FPS))
-    kept, fps = [to_uint8(frame) for i, frame in enumerate(frames) if i % step == 0], fps / step
+    fps /= step
+    kept: list[np.ndarray] = []
+    for i, frame in enumerate(frames):
+        if i % step == 0:
+            kept.append(to_uint8(frame))
+            _check_gif(path, len(kept), shape[1], shape[0])
     chosen = np.unique(np.linspace(0, len(kept) - 1, PALETTE_FRAMES).round().astype(int))
     # one palette for all frames: with one each, still surfaces flicker
     sampled = np.concatenate([kept[i] for i in chosen])

@@ -174,6 +174,14 @@ def test_an_avatar_without_a_face_says_how_it_gets_one(someone):
         animate(plain, pose_with(avatar, body))
 
 
+def test_no_face_is_written_that_could_not_be_read(someone, tmp_path):
+    avatar = someone[2]
+    wrong = replace(avatar, face=replace(avatar.face, eyes=avatar.face.eyes.at[0, 0].set(jnp.nan)))
+    with pytest.raises(FileError, match="face_eyes: expected numbers in"):
+        wrong.save(tmp_path / "a.npz")
+    assert not any(tmp_path.iterdir())
+
+
 def test_files_of_avatars_hold_the_face(someone, tmp_path):
     _, _, avatar = someone
     avatar.save(tmp_path / "a.npz")

@@ -5,6 +5,7 @@ import weakref
 import numpy as np
 import pytest
 
+from humangs_jax.avatar import video
 from humangs_jax.avatar.video import check_video, video_size, write_video
 from humangs_jax.io.images import read_image
 
@@ -151,6 +152,15 @@ def test_png_files_of_an_earlier_video_are_replaced_and_others_stay(tmp_path):
         "frame_00001.png",
         "notes.txt",
     ]
+
+
+def test_a_gif_that_does_not_fit_into_memory_ends_with_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "LARGEST_GIF", 3 * 64 * 64 * 3)
+    frames = np.zeros((4, 64, 64, 3))
+    write_video(tmp_path / "a.gif", frames[:3], 24)
+    with pytest.raises(ValueError, match=r"4 frames of 64 x 64 are too many for a .gif"):
+        write_video(tmp_path / "b.gif", iter(frames), 24)
+    assert [file.name for file in tmp_path.iterdir()] == ["a.gif"]
 
 
 def test_what_cannot_be_written_is_refused_before_it_is_drawn(tmp_path):
