@@ -5,6 +5,10 @@ traces and lowers each function again, which takes longer than reading its progr
 the decorator `compiled` finds its program by its name, the shapes of its arguments, its static
 arguments and the source of the package, and is not traced at all.
 
+Programs that JAX's own cache had are not written, because XLA cannot write what it has read. So
+after an edit of the source, functions whose programs have not changed are traced in each process. A
+new version of the package begins with an empty cache, and keeps all programs again.
+
 Only the console script does this (`core.processes.keep_programs`), on a CPU. Elsewhere `compiled`
 is `jax.jit`: a notebook may change a function of the package while it runs, which the source does
 not show.
