@@ -91,10 +91,11 @@ def _shipped() -> dict[str, np.ndarray]:
 
 
 def _read_face(path: str | Path) -> dict[str, np.ndarray]:
-    """Returns the arrays of a face file by key, and `rows`, (offsets, 2): the vertex and the shape
-    of each offset.
+    """Returns the arrays of a face file by key. The key `rows` is added: the vertex and the shape
+    of each offset, (offsets, 2).
 
-    Raises: FileNotFoundError; ValueError, which names the key.
+    Raises: FileNotFoundError; ValueError, which names the file, and the key if an array is missing
+    or wrong.
     """
     with reading(path, "face file"):
         arrays, _ = read_npz(path)

@@ -1,7 +1,7 @@
 """Names and parents of SMPL-X's 55 joints, which the shipped body shares."""
 
 DEFAULT_FPS = 30.0
-"""Frames per second of a motion whose file says none."""
+"""Frames per second of a motion if its file has no frame rate."""
 
 
 BODY_NAMES = (

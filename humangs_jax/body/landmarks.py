@@ -377,8 +377,8 @@ def _grouped(names: tuple[str, ...], placed: Sequence[str]) -> tuple[PlacedLandm
 
 
 def _regressed(body: BodyModel, values: Float[Array, "n *b"]) -> Float[Array, "j *b"]:
-    """Returns a quantity at the joints, (j, ...), from its values at the vertices, (n, ...). It has
-    to be linear in the vertices.
+    """Returns a quantity at the joints, (j, ...), from its values at the vertices, (n, ...). The
+    quantity has to be linear in the vertices.
     """
     return jnp.einsum("jn,n...->j...", body.joint_regressor, values, precision=EXACT)
 

@@ -192,8 +192,8 @@ def save_body(path: str | Path, body: BodyModel) -> None:
 def read_body(path: str | Path) -> BodyModel:
     """Returns the body model that `save_body` wrote.
 
-    Raises: FileNotFoundError; ValueError, which names the file and the key, if the file is
-    something else.
+    Raises: FileNotFoundError; ValueError, which names the file, if the file is no body file or is
+    damaged. If an array is missing or wrong, it also names the key.
     """
     with reading(path, "body file"):
         arrays, pickled = read_npz(path)

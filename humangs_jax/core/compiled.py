@@ -153,7 +153,7 @@ class Compiled(Generic[T]):
 
     def _call(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> "_Call | None":
         """Returns the arguments of a call apart from the static ones, and what its program depends
-        on. None if programs are not kept, or not those of such arguments.
+        on. None if programs are not kept, or if an argument is neither an array nor a number.
         """
         folder = _folder()
         # under these settings JAX calls the function itself, to find faults
@@ -292,7 +292,9 @@ class _Call:
     kwargs: dict[str, Any]
     """Keyword arguments that are not static."""
     key: tuple[Any, ...]
-    """What the program depends on: the tree, the shapes of its leaves, the static arguments."""
+    """What the program depends on: the tree, the shapes of its leaves, the static arguments, and
+    the values of `SETTINGS`.
+    """
 
 
 def _stands_alone(program: str) -> bool:
@@ -304,8 +306,8 @@ def _stands_alone(program: str) -> bool:
 
 
 def _shape(leaf: Any) -> tuple[Any, ...] | None:
-    """Returns shape, type and kind of an argument. None for arrays on several devices and for what
-    is no array.
+    """Returns the shape and the type of an array, and whether the type is weak. For a number of
+    Python, returns the name of its class. None for any other argument.
     """
     if isinstance(leaf, jax.Array | jax.ShapeDtypeStruct):
         weak = getattr(leaf, "weak_type", False)  # keys of random numbers have none

@@ -15,9 +15,9 @@ from humangs_jax.core.array_types import PyTree
 
 T = TypeVar("T", bound=PyTree)
 PIXELS_AT_ONCE = 1 << 22
-"""Number of pixels that an accelerator works on side by side for one subject. They are those of
-sixteen images of 512 x 512, or of four photos or targets of the published size. Images that have
-more pixels together are worked on in several parts.
+"""Largest number of pixels that an accelerator works on side by side for one subject. Sixteen
+images of 512 x 512 have this number. Images that have more pixels together are worked on in several
+parts.
 """
 
 

@@ -83,10 +83,11 @@ class Camera(Batchable):
         `cam_from_world` is float64.
 
         Raises: ValueError if a shape is wrong, if a number is not finite, or if a number in K or
-        `cam_from_world` is larger than 1e7. Also if a focal length is not positive, K has skew, or
-        the rotation is not orthonormal and right-handed (to 1e-3). Also if the sides of the image
-        are not positive whole numbers, if the lens is unknown, or if the lens does not have this
-        number of coefficients.
+        `cam_from_world` is larger than 1e7. Also if K is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
+        with positive focal lengths, if the rotation is not orthonormal and right-handed (to 1e-3),
+        or if the last row of `cam_from_world` is not 0 0 0 1. Also if the sides of the image are
+        not positive whole numbers, if the lens is unknown, or if the lens does not have this number
+        of coefficients.
         """
         # arrays of the type that is kept: float64 only if JAX has it
         given = K, cam_from_world, distortion
@@ -162,7 +163,7 @@ class Camera(Batchable):
     def resized(self, width: int, height: int) -> "Camera":
         """Returns the camera for the same image at another size.
 
-        Raises: ValueError for sides that are no whole numbers.
+        Raises: ValueError for sides that are not positive whole numbers.
         """
         width, height = _pixels(width, height)
         scale = np.asarray([width / self.width, height / self.height, 1.0], self.K.dtype)
@@ -170,7 +171,9 @@ class Camera(Batchable):
         return replace(self, K=from_host(K * scale[:, None]), width=width, height=height)
 
     def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
-        """Returns the camera for the same world with all lengths divided by `unit`, metres."""
+        """Returns the camera for the same world in another unit of length. unit: its length in
+        metres. All lengths are divided by it.
+        """
         translation = self.cam_from_world[..., :3, 3] / unit
         moved = replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
         if self.lens != "orthographic":
@@ -196,7 +199,8 @@ class Camera(Batchable):
 
 
 def require_pinhole(what: str, camera: Camera) -> None:
-    """Checks that a camera is a pinhole without distortion. what: the function that needs it.
+    """Checks that a camera is a pinhole without distortion. what: name of the function that needs
+    such a camera.
 
     Raises: ValueError.
     """

@@ -13,8 +13,8 @@ k2 k3 k4, or none:
 
     (x, y) = (u, v) t / r (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8).
 
-"orthographic" has neither: pixels are fx X + cx and fy Y + cy, K in pixels a metre. u and v are
-arrays of one shape, which may be any.
+"orthographic" has no coefficients: pixels are fx X + cx and fy Y + cy, with K in pixels a metre. In
+all functions, u and v are arrays of the same shape.
 """
 
 import jax
@@ -29,8 +29,8 @@ COUNTS: dict[str, tuple[int, ...]] = {
 }
 """Allowed numbers of coefficients, by lens."""
 RINGS = 16
-"""Number of points between the axis and a given point at which `within_reach` checks that the image
-grows outwards.
+"""Number of points on the way from the axis to a given point at which `within_reach` checks that
+the image moves outwards.
 """
 
 

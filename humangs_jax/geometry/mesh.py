@@ -1,6 +1,4 @@
-"""Computes areas, normals and edges of triangle meshes, and directions, on the host with numpy.
-Results have the precision of the arrays.
-"""
+"""Computes areas, normals and edges of triangle meshes, and directions, on the host with numpy."""
 
 import numpy as np
 
@@ -57,7 +55,9 @@ def mesh_edges(
 
 
 def unit(vectors: Float[np.ndarray, "*n d"]) -> Float[np.ndarray, "*n d"]:
-    """Returns vectors divided by their lengths. Zero vectors stay zero."""
+    """Returns vectors divided by their lengths, or by 1e-12 if they are shorter. Zero vectors stay
+    zero.
+    """
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 

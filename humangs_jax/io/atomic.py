@@ -3,8 +3,8 @@
 They are written under a temporary name in the same folder, then renamed.
 
 Temporary names are unique, so several processes may write at once. When a process was killed, a
-later process that writes to the same place removes its temporary files. It also puts back an old
-folder that the killed process had already moved aside.
+later process that writes to the same place removes the temporary files of the killed process. It
+also puts back old files and folders that the killed process had already moved aside.
 """
 
 import contextlib

@@ -114,7 +114,8 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
 
     In an image with a palette, the mask is 1 where the image has the only label besides the
     background. If label 0 is used, it is the background, and has to be black. Otherwise the only
-    black label is the background. A palette of several greys is read like a grey image.
+    black label is the background. If no black label is used, the mask is 1 everywhere, but label 0
+    has to be black in the palette. A palette of several greys is read like a grey image.
 
     In an image with colors, the mask is 1 where the image has the only color besides black.
 
@@ -122,8 +123,8 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     mask.
 
     Raises: as `read_image`; FileError if it is not clear which part is the person. This is so if
-    there are several labels or colors, if label 0 is not black, if nothing is black, or if the
-    alpha channel and the greys differ.
+    there are several labels or colors, if label 0 is used and not black, if an image with colors
+    has no black, or if the alpha channel and the greys differ.
     """
     # labels of a palette without transparency
     with open_image(path) as (image, data):
@@ -334,8 +335,8 @@ def is_own_picture(path: str | Path) -> bool:
 
 
 def is_own_output(path: str | Path) -> bool:
-    """Says whether a new output may replace a file. True if the file shows results
-    (`is_own_picture`), if its suffix is not .png, and if it cannot be read as an image.
+    """Says whether a new output may replace a file. It may if one of these holds: the file shows
+    results (`is_own_picture`), its suffix is not .png, or it cannot be read as an image.
     """
     if Path(path).suffix.lower() != ".png" or is_own_picture(path):
         return True

@@ -518,7 +518,7 @@ def json_text(value: Any, indent: int | None = 1) -> str:
 def read_json(path: str | os.PathLike[str]) -> Any:
     """Returns the value in a JSON file.
 
-    Raises: FileNotFoundError; FileError, which names file and line.
+    Raises: FileNotFoundError; FileError, which names the file, and the line if it is not JSON.
     """
     with reading(path, "JSON file"):
         return parse_json(read_text(path))

@@ -193,10 +193,10 @@ def photos_agree(gains: Iterable[float], least: float) -> bool:
     """Returns whether something new should be kept. It should be if most of the photos gain at
     least `least`.
 
-    A photo whose pose is off may lose by a change that is right, so one photo alone cannot reject
-    the change: it takes two of `ASKED`. But no photo gains a lot by a change that is wrong, so a
-    single photo that gains `CLEAR` more than `least` is enough to accept it. Without any gains the
-    result is False.
+    A photo whose pose is off may lose by a change that is right. So if there are `ASKED` photos, it
+    takes two of them to reject the change. But no photo gains a lot by a change that is wrong. So a
+    single photo that gains `CLEAR` more than `least` is enough to accept it. The result is False if
+    as many photos reject the change as accept it, and if there are no gains.
 
     Args:
         gains: the new score minus the old score of one photo after the other, decibels. They are

@@ -1,4 +1,4 @@
-"""Loads the frozen networks that losses may use from files that the user has. None ships with the
+"""Loads frozen networks for losses. They are in files that the user has. None ships with the
 package.
 
 Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, as `torch.save` or
@@ -107,8 +107,8 @@ def _weights(tensors: Tensors, network: str) -> Weights:
 def load_vgg19(path: Path) -> Vgg19:
     """Loads the VGG-19 of the perceptual loss from a file, in float32.
 
-    Raises: OSError; ValueError, which names file and tensor, if the file cannot be read, or if a
-    tensor is missing, of another shape or not finite.
+    Raises: FileNotFoundError; ValueError if the file cannot be read, or if a tensor is missing, of
+    another shape or not finite. The message names the file, and the tensor if the fault is in one.
     """
     tensors = read_tensors(path, _is_layer)[0]
     with _named(path):
@@ -211,8 +211,9 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
     """Returns the tensors of the loss networks in a released checkpoint, under names that the
     loaders read, and the names of these networks.
 
-    Raises: OSError; ValueError, which names file and tensor, if the checkpoint has no loss network,
-    or an incomplete one.
+    Raises: FileNotFoundError; ValueError if the file cannot be read, or if the checkpoint has no
+    loss network, or an incomplete one. The message names the file, and the tensor if the fault is
+    in one.
     """
     tensors, _ = read_tensors(
         checkpoint, lambda key: key.startswith(LOSS_PREFIX) and (_is_layer(key) or _is_head(key))

@@ -129,7 +129,7 @@ class HumanGSConfig:
 
     @property
     def trained(self) -> "HumanGSConfig":
-        """This configuration with the default runtime. Weights files record no more."""
+        """This configuration with the default runtime. Weights files do not record the runtime."""
         return dataclasses.replace(self, runtime=Runtime())
 
     def with_runtime(self, **changes: Any) -> "HumanGSConfig":

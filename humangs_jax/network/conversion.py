@@ -174,8 +174,8 @@ def read_state_dict(path: str | os.PathLike[str]) -> tuple[StateDict, int]:
     """Returns the tensors of a checkpoint in any format of `io.tensors`, and the number of skipped
     tensors of loss networks.
 
-    Raises: OSError; ValueError if the file is damaged, is no checkpoint but a weights file of this
-    package, or holds anything but tensors.
+    Raises: FileNotFoundError; ValueError if the file cannot be read, if it is no checkpoint but a
+    weights file of this package, or if its state dict holds anything but tensors.
     """
     if is_safetensors(path) and read_safetensors(path, lambda _: False)[2].get("format") == FORMAT:
         raise ValueError(f"{path} is a weights file already: nothing to convert")
@@ -187,8 +187,9 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
     not show are taken from `presets.published`. Each vertex is taken to have one tight Gaussian.
 
     head_width: width of an attention head. It is needed if queries and keys are not normalised,
-    because no shape shows it then. Raises: ValueError for a variant that is not supported, or if a
-    tensor that determines a size is missing or has another number of axes.
+    because no shape shows it then. Raises: ValueError for a variant that is not supported, if a
+    tensor that determines a size is missing, empty or of another number of axes, if no square patch
+    fits, or if `head_width` is missing or wrong.
     """
     if UNSUPPORTED in state:
         raise ValueError(

@@ -169,8 +169,8 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
 
 @functools.partial(jax.jit, static_argnames="config")
 def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -> Encoding:
-    """Returns the encoding of photos, which is the first step of `apply_humangs`. It uses the
-    running batch statistics. Raises: as `apply_humangs`.
+    """Runs the first step of `apply_humangs`: returns the encoding of photos. Norms use the running
+    batch statistics. Raises: as `apply_humangs`.
     """
     return cast(
         Encoding,
@@ -184,7 +184,7 @@ def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -
 def read(
     variables: Variables, encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> PyTree:
-    """Returns the features of the body, which is the second step of `apply_humangs`. Raises: as
+    """Runs the second step of `apply_humangs`: returns the features of the body. Raises: as
     `apply_humangs`.
     """
     return config.architecture.reader.apply(
@@ -196,8 +196,8 @@ def read(
 def decode(
     variables: Variables, features: PyTree, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> HumanGSOutputs:
-    """Returns the outputs with canonical Gaussians, metres, which is the third step of
-    `apply_humangs`. `dropped_tokens` is 0, because it belongs to the encoding.
+    """Runs the third step of `apply_humangs`: returns the outputs with canonical Gaussians, metres.
+    Their `dropped_tokens` is 0, because this number belongs to the encoding.
     """
     own = part_variables(variables, "decoder")
     return cast(

@@ -2,8 +2,8 @@
 map there are zeros.
 
 Positions are texel indices (x, y): (0, 0) is the CENTRE of the first texel, x runs along the width.
-Two conventions lead there from pixels u in [0, W] (pixel centres at +0.5) of an image that a
-w-texel grid covers:
+There are two conventions for the texel index of a position u in [0, W], pixels (pixel centres at
++0.5), in an image that a grid of w texels covers:
 
 - half-pixel (correct): texels are areas, index = u * w / W - 0.5;
 - mixed (published): u / W * 2 - 1 treats pixels as areas, then `align_corners=True` treats texels

@@ -187,8 +187,8 @@ def visible_vertices(
     image_size: tuple[int, int],
     grid: PixelGrid,
 ) -> Bool[Array, " n"]:
-    """Returns which projected vertices lie inside the image, in front of the camera, and no more
-    than `DEPTH_TOLERANCE` behind the rasterized surface, (n,).
+    """Returns which projected vertices lie inside the image, in front of the camera, and less than
+    `DEPTH_TOLERANCE` behind the rasterized surface, (n,).
 
     depth_map: rasterized z, -1 on background, so that a vertex over background is unseen.
     image_size: (width, height).

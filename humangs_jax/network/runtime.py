@@ -186,15 +186,16 @@ class Conventions:
     `rendering.splat_config.SPLAT_PRESETS`.
     """
     leg_blend_distance: Length | None = None
-    """Gaussians between the legs that are farther than this from their vertex, metres, move with
-    both legs (`body.model.blend_leg_weights`). None: all move with their vertex.
+    """Distance from the vertex, metres. Gaussians between the legs that are farther than this from
+    their vertex move with both legs (`body.model.blend_leg_weights`). None: all move with their
+    vertex.
     """
     light: bool = False
     """Whether other poses are drawn in the light of the photos (`Avatar.light`)."""
     pixel_footprint: Length | None = None
-    """Size of a pixel of the training images on the person, metres. With a number, the blur of such
-    a pixel is part of the Gaussians' scales (`Gaussians.pixel_footprint`). None: only the renderer
-    applies a low-pass.
+    """Side of a pixel of the training images, measured on the person, metres. With a number, the
+    blur of such a pixel is part of the Gaussians' scales (`Gaussians.pixel_footprint`). None: only
+    the renderer applies a low-pass.
     """
     body_vertices: Vertices | None = knob(
         None,

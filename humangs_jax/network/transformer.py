@@ -12,12 +12,13 @@ three exact implementations:
 - "chunked": matrix products over blocks of one head's queries, recomputed in the backward pass, so
   that memory grows with L and not with L^2;
 - "xla": `jax.nn.dot_product_attention`, which materialises L x L logits;
-- "cudnn": the fused flash attention of this function (NVIDIA, half precision only).
+- "cudnn": the fused flash attention of `jax.nn.dot_product_attention` (NVIDIA, half precision
+  only).
 
 "auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens
-(not in float64: its softmax is always float32), and "chunked" otherwise. On a CPU of two cores,
-4,097 tokens and 12 heads of 64, "xla" needs 2.6 s of processor time and 7.9 with its gradient,
-"chunked" 0.8 and 2.9 (measured when it was written).
+(not in float64: its softmax is always float32), and "chunked" otherwise. For 4,097 tokens and 12
+heads of 64 on a CPU of two cores, "xla" needs 2.6 s of processor time, and 7.9 s with its gradient.
+"chunked" needs 0.8 s and 2.9 s (measured when it was written).
 """
 
 from typing import Any, cast

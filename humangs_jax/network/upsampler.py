@@ -1,4 +1,4 @@
-"""Fuses token maps of several depths, and upsamples the result four times.
+"""Fuses token maps of several depths, and makes the result four times as high and wide.
 
 With hidden width H, each map goes through a 1x1 convolution to H channels. All are concatenated,
 and a 3x3 convolution to 2H, norm and LeakyReLU follow. Then a 4x4 transposed convolution of stride

@@ -54,8 +54,8 @@ vertices where normals point in the opposite direction.
 class VertexDecoder(Decoder):
     """The paper's decoder: a light MLP from the features of a vertex to its Gaussians.
 
-    It computes in float32 at least. This is a thousandth of the arithmetic of the published
-    network. In bfloat16 it would double the error of the Gaussians.
+    It computes in float32 at least. The decoder's share of the published network's arithmetic is a
+    thousandth. In bfloat16 it would double the error of the Gaussians.
     """
 
     hidden: Width = 256

@@ -12,8 +12,8 @@ Here r^T r = conic / 2 and conic = cov2d^-1. T_0 = 1 before the nearest splat, a
 splat's features: rgb, z and any others.
 
 A pixel ends before the first splat whose T_k+1 <= transmittance_stop. Apart from log opacity, the
-exponent is minus a sum of squares. Hence it is never positive, and it is accurate for needles, for
-which the quadratic form of the conic loses digits.
+exponent is minus a sum of squares. This part is never positive, and it is accurate for needles. The
+quadratic form of the conic would lose digits there.
 
 The gradient runs front to back as well. With g the cotangent of C, g_T the cotangent of the final
 T, and Q = g . C + g_T T_end,
@@ -21,8 +21,8 @@ T, and Q = g . C + g_T T_end,
     dL/dalpha_k = (g . f_k) T_k - (Q - sum_{i <= k} w_i g . f_i) / (1 - alpha_k)
 
 So nothing has to be saved for each pair: the backward pass recomputes alpha and T in the same order
-with the same decisions. alpha enters as log alpha. Its derivative is e_k := dL/dalpha_k alpha_k,
-and 0 where alpha was clamped or skipped. The sums of e_k (1, dx, dy, dx^2, dx dy, dy^2) over pixels
+with the same decisions. The derivative with respect to log alpha is e_k := dL/dalpha_k alpha_k, and
+0 where alpha was clamped or skipped. The sums of e_k (1, dx, dy, dx^2, dx dy, dy^2) over pixels
 give the gradient of a splat's shape. They are computed as matrix products with monomials about the
 tile's centre, and moved to the splat's centre afterwards.
 

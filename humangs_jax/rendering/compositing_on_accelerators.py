@@ -62,8 +62,8 @@ per pair. At this B that is half of what the triangular product costs.
 
 
 class Chunks(NamedTuple):
-    """All lists cut into chunks of at most `CHUNK` splats, list by list. Unused chunks have tile t
-    and count 0.
+    """All lists cut into chunks of at most `CHUNK` splats, list by list. Unused chunks have count 0
+    and the tile number t, which is the number of tiles.
     """
 
     tiles: Int[Array, " s"]

@@ -1,7 +1,7 @@
 """Composites on CPUs, in small blocks of tiles. For symbols see `rendering.compositing`.
 
 Tiles are ordered by list length, longest first, and taken in blocks of `config.block`. A block
-takes its lists in chunks until the longest list ends or all its pixels have ended. The arrays of a
+takes its lists in chunks until, in every tile, the list or all pixels have ended. The arrays of a
 chunk (block, chunk, pixels) stay in the cache. The chain of splats in a chunk is unrolled. The
 forward pass has two chains, one for T and one for everything else, so that XLA makes ONE kernel of
 each chain, which runs in registers. Once a pixel has ended, the loop carries -T, which keeps the

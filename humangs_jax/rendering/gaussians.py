@@ -50,8 +50,8 @@ class Gaussians(Batchable):
     pixel_footprint: Annotated[Float[Array, " g"] | None, NOT_NEGATIVE] = None
     """Side of a pixel at each Gaussian, (g,), metres. The scales contain the low-pass of images
     with such pixels (`avatar.animate`). Renderers then add a variance of at most `MIP_EPS2D`
-    pixels^2. If the pixels of their image are larger, they also dim the Gaussian, because the added
-    variance enlarges it. None: the scales contain no low-pass.
+    pixels^2. If a pixel of the drawn image is larger than this, the Gaussian is also dimmed,
+    because the added variance enlarges it. None: the scales contain no low-pass.
     """
     harmonics: Float[Array, "g k 3"] | None = None
     """Coefficients of real spherical harmonics, (g, k, 3), or None. The harmonics add colors that
@@ -75,8 +75,9 @@ def widened(
     scales: Float[Array, "g 3"], pixel_footprint: Float[Array, " g"] | None, sign: int = 1
 ) -> Float[Array, "g 3"]:
     """Returns scales with a low-pass added, metres. The variance of the low-pass is `EPS2D -
-    MIP_EPS2D` times the square of `pixel_footprint`, the side of a pixel in metres. sign: -1
-    subtracts the variance again. Without a `pixel_footprint` the scales are unchanged.
+    MIP_EPS2D` times the square of `pixel_footprint`, the side of a pixel in metres. The results are
+    at least 1e-5. sign: -1 subtracts the variance again. Without a `pixel_footprint` the scales are
+    unchanged.
     """
     if pixel_footprint is None:
         return scales

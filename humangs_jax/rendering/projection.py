@@ -127,9 +127,10 @@ def project_gaussians(
     """Returns every Gaussian projected onto the image, as `config` says. This is the first step of
     `splatting.render`.
 
-    `config.jacobian_margin` enlarges the image on each side by this fraction of half its width (or
-    height). For a centre outside of the enlarged image, the Jacobian is evaluated at the nearest
-    point of the enlarged image. This applies to pinhole cameras without distortion.
+    `config.jacobian_margin` is the width of a margin around the image, as a fraction of half the
+    image's width (or height). For a centre outside of the image with this margin, the Jacobian is
+    evaluated at the nearest point of the margin's border. This applies to pinhole cameras without
+    distortion.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
     eps2d = added_variance(gaussians.pixel_footprint, config.eps2d)

@@ -9,8 +9,8 @@ are autodiff's. With a_j the columns of M and C = cov2d = M M^T + eps2d I, the e
     det C      = sum_i<j (a_i x a_j)^2 + eps2d |M|^2 + eps2d^2.
 
 These are sums of squares, which are accurate for needles of any length. (The inverse of C has no
-correct digit left at 1e8 pixels.) Memory and time grow with Gaussians times pixels; use it in
-float64 on small images.
+correct digit left for a needle of 1e8 pixels.) Memory and time grow with Gaussians times pixels;
+use it in float64 on small images.
 """
 
 import functools

@@ -26,20 +26,20 @@ from humangs_jax.core.configuration import (
 )
 
 NEAR = 0.01
-"""Gaussians whose centre is nearer than this, or behind the camera, are not drawn, metres. gsplat
-has 0.01, INRIA 0.2.
+"""Least z of a Gaussian's centre in the camera's frame, metres. Gaussians that are nearer, or
+behind the camera, are not drawn. gsplat has 0.01, INRIA 0.2.
 """
 
 EPS2D = 0.3
 """Variance that is added along both axes of the image, pixels^2. It is a low-pass of about one
 pixel. Without it a Gaussian thinner than a pixel falls between pixel centres. INRIA and gsplat have
-the same value. Opacity is not compensated for it (gsplat "classic").
+the same value. By default, opacity is not compensated for it (gsplat "classic").
 """
 
 MIP_EPS2D = 0.1
-"""Variance that is added to Gaussians whose scales contain a low-pass (`Gaussians.pixel_footprint`)
-instead of `EPS2D`, pixels^2. It is about the footprint of a pixel. Images of all sizes then show
-the Gaussians as wide as the images to which they were fitted (Mip-Splatting,
+"""Variance that is added instead of `EPS2D` if the scales already contain a low-pass
+(`Gaussians.pixel_footprint`), pixels^2. It is about the footprint of a pixel. Images of all sizes
+then show the Gaussians as wide as the images to which they were fitted (Mip-Splatting,
 https://arxiv.org/abs/2311.16493).
 """
 
@@ -99,10 +99,10 @@ class SplatConfig:
     )
     """A pixel ends before its transmittance would fall to this."""
     jacobian_margin: Spread | None = None
-    """None: the Jacobian of the projection is exact. A number: the image is enlarged on each side
-    by this fraction of half its width (or height). For a centre outside of the enlarged image, the
-    Jacobian is evaluated at the nearest point of the enlarged image. INRIA and gsplat have 0.3. It
-    applies to pinhole cameras without distortion.
+    """None: the Jacobian of the projection is exact. A number: the width of a margin around the
+    image, as a fraction of half the image's width (or height). For a centre outside of the image
+    with this margin, the Jacobian is evaluated at the nearest point of the margin's border. INRIA
+    and gsplat have 0.3. It applies to pinhole cameras without distortion.
     """
     normalize_quats: bool = True
     """Whether quaternions are normalised. INRIA's rasterizer does not."""
@@ -174,12 +174,12 @@ class SplatConfig:
     decides where splats are cut off.
     """
     block: Chunk = 32
-    """Number of tiles that are composited together, on CPUs only. From 16 to 64 times differ by 4
-    %.
+    """Number of tiles that are composited together, on CPUs only. Between 16 and 64, it changes the
+    time by 4 %.
     """
     chunk: Chunk = 8
-    """Number of splats of a list that are taken at once, on CPUs only. From 4 to 16 times differ by
-    6 %.
+    """Number of splats of a list that are taken at once, on CPUs only. Between 4 and 16, it changes
+    the time by 6 %.
     """
 
     def __post_init__(self):
@@ -242,8 +242,9 @@ def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
     the preset's name, which weights record.
 
     All fields in which the two presets differ take the values of the preset `rendering`. Other
-    fields stay as the user has set them. The configuration is returned unchanged if its
-    `jacobian_margin`, `normalize_quats` and `square` all differ from the other preset.
+    fields stay as the user has set them. A configuration is returned unchanged if each of its
+    fields `jacobian_margin`, `normalize_quats` and `square` differs from the preset that is not
+    `rendering`.
     """
     wanted, other = SPLAT_PRESETS["inria"], SPLAT_PRESETS["exact"]
     if rendering == "exact":

@@ -26,8 +26,8 @@ the ellipse are at
 
     dx = (xy / yy) dy -+ sqrt(D / yy (reach - dy^2 / yy)),     |dy| <= sqrt(reach yy).
 
-So inside one row of tiles the ellipse reaches farthest right at dy = xy sqrt(reach / xx), clamped
-to the row, and farthest left at the opposite point.
+So inside one row of tiles the ellipse reaches farthest right at dy = xy sqrt(reach / xx), and
+farthest left at minus this dy, both clamped to the row.
 """
 
 import dataclasses

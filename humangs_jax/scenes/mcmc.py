@@ -149,7 +149,7 @@ def mcmc_noise(
     rate: Float[Array, ""] | float,
 ) -> UnconstrainedGaussians:
     """Moves the means at random, by `rate` times the covariance times normal numbers. The noise
-    fades out around an opacity of 0.005.
+    fades out where opacities rise above about 0.005.
 
     Args:
         key: of `jax.random`.

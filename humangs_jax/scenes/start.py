@@ -28,7 +28,9 @@ PARALLEL = 1e-3
 is below this.
 """
 CANDIDATES = 16
-"""The number of random points for each Gaussian. One of them becomes the Gaussian."""
+"""The number of random points among which the places of Gaussians are chosen, divided by the number
+of Gaussians.
+"""
 SMALLEST = 1e-4
 """The least scale of a Gaussian at the start, as a share of the extent of the cameras. Without it,
 the scale would be 0 where points coincide.

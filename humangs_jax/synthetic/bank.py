@@ -8,8 +8,9 @@ A scan is a baked and lit mesh in a folder, like that of a scanner: scan.obj wit
 material_0.png, scan.glb, and scan.json with seed, shape and pose. Lengths are in metres, y is up,
 and texture coordinates have v up. A vertex is written once for each chart that it is in.
 
-A bank holds people as arrays of one shape. It is made on the host once, and `on_the_fly_example`
-reads it on the device. All people of a bank are from ONE range of seeds (see `subject.SPLITS`), so
+A bank holds the arrays of people, padded to equal shapes. It is made on the host once, and
+`on_the_fly_example` reads it on the device. All people of a bank are from ONE range of seeds (see
+`subject.SPLITS`), so
 that no key of a training bank makes a person of the test range. A person takes about 3 MB at 512
 texels a side.
 """

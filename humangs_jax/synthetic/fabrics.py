@@ -119,7 +119,7 @@ def random_color(rng: np.random.Generator) -> Vector:
 
 
 def accent(rng: np.random.Generator, base: Vector) -> Vector:
-    """Draws a dye (3,) that stands out from a first one."""
+    """Draws a dye (3,) that stands out from the dye `base`."""
     for _ in range(8):
         other = random_color(rng)
         if np.abs(other - base).sum() > 0.6:
@@ -220,8 +220,8 @@ def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabr
     """Draws a fabric that suits a kind of garment.
 
     plainness: probability that the pattern is drawn from the plain ones, which have one dye or show
-    little of a second dye. Otherwise it is drawn from all patterns. Some kinds of garments then
-    replace the pattern, see `_PATTERN_RULES`.
+    little of a second dye. Otherwise it is drawn by the odds in `PATTERNS`. Some kinds of garments
+    then replace the pattern, see `_PATTERN_RULES`.
     """
     plain_ones = {"plain": 0.66, "melange": 0.2, "tweed": 0.14}
     odds = {name: share for name, (share, _) in PATTERNS.items() if share}

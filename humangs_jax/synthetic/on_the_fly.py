@@ -66,8 +66,8 @@ class OnTheFlyConfig:
     target_size: Side = 256
     """Side of the targets, pixels."""
     mixed_pose_share: Share = 0.3
-    """Probability that the inputs of an example show random poses, each one of the example's two
-    poses. Otherwise all inputs show the first pose. Targets always show random poses.
+    """Probability that each input of an example shows one of the example's two poses at random.
+    Otherwise all inputs show the first pose. Targets always show one of the two at random.
     """
     jitter: Spread = 0.7
     """How irregular the azimuths of the inputs are: each is off by up to half of this times the

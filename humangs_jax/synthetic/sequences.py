@@ -203,8 +203,8 @@ def _carry_trunk(
 def _path(heading: _Heading, stride: float, first: float, last: float) -> _Track:
     """Returns the path that follows a heading: a function of the phase, see `_Track`.
 
-    stride: metres per stride. first, last: phases between which the path is needed;
-    its place at `first` is 0.
+    stride: metres per stride. first, last: phases between which the path is needed. At the phase
+    `first` the path is at the origin.
     """
     grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
     direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)

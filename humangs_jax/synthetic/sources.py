@@ -84,7 +84,9 @@ def on_the_fly_people(
 
 
 def _bank(people: int, out: Path, body: BodyModel) -> PeopleBank:
-    """Returns the bank in out/people.npz. One process makes it unless it has the right seeds."""
+    """Returns the bank in out/people.npz. If there is no bank of the right seeds, one process makes
+    it.
+    """
     path, seeds, bank = out / "people.npz", SPLITS["train"][:people], None
     if jax.process_index() == 0:
         bank = load_bank(path) if path.is_file() else None

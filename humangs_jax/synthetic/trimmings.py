@@ -356,8 +356,8 @@ _SEWN_ON = (
     (("coat", *DRESSES), "sash", _sashed),
     (("jeans",), "turn_up", _turned_up),
 )
-"""Each row has four parts: kinds of garments; the detail that such a garment needs to have the
-trimming (None: all have it); the function of the trimming; and the function's further arguments.
+"""Each row has kinds of garments; the detail that such a garment needs to have the trimming (None:
+all have it); the function of the trimming; and further arguments of the function, if there are any.
 The order matters, because all trimmings of a garment draw from one generator.
 """
 
