@@ -1,15 +1,15 @@
 """Expressions of a face: named directions in which vertices move, such as the 52 shapes of ARKit or
 the components of SMPL-X.
 
-A pose may carry one coefficient for each (`BodyPose.expression`). Vertices move in the T-pose,
-before skinning:
+A pose may carry one coefficient for each expression (`BodyPose.expression`). Vertices move in the
+T-pose, before skinning:
 
     rest'(e) = rest + directions e,
     joints'(e) = joints + joint_directions e,
     rotations'(e) = rotations + joint_turns e.
 
-The shapes of the shipped body come from `assets/face.npz`, and with them what photos hardly show:
-teeth, tongue, the inside of the mouth and the skin of closed lids (`FaceParts`).
+`assets/face.npz` has the shapes of the shipped body. It also has what photos hardly show: teeth,
+tongue, the inside of the mouth and the skin of closed lids (`FaceParts`).
 """
 
 import functools
@@ -33,7 +33,7 @@ STEP = 1e-5
 EYES = ("left_eye", "right_eye")
 """Names of the joints that turn the eyes."""
 PARTS = ("upper_teeth", "lower_teeth", "tongue", "left_lid", "right_lid", "mouth")
-"""Names of the parts that `FaceParts.parts` numbers; "mouth" is the skin inside of it."""
+"""Names of the parts that `FaceParts.parts` numbers; "mouth" is the skin inside of the mouth."""
 KEYS = (
     *("format", "names", "counts", "vertices", "offsets", "eye_turns"),
     *("lips", "inside_vertices", "part_faces", "parts"),

@@ -52,8 +52,8 @@ class _FacePart(NamedTuple):
     end: int
     """Number of the last point plus 1."""
     total: int
-    """Number of a point plus the number of its mirror image, which is the same for all
-    points here.
+    """Number of a point plus the number of its mirror image. All points of the range have the same
+    sum.
     """
     left_is_later: bool = True
     """Whether the point with the larger number of a mirrored pair is on the person's left."""

@@ -120,10 +120,10 @@ def blend_leg_weights(
     The mean for a point is taken over the vertices around it, with a normal kernel. The standard
     deviation of the kernel is d, the distance of the point from its vertex. The weights move
     towards the mean by a share, the product of two factors. The first rises from 0 at d = 3/4
-    `reach` to 1 at d = 5/4 `reach`. The second is ten times the share that the leg with the smaller
-    share has in the mean, at most 1. So hair and sleeves keep their weights. At most a quarter of
-    the points change, those with the largest d. LHM diffuses weights through a grid of voxels for
-    the same purpose (https://arxiv.org/abs/2503.10625).
+    `reach` to 1 at d = 5/4 `reach`. The second is ten times the smaller of the two legs' shares in
+    the mean, at most 1. So hair and sleeves keep their weights. At most a quarter of the points
+    change, those with the largest d. LHM diffuses weights through a grid of voxels for the same
+    purpose (https://arxiv.org/abs/2503.10625).
 
     Arguments: points: in the rest pose, metres. distances: of each point from its vertex, metres.
     weights: of the vertex of each point. vertices, vertex_weights: of the body in the rest pose.

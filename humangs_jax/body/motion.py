@@ -66,7 +66,7 @@ class Motion:
 
     def expressions_of(self, names: Sequence[str]) -> Float[Array, "m e"] | None:
         """Returns the coefficients for a face with these expressions, (m, e). They are 0 for
-        expressions that the motion does not have. Returns None if it has none of them.
+        expressions that the motion does not have. Returns None if the motion has none of them.
         """
         own = self.expression_names
         if self.expressions is None or not set(names) & set(own):

@@ -20,7 +20,7 @@ back takes less time than compiling a program.
 
 def from_host(array: Any, dtype: Any = None) -> Any:
     """Returns an array of JAX with the numbers of a list or of an array of numpy. An array of JAX
-    is returned, too, converted to `dtype`. dtype: None keeps the type.
+    is only converted to `dtype`. dtype: None keeps the type.
 
     `jnp.asarray` gives the same result, but compiles a program for each shape.
     """
@@ -63,8 +63,8 @@ def taken(array: Any, index: Any) -> Any:
 
 
 def out_of_range(index: Any, size: int) -> Int[np.ndarray, " n"]:
-    """Returns the integers of an index that do not fit an axis of this size, (n,). Slices, masks,
-    and arrays whose numbers this process cannot read have none.
+    """Returns the integers of an index that do not fit an axis of this size, (n,). The result is
+    empty for slices, lists and masks, and for arrays whose numbers this process cannot read.
     """
     readable = isinstance(index, int | np.integer | np.ndarray) or _plain(index)
     if not readable or np.asarray(index).dtype == bool:

@@ -382,8 +382,8 @@ def _surroundings() -> str:
 
 
 def _read(file: Path) -> Any:
-    """Returns what a file holds. Files that were not used for longest are deleted first, so that
-    the file is noted as used.
+    """Returns what a file holds, and marks the file as used. Files that were not used for longest
+    are deleted first.
     """
     data = file.read_bytes()
     if hashlib.sha256(data[DIGEST:]).digest() != data[:DIGEST]:

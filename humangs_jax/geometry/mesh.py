@@ -46,8 +46,8 @@ def vertex_area_vectors(
 def mesh_edges(
     faces: Int[np.ndarray, "f 3"],
 ) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "f 3"]]:
-    """Returns the undirected edges of a mesh, (e, 2), and the rows in the edges of each face's
-    three sides, (f, 3). Side i goes from corner i to corner i + 1.
+    """Returns the undirected edges of a mesh, (e, 2), and for the three sides of each face the
+    numbers of their edges, (f, 3). Side i goes from corner i to corner i + 1.
     """
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
     edges, index = np.unique(np.sort(sides.reshape(-1, 2), axis=-1), axis=0, return_inverse=True)

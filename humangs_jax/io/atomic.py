@@ -267,9 +267,9 @@ def check_replaceable(
     hold this file and `overwrite` to be True. Without a mark it may hold anything. inputs: paths
     that the work reads. They may not lie in the folder, because they would be deleted. Paths of
     None are ignored.
-    Raises: ValueError if the content of the folder or an input forbids to replace it. Also if it is
-    a symbolic link, a file, a mount point, the working folder or a folder above that, and if
-    nothing can be written in the folder above.
+    Raises: ValueError if the content of the folder or an input forbids to replace it. Also if the
+    path is a symbolic link, a file, a mount point, the working folder or a folder that contains the
+    working folder, or if nothing can be written in the folder above.
     """
     # the place can be replaced
     folder = Path(folder)

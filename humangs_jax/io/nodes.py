@@ -13,7 +13,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.io.reading import InvalidFileError, shown
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
-"""Number of values at each time, by what a track of an animation moves."""
+"""What a track of an animation may move, and how many values the track has for each time."""
 
 
 Nodes = list[dict[str, Any]]

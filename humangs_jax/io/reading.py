@@ -7,8 +7,8 @@ Readers open files through `open_file` or `read_bytes` and work inside `reading`
         ...
 
 Any error inside becomes a `FileError` of one line that names the file: `me.npz: not a readable npz
-archive: ...`. A helper that does not know the file raises `InvalidFileError`; its text follows the
-name of the file unchanged.
+archive: ...`. A helper that does not know the file raises `InvalidFileError`. Its text is not
+changed, and follows the name of the file.
 """
 
 import contextlib
@@ -57,11 +57,12 @@ class Limits:
     image_bytes: int = 256 << 20
     """Bytes of a photo before it is decoded."""
     array_bytes: int = 4 << 30
-    """Unpacked bytes of all arrays of an archive, bytes of a pickle, an npy file or a file of
-    Gaussians, or bytes of an EXR file that is written.
+    """Unpacked bytes of all arrays of an archive, bytes of a pickle, an npy file, an HDF5 data set
+    or a file of Gaussians, or bytes of an EXR file that is written.
     """
     plain_bytes: int = 256 << 20
-    """Bytes to which a file of any size may unpack. Also bytes of a sparse matrix as a full array.
+    """Bytes to which a file of any size may unpack. Also bytes of a sparse matrix, or of the
+    expressions of a face, as a full array.
     """
     ratio: int = 100
     """Largest unpacked size relative to the size of the file. It applies to unpacked sizes beyond
@@ -72,7 +73,7 @@ class Limits:
     opcodes: int = 4_000_000
     """Instructions of a pickle."""
     nesting: int = 64
-    """Depth of lists and objects within each other in JSON and YAML."""
+    """Depth of lists and objects within each other in JSON, YAML and TOML."""
     pixels: int = 64_000_000
     """Pixels of a photo."""
     side: int = 32_768
@@ -473,7 +474,7 @@ def parse_json(text: str) -> Any:
 
 
 def check_nesting(value: Any) -> None:
-    """Checks that lists and dicts lie within each other at most `nesting` deep, which is a limit.
+    """Checks that lists and dicts lie within each other no deeper than the limit `nesting` allows.
 
     Raises: InvalidFileError.
     """

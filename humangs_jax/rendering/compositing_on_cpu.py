@@ -53,8 +53,8 @@ class _Chain(NamedTuple):
     peaks: Float[Array, " g"]
     """The largest w of each splat so far, in all blocks, (g,)."""
     medians: Float[Array, "block p"] | None
-    """The smallest z so far behind which T is one half or less, (block, p). None unless
-    `config.depth_median`.
+    """The smallest z, among the splats so far, behind which T is one half or less, (block, p). None
+    unless `config.depth_median`.
     """
 
 

@@ -50,8 +50,8 @@ class Gaussians(Batchable):
     pixel_footprint: Annotated[Float[Array, " g"] | None, NOT_NEGATIVE] = None
     """Side of a pixel at each Gaussian, (g,), metres. The scales contain the low-pass of images
     with such pixels (`avatar.animate`). Renderers then add a variance of at most `MIP_EPS2D`
-    pixels^2. If a pixel of the drawn image is larger than this, the Gaussian is also dimmed,
-    because the added variance enlarges it. None: the scales contain no low-pass.
+    pixels^2. If a pixel of the drawn image is larger than `pixel_footprint`, the Gaussian is also
+    dimmed, because the added variance enlarges it. None: the scales contain no low-pass.
     """
     harmonics: Float[Array, "g k 3"] | None = None
     """Coefficients of real spherical harmonics, (g, k, 3), or None. The harmonics add colors that
@@ -269,8 +269,8 @@ larger than the number of functions.
 
 
 def check_count(count: int) -> None:
-    """Checks that a number of harmonics is 3, 8 or 15, the numbers of degrees 1, 1 to 2 and 1 to 3.
-    Raises: ValueError.
+    """Checks that a number of harmonics is 3 (degree 1), 8 (degrees 1 and 2) or 15 (degrees 1 to
+    3). Raises: ValueError.
     """
     if count not in COUNTS[1:]:
         raise ValueError(

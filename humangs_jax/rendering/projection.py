@@ -128,9 +128,8 @@ def project_gaussians(
     `splatting.render`.
 
     `config.jacobian_margin` is the width of a margin around the image, as a fraction of half the
-    image's width (or height). For a centre outside of the image with this margin, the Jacobian is
-    evaluated at the nearest point of the margin's border. This applies to pinhole cameras without
-    distortion.
+    image's width (or height). For a centre beyond the margin, the Jacobian is evaluated at the
+    nearest point of the margin's outer edge. This applies to pinhole cameras without distortion.
     """
     gaussians, camera = at_least_float32((gaussians, camera))
     eps2d = added_variance(gaussians.pixel_footprint, config.eps2d)

@@ -78,7 +78,7 @@ class SplatConfig:
     """
 
     near: Annotated[float, Range(0, 1e6)] = NEAR
-    """Gaussians whose centre is nearer than this are not drawn, metres."""
+    """Least z in the camera's frame, metres. Gaussians whose centre is nearer are not drawn."""
     eps2d: Annotated[float, Range(0, 1e6)] = EPS2D
     """Variance that is added to projected variances, pixels^2."""
     antialiased: bool = False
@@ -100,9 +100,9 @@ class SplatConfig:
     """A pixel ends before its transmittance would fall to this."""
     jacobian_margin: Spread | None = None
     """None: the Jacobian of the projection is exact. A number: the width of a margin around the
-    image, as a fraction of half the image's width (or height). For a centre outside of the image
-    with this margin, the Jacobian is evaluated at the nearest point of the margin's border. INRIA
-    and gsplat have 0.3. It applies to pinhole cameras without distortion.
+    image, as a fraction of half the image's width (or height). For a centre beyond the margin, the
+    Jacobian is evaluated at the nearest point of the margin's outer edge. INRIA and gsplat have
+    0.3. It applies to pinhole cameras without distortion.
     """
     normalize_quats: bool = True
     """Whether quaternions are normalised. INRIA's rasterizer does not."""
@@ -242,9 +242,8 @@ def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
     the preset's name, which weights record.
 
     All fields in which the two presets differ take the values of the preset `rendering`. Other
-    fields stay as the user has set them. A configuration is returned unchanged if each of its
-    fields `jacobian_margin`, `normalize_quats` and `square` differs from the preset that is not
-    `rendering`.
+    fields stay as the user has set them. If `jacobian_margin`, `normalize_quats` and `square` of
+    the configuration all differ from those of the other preset, it is returned unchanged.
     """
     wanted, other = SPLAT_PRESETS["inria"], SPLAT_PRESETS["exact"]
     if rendering == "exact":

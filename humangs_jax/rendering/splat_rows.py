@@ -77,8 +77,8 @@ class Composited(NamedTuple):
 
 
 def joined_over_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """Returns the function in a form that `vmap` calls once, with the tiles of all images together.
-    Its arguments are (splats, items, starts, further arrays per tile...).
+    """Returns a function in a form that `vmap` calls once, with the tiles of all images together.
+    The function's arguments are (splats, items, starts, further arrays per tile...).
 
     The function must return arrays per tile or per splat. `vmap` divides them among the images
     afterwards.

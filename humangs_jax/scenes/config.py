@@ -8,8 +8,8 @@ from humangs_jax.core.configuration import Range, Seed, Share, Spread, Steps, We
 from humangs_jax.rendering.splat_config import SplatConfig
 
 SCENE_SPLAT = SplatConfig(jacobian_margin=0.3)
-"""The renderer's settings, with a `jacobian_margin` as gsplat has. In scenes that surround the
-cameras, Gaussians beside a camera would cover whole images with the exact Jacobian.
+"""The renderer's settings, with the `jacobian_margin` of gsplat. With the exact Jacobian, Gaussians
+beside a camera would cover whole images in scenes that surround the cameras.
 """
 Capacity = Annotated[int, Range(1, 100_000_000)]
 """A number of Gaussians."""

@@ -1,9 +1,9 @@
 """A pose prior: draws plausible poses of people who stand, stride, crouch or reach.
 
-Poses keep to the limits of the joints, and soles are on the ground. A stance places the feet and
-the pelvis. For each arm many candidates are drawn, and one is kept: its wrist comes nearest to a
-goal, and its forearm and hand stay out of the trunk, the head, the legs and the other arm. Hands
-blend a few gestures. `anatomy` has the joints, their limits and the conventions.
+Poses keep to the limits of the joints, and the person stands on the ground. A stance places the
+feet and the pelvis. For each arm many candidates are drawn, and one is kept: its wrist comes
+nearest to a goal, and its forearm and hand stay out of the trunk, the head, the legs and the other
+arm. Hands blend a few gestures. `anatomy` has the joints, their limits and the conventions.
 """
 
 import dataclasses
