@@ -196,8 +196,9 @@ class Compiled(Generic[T]):
         return future.result()
 
     def _made(self, call: "_Call") -> Callable[..., T] | None:
-        """Reads the program of a call from disk, or compiles it and writes it there. Returns None
-        if the program depends on something that has no stable text.
+        """Reads the program of a call from disk, or compiles it. A compiled program is written to
+        disk if other processes can use it. Returns None if the program depends on something that
+        has no stable text.
         """
         file = self._file(call, "program")
         if file is None:

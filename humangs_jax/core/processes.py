@@ -235,7 +235,8 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
 
     Returns:
         The folder in use, which lies in `folder`, or the one that JAX already had. None if JAX had
-        none and `HUMANGS_COMPILE_CACHE` is 0, or if the folder cannot be written to.
+        none and `HUMANGS_COMPILE_CACHE` is 0, if the folder cannot be written to, or if there is no
+        home.
 
     Examples:
         >>> hg.enable_compile_cache()

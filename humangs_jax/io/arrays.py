@@ -47,7 +47,8 @@ def numbers(
     dtype: type[np.floating] = np.float64,
     error: type[FileError] = FileError,
 ) -> np.ndarray:
-    """Returns a value of a file as an array of real numbers that are finite in float32.
+    """Returns a value of a file as an array of real numbers. They are finite in float32, unless
+    `nulls` is True.
 
     Arguments:
         file, field: for the error.
@@ -55,7 +56,7 @@ def numbers(
             accepted.
         some: whether there must be at least one number.
         nulls: whether null becomes NaN. Numbers that are not finite are then accepted, too.
-        largest: largest magnitude that is allowed.
+        largest: largest magnitude that is allowed. It is not checked if a number is NaN.
         dtype: type of the numbers in the array that is returned.
         error: class of the error.
 
@@ -420,8 +421,8 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
     """Returns the array of an archive's member of `size` bytes, or None for pickled objects.
 
     Memory is allocated only after the size is checked.
-    Raises: InvalidFileError for other types than numbers and strings, or for another size;
-    EOFError.
+    Raises: as `read_header`; InvalidFileError for other types than numbers and strings, or for
+    another size; EOFError.
     """
     shape, columns_first, dtype = read_header(member)
     if dtype.hasobject:

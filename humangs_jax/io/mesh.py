@@ -94,7 +94,7 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
 
 
 def _view_of(view: dict[str, Any], binary: bytes) -> bytes:
-    """Returns the bytes of a buffer view. Raises: InvalidFileError."""
+    """Returns the bytes of a buffer view. Raises: InvalidFileError, KeyError."""
     compressed = [name for name in view.get("extensions", {}) if name.endswith("_compression")]
     if compressed:
         raise InvalidFileError(f"compressed ({compressed[0]}): export the file without compression")
@@ -107,7 +107,7 @@ def _view_of(view: dict[str, Any], binary: bytes) -> bytes:
 
 
 def count_of(accessor: dict[str, Any]) -> int:
-    """Returns the number of elements of an accessor. Raises: InvalidFileError."""
+    """Returns the number of elements of an accessor. Raises: InvalidFileError, KeyError."""
     count, start = accessor["count"], accessor.get("byteOffset", 0)
     if not all(type(n) is int and n >= 0 for n in (count, start)):
         raise InvalidFileError(f"{shown(count)} numbers from {shown(start)}")
@@ -303,8 +303,8 @@ def read_obj(path: str | Path) -> list[Any]:
 
 
 def _grouped(text: str) -> str:
-    """Returns the text of an OBJ file with the faces of each material together, at its end. Names
-    of objects and groups are removed.
+    """Returns the text of an OBJ file with the faces of each material together, at its end. Lines
+    that begin objects, groups and smoothing groups are removed.
 
     trimesh's time grows faster than linearly with the number of changes of material, object and
     group. It even counts changes in comments.

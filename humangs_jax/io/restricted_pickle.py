@@ -617,8 +617,8 @@ def _check_leaves(value: Any) -> None:
 def read_pickle(path: str | Path) -> dict[str, Any]:
     """Returns the dict in a pickle of Python 2 or 3. `as_array` makes arrays of its values.
 
-    Raises: FileNotFoundError; FileError, which names the file, if it is no pickle of a dict or
-    names anything that arrays do not need.
+    Raises: FileNotFoundError; FileError, which names the file, if the file cannot be read, is no
+    pickle of a dict whose keys are texts, or names anything that arrays do not need.
     """
     with reading(path, "pickle"):
         data = io.BytesIO(read_bytes(path, "array_bytes"))

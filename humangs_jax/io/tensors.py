@@ -172,7 +172,7 @@ def _storage_of_bytes(data: bytes) -> _Storage:
     The stream consists of five pickles, the count of the numbers, and the numbers. The pickles hold
     a magic number, a version, a description of the machine, the storage, and a list with its name.
 
-    Raises: InvalidFileError.
+    Raises: InvalidFileError; anything that pickle raises for damaged streams.
     """
     if data[2:15] != STREAM_START:
         raise InvalidFileError("a storage that is not a stream of torch")
@@ -239,7 +239,7 @@ def _of_archive(archive: zipfile.ZipFile, size: int, names: Mapping) -> Any:
     """Returns the content of the pickle in an archive. Its tensors can be read while the archive is
     open.
 
-    Raises: InvalidFileError.
+    Raises: as `tensors_in`.
     """
     if sum(member.file_size for member in archive.infolist()) > LARGEST_RATIO * size:
         raise InvalidFileError(
@@ -284,14 +284,14 @@ def tensors_in(data: bytes, keys: tuple[str, ...]) -> Tensors:
     """Returns all tensors of the state dict in the bytes of a `torch.save` file. The state dict
     lies under one of `keys`, or is the whole content.
 
-    Raises: InvalidFileError.
+    Raises: InvalidFileError; anything that zipfile and pickle raise for damaged files.
     """
     return _tensors_of(io.BytesIO(data), len(data), everything, keys)[0]
 
 
 def _tensors_of(file: Any, size: int, wanted: Wanted, keys: tuple[str, ...]) -> tuple[Tensors, int]:
     """Returns the wanted tensors of the state dict in an open file, and the number of its other
-    entries. Raises: InvalidFileError.
+    entries. Raises: as `tensors_in`.
     """
     start = file.read(15)
     file.seek(0)

@@ -62,6 +62,7 @@ def save_weights(
     Raises:
         ValueError: which names the key, if a tensor does not fit the configuration, is not finite,
             or overflows float16.
+        OSError: if the file cannot be written.
 
     Examples:
         >>> hg.save_weights("mine.safetensors", variables, config, "float16")

@@ -102,7 +102,8 @@ def fit_scene(
 
     Raises:
         ValueError: images that do not fit their cameras, are not in [0, 1] or are too small for
-            SSIM; points that are not finite or not (n, 3), or more than the capacity.
+            SSIM; points that are not finite or not (n, 3), or more than the capacity; Gaussians
+            with deformations.
         FileNotFoundError: a path of an image without a file.
         FileError: an image or a checkpoint that cannot be read, or a checkpoint of other photos,
             cameras, points, settings or another background.

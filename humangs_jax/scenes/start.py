@@ -126,8 +126,8 @@ def _seen_points(
     are likelier.
 
     The chance of a point is in proportion to the fourth power of the number of cameras that see it.
-    If the cameras stand around an object, the points lie on it and not between it and the cameras.
-    In a room they lie everywhere.
+    If the cameras stand around an object, most points lie near it and few between it and the
+    cameras. In a room they lie everywhere.
     """
     middle, reach = _middle(views), float(extent_of(views))
     points = middle + rng.uniform(-reach, reach, (CANDIDATES * count, 3))

@@ -52,7 +52,7 @@ class SceneState:
 def begin_scene(gaussians: Gaussians, capacity: int) -> SceneState:
     """Returns a state with `capacity` slots, of which the first are these Gaussians.
 
-    Raises: ValueError for more Gaussians than the capacity.
+    Raises: ValueError for more Gaussians than the capacity, or for Gaussians with deformations.
     """
     count = len(gaussians.opacities)
     if count > capacity:

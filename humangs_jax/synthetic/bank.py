@@ -283,7 +283,8 @@ def build_bank(
     shipped body themselves.
 
     Raises: ValueError if there are no seeds, if a seed lies in another range, if the body is not
-    the package's body, or if the size of the textures is no multiple of 128.
+    the package's body, or if the size of the textures is no multiple of 128; OSError if a process
+    is killed.
     """
     seeds = list(seeds)
     if not seeds:

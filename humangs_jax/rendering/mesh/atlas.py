@@ -78,7 +78,7 @@ def unwrap(
     pieces: number of each face's piece. No chart extends over two pieces. density: texels per metre
     on each face, relative to other faces. It must be the same all over a piece.
 
-    Raises: ValueError for a size that is no multiple of `CELLS`.
+    Raises: ValueError for a size that is not a positive multiple of `CELLS`.
     """
     if size < CELLS or size % CELLS:
         raise ValueError(f"texture of {size} texels a side: expected a multiple of {CELLS}")
@@ -142,7 +142,7 @@ def fill_gaps(
 
 
 def _adjacent(faces: np.ndarray) -> np.ndarray:
-    """Returns the pairs of faces that share an edge, (p, 2)."""
+    """Returns pairs of faces that share an edge, (p, 2). An edge of k faces gives k - 1 pairs."""
     edges = np.sort(edges_of(faces).astype(np.int64), axis=1)
     keys = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
     order = np.argsort(keys, kind="stable")
@@ -151,9 +151,12 @@ def _adjacent(faces: np.ndarray) -> np.ndarray:
 
 
 def _choose_sides(normals: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Returns the index in `SIDES` of the side that each face is given, (f,). It is the side that
-    the face looks towards most. If its neighbours agree on another side that the face also looks
-    towards, it is that side.
+    """Returns the index in `SIDES` of the side that each face is given, (f,). Each face starts with
+    the side that it looks towards most. In eight rounds, faces change to the side with the largest
+    sum of the face's cosine and the neighbours' votes. The cosine with that side is at least
+    `LEAST_COSINE`, unless the face's largest cosine is smaller.
+
+    normals: unit normals of the faces, (f, 3). pairs: faces that are neighbours, (p, 2).
     """
     cosines = normals @ SIDES.T
     allowed = cosines >= np.minimum(LEAST_COSINE, cosines.max(1, keepdims=True))

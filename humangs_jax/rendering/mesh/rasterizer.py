@@ -50,7 +50,9 @@ class RasterConfig:
     """Settings of the rasterizer. The image depends on `near` alone."""
 
     near: Spread = 0.01
-    """Faces with a corner at z <= near are dropped, in the units of the vertices."""
+    """Depth of the near plane, in the units of the vertices. Faces with a corner at z <= near are
+    dropped.
+    """
     rows_per_step: Slice = 1 << 15
     """Slots for rows of pixels in a step of the outer loop. Large steps spend time on empty slots,
     small steps on the overhead of more steps.
@@ -78,7 +80,7 @@ class Fragments(Batchable):
     """z in the camera's frame, (h, w), in the units of the vertices; -1 where there is no face."""
     overflow: Int[Array, ""]
     """Number of faces that may be missing from the image. They cross the near plane, have pixel
-    positions that are not finite, or come after the first 2^30 rows of pixels.
+    positions or an area in pixels that are not finite, or come after the first 2^30 rows of pixels.
     """
 
 
@@ -129,8 +131,8 @@ def interpolate_attributes(
     """Returns the attributes interpolated over the seen surface, (h, w, c). They are `background`
     where there is no face.
 
-    faces: indices into `attributes` of the corners of each face. Face i must be the face i that was
-    rasterized, but its indices may be others. With texture faces and texture coordinates, the
+    faces: indices into `attributes` of the corners of each face. Row i is for face i of the mesh
+    that was rasterized, but may have other indices. With texture faces and texture coordinates, the
     result is the texture coordinate of every pixel.
     """
     if faces.shape[0] == 0:
@@ -197,7 +199,7 @@ def _rows(
     corners: Float[Array, "f 9"], drawn: Array, width: int, height: int
 ) -> tuple[Array, Array]:
     """Returns the first row of pixel centres of every face, (f,), and the number of rows, (f,). The
-    number is 0 if no column of pixel centres lies in the face's bounding box.
+    number is 0 for a face that is not drawn, and if no pixel centre lies in its bounding box.
     """
     x, y = (jnp.where(drawn[:, None], corners[:, i::3], 0.0) for i in range(2))
     drawn &= _first_pixel(x.min(-1), width) <= _last_pixel(x.max(-1), width)
@@ -342,7 +344,7 @@ def sample_texture(
     texture: Float[Array, "th tw c"], uv: Float[Array, "h w 2"]
 ) -> Float[Array, "h w c"]:
     """Returns the texture's bilinear values at texture coordinates, (h, w, c). It is differentiable
-    with respect to the texture and, inside a texel, to uv.
+    with respect to the texture and, except where u or v is at the centres of texels, to uv.
 
     As in OBJ files, u points right and v UP: (0, 0) is the lower left corner of the texture, (1, 1)
     its upper right one, and row 0 is the top. Texel (row, column) is at u = (column + 0.5) / width,
