@@ -283,9 +283,9 @@ def keep_programs(cache: Path) -> None:
     before the first computation.
 
     A program is code, and its file is read with `pickle`. So the folder is made for the user alone.
-    Nothing is kept if the folder belongs to somebody else or is a link, or if others may write to it
-    or may exchange it for another. Windows has no such owners; there the user's cache folder is
-    private.
+    Nothing is kept if the folder belongs to somebody else or is a link. Nothing is kept, either, if
+    others may write to it or exchange it for another. Windows has no such owners; there the user's
+    cache folder is private.
 
     Args:
         cache: the folder of JAX's own cache, in which the folder is made.

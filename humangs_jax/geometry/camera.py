@@ -82,12 +82,12 @@ class Camera(Batchable):
         The camera's arrays are float32. They are float64 if JAX's `jax_enable_x64` is on and K or
         `cam_from_world` is float64.
 
-        Raises: ValueError if a shape is wrong, if a number is not finite, or if a number in K or
-        `cam_from_world` is larger than 1e7. Also if K is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
-        with positive focal lengths, if the rotation is not orthonormal and right-handed (to 1e-3),
-        or if the last row of `cam_from_world` is not 0 0 0 1. Also if the sides of the image are
-        not positive whole numbers, if the lens is unknown, or if the lens does not have this number
-        of coefficients.
+        Raises: ValueError if a shape is wrong, if a number is not finite, or if the magnitude of a
+        number in K or `cam_from_world` is above 1e7. Also if K is not [[fx, 0, cx], [0, fy, cy],
+        [0, 0, 1]] with positive focal lengths, if the rotation is not orthonormal and right-handed
+        (to 1e-3), or if the last row of `cam_from_world` is not 0 0 0 1. Also if the sides of the
+        image are not positive whole numbers, if the lens is unknown, or if the lens does not have
+        this number of coefficients.
         """
         # arrays of the type that is kept: float64 only if JAX has it
         given = K, cam_from_world, distortion

@@ -248,8 +248,8 @@ class GlbWriter:
 
 
 def read_obj(path: str | Path) -> list[Any]:
-    """Returns the triangle meshes of an OBJ file with materials and textures, at least one, as
-    trimesh.Trimesh.
+    """Returns the triangle meshes of an OBJ file as trimesh.Trimesh, with materials and textures.
+    There is at least one mesh.
 
     Materials and textures that cannot be read are left out, and a warning is logged.
     Raises: FileNotFoundError; FileError if the file has no triangles, is damaged, or asks for more

@@ -397,7 +397,8 @@ def read_values(path: str | os.PathLike[str]) -> Any:
     """Returns the content of a pickle, of a file of joblib or `torch.save`, or of an npy file that
     holds a Python object. The content consists of dicts, lists and values that `as_array` takes.
 
-    Nothing in the file is run. Raises: FileNotFoundError; FileError as `read_pickle`.
+    Nothing in the file is run. Raises: FileNotFoundError; FileError, which names the file, if the
+    file cannot be read or names anything that such values do not need.
     """
     with reading(path, "pickle"):
         data = read_bytes(path, "array_bytes")
