@@ -447,10 +447,10 @@ def without_unseen(
     avatar: Avatar, poses: BodyPose, cameras: Camera, how: SplatConfig, progress: str | None = None
 ) -> Avatar:
     """Returns the avatar without the Gaussians whose blending weight is less than `ALPHA_MIN` on
-    every pixel of all these images.
+    every pixel of every image. There is one image for each pose and its camera.
 
-    All images are drawn once to find these Gaussians. This pays if the images are drawn several
-    times. docs/video.md has the error and the time.
+    All images are drawn once to find these Gaussians. This pays only if the same images are drawn
+    several times afterwards.
     """
     most = np.zeros(len(avatar.gaussians.means), np.float32)
     drawn = draw(avatar, poses, cameras, how=dataclasses.replace(how, visibility=True))

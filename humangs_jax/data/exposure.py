@@ -220,7 +220,7 @@ FITS = 16
 the fit before.
 """
 REDESCENDING = 8
-"""Number of fits, the last of `FITS`, whose weights are Cauchy's. Parts that differ then lose
+"""After this many fits, the last of `FITS`, weights are Cauchy's. Parts that differ then lose
 nearly all influence. If the first fits used these weights, too, the result would depend on where
 the search starts.
 """
@@ -352,14 +352,15 @@ def _robust_differences(
     errors: Float[np.ndarray, " r"],
     count: int,
 ) -> Float[np.ndarray, "count c"]:
-    """Returns `count` numbers x for each of c columns, (count, c), such that x[one] - x[other] is
-    the value of most rows. x is near 0 where the rows leave it open.
+    """Returns `count` numbers x for each of c columns, (count, c). Each row asks that
+    x[one] - x[other] equals its value. Most rows are met nearly. Rows that contradict them count
+    little. x is near 0 where the rows leave it open.
 
     The fit is weighted least squares, repeated `FITS` times: first with Huber's weights, then with
     Cauchy's.
 
-    ends: (one, other) of each row. values: the differences, (r, c). errors: the standard error of
-    each row.
+    ends: the indices (one, other) of each row, (r, 2). values: the value of each row, (r, c).
+    errors: the standard error of each row, (r,).
     """
     differences = np.eye(count)[ends[:, 0]] - np.eye(count)[ends[:, 1]]
     prior = np.eye(count) / OTHER_DAYS

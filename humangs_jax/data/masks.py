@@ -103,10 +103,11 @@ class _Shift(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """What a photo shows at points along the silhouette.
+    """What a photo shows at n points along the silhouette, all at one depth, or how much that
+    changes from one depth to another (`_change`).
 
-    values: the colors of the points, (n, 3), or how much their colors change, (n,). counts: whether
-    a point counts, (n,).
+    values: the colors of the points, (n, 3), or the distances between their colors at the two
+    depths, (n,). counts: whether a point counts, (n,).
     """
 
     values: np.ndarray

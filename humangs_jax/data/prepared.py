@@ -98,8 +98,8 @@ class PreparedCapture:
         return PreparedCapture(self.given, smaller, self.left_out, self.up, self.chosen)
 
     def with_body(self, config: HumanGSConfig) -> "PreparedCapture":
-        """Returns the capture with the body that carries the Gaussians of a network, and its
-        displacement.
+        """Returns a copy whose fields `body`, `displacement`, `skirt` and `network` are set for the
+        network of `config`. The body carries the network's Gaussians.
         """
         capture = self.capture
         body = gaussian_body(capture.body, config)

@@ -416,9 +416,13 @@ def _iteration_by(
 def photo_signals(
     parameters: UnconstrainedGaussians, avatar: Avatar, photo: Photo, splat: SplatConfig
 ) -> tuple[Signals, Int[Array, ""]]:
-    """Returns the signals of one photo, and the number of (splat, tile) pairs that the buffers had
-    no room for. The signals have no axis v. Their gradients are of the pixels that count,
-    `visibility` and `pixels` of all pixels. splat: has `visibility=True`.
+    """Returns the signals of one photo, without the axis v, and the number of (splat, tile) pairs
+    that the buffers had no room for.
+
+    `gradients` are of the errors on the pixels that count (`Photo.counted`). `visibility` and
+    `pixels` are over all pixels.
+
+    splat: has `visibility=True`.
     """
     image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat)
     gradient, _ = pulled(pull_back, _squared_errors(image, photo))

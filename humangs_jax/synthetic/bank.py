@@ -45,6 +45,7 @@ from humangs_jax.synthetic.subject import (
     GENERATOR_VERSION,
     PosedSubject,
     SyntheticSubject,
+    check_body,
     light_points,
     make_subject,
     paint,
@@ -290,6 +291,7 @@ def build_bank(
     if not seeds:
         raise ValueError("no seeds")
     _check_range(seeds, split)
+    check_body(body)  # worker processes load the package's body themselves
     make = functools.partial(
         _person, texture_size=texture_size, pose_count=pose_count, displaced=displaced
     )

@@ -246,17 +246,23 @@ SKIN = 0
 _shape = jax.jit(shape_body)
 
 
+def check_body(body: BodyModel) -> None:
+    """Raises ValueError if a body is not the package's. The cuts and the paint of clothes are given
+    in coordinates of the package's body.
+    """
+    if (body.name, len(body.template)) != BODY:
+        raise ValueError(f"synthetic people need the shipped body '{BODY[0]}', got '{body.name}'")
+
+
 def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> SyntheticSubject:
     """Builds the person of a seed.
 
     person: the description that is built, for example one with other clothes. None: the description
     of the seed.
 
-    Raises: ValueError if the body is not the package's body. The cuts and the paint of clothes are
-    given in coordinates of the package's body.
+    Raises: ValueError if the body is not the package's body.
     """
-    if (body.name, len(body.template)) != BODY:
-        raise ValueError(f"synthetic people need the shipped body '{BODY[0]}', got '{body.name}'")
+    check_body(body)
     if person is None:
         person = describe(seed, body)
     rest = _shape(body, jnp.asarray(person.betas))

@@ -81,6 +81,13 @@ def example(bank):
     return jitted_example(bank, jax.random.key(1), config=CONFIG)
 
 
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_bank_is_of_the_package_s_body(body, processes):
+    other = replace(body, name="another body")
+    with pytest.raises(ValueError, match="need the shipped body 'makehuman', got 'another body'"):
+        build_bank([5], other, "train", processes=processes)
+
+
 @pytest.mark.slow
 def test_banks_hold_people_of_one_split_only(bank, body, tmp_path):
     for seeds, split in (

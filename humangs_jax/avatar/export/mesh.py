@@ -215,8 +215,9 @@ def write_mesh_glb(
 ) -> None:
     """Write mesh, skin and motion as a `.glb`. If writing fails, the path stays as it was.
 
-    Arguments: motion: the motion as it is to be played (`grounded`). None: the person stands in
-    T-pose, feet on 0. name: the name of the motion. up: the axis that points up in the file.
+    Arguments: motion: written as it is. Callers put it on the floor first, see
+    `body.motion.grounded`. None: the person stands in T-pose, feet on 0. name: the name of the
+    motion. up: the axis that points up in the file.
     """
     writer = GlbWriter()
     skeleton = len(avatar.parents) + 1  # nodes: the joints, then what they hang on, then the mesh

@@ -186,8 +186,10 @@ def given(frames: int, views: int) -> Order:
 def _arranged(
     observations: Observations, mirror: Int[np.ndarray, " k"], order: Order
 ) -> Observations:
-    """Returns the keypoints of m frames in an order. They have no 3D landmarks if the order
-    exchanges sides. mirror: index of each keypoint's mirror image, (k,).
+    """Returns the keypoints of m frames after the exchanges of an `Order`. The cameras stay. If the
+    order exchanges left and right anywhere, the result has no 3D landmarks.
+
+    mirror: index of each keypoint's mirror image, (k,).
     """
     rows = np.arange(len(order.source))[:, None]
     columns = np.where(order.mirrored[rows, order.source, None], mirror, np.arange(len(mirror)))
