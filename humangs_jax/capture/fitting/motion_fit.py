@@ -37,6 +37,7 @@ from humangs_jax.body.model import BodyModel, BodyPose, shape_body, without_expr
 from humangs_jax.body.motion import Motion
 from humangs_jax.capture.fitting.landmark_fit import accelerations, keypoint_problem
 from humangs_jax.capture.fitting.residuals.keypoints import (
+    KeypointProblem,
     Observations,
     frame_residuals,
     in_camera_axes,
@@ -45,6 +46,7 @@ from humangs_jax.capture.fitting.residuals.keypoints import (
 )
 from humangs_jax.capture.fitting.state import (
     FitState,
+    Origin,
     frame_axes,
     half_squares,
     pose_of,
@@ -53,7 +55,7 @@ from humangs_jax.capture.fitting.state import (
     zero_state,
 )
 from humangs_jax.capture.keypoints.keypoints import Keypoints
-from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.compiled import compiled
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry.transform import EXACT
@@ -141,6 +143,8 @@ class _Window:
     """Poses with which the fit begins, a batch of w frames."""
     betas: Float[Array, " s"]
     """Shape with which the fit begins, (s,)."""
+    shape_is_free: Float[Array, ""]
+    """1 if the shape is fitted, 0 if it stays as it is, ()."""
     smoother: Float[Array, "w w"]
     """Matrix S of the preconditioning, (w, w), see the module's docstring."""
     timed: Float[Array, " w"]
@@ -443,6 +447,7 @@ def _run(
     window = _Window(
         poses=jax.tree.map(lambda x: x[padded], poses),
         betas=jnp.asarray(betas, jnp.float32),
+        shape_is_free=jnp.asarray(not timed, jnp.float32),
         smoother=jnp.asarray(_smoother(fps) if timed else np.eye(WINDOW), jnp.float32),
         timed=jnp.asarray(filled(np.ones(count)) * timed, jnp.float32),
         held=jnp.asarray(filled(np.zeros((count, len(_FEET))) if static is None else static)[1:]),
@@ -472,69 +477,137 @@ def _solved(
 ) -> tuple[BodyPose, Float[Array, " s"]]:
     """Fits a window, starting from its poses and shape. Returns the new poses and the shape."""
     problem = keypoint_problem(model)
-    origin = replace(problem.origin, betas=jnp.zeros_like(window.betas))
-    usual = problem.origin.pose
-    # only the root and the place start from where they are: poses are measured from the usual one,
-    # which is where their prior is
-    starts = replace(
-        window.poses, rotations=usual.rotations.at[0].set(0) + _roots_of(window.poses.rotations)
-    )
-    origins = jax.vmap(lambda pose: replace(origin, pose=pose))(starts)
-    begun = jax.vmap(lambda own, pose: state_of(own, window.betas, pose))(origins, window.poses)
-    begun = replace(begun, betas=window.betas)
-    # joints whose accelerations and jerk are expected: the body's, and the last of each finger
-    expected = {*BODY_NAMES, *(f"{side}_{each}3" for side in ("left", "right") for each in FINGERS)}
-    heavy = np.asarray([name in expected for name in model.joint_names])
-    feet = np.asarray([model.names.index(name) for name in _FEET])
+    origins = _frame_origins(problem, window)
+    start = _start_state(origins, window)
 
-    def smooth(state: FitState) -> FitState:
-        """Returns the state x = x_0 + S u for the unknowns u."""
+    def loss(unknowns: FitState) -> Float[Array, ""]:
+        """Returns half the sum of the squares of all residuals."""
+        state = _state_of_unknowns(unknowns, start, window)
+        found, landmarks, joints = _residuals_of_frames(problem, origins, seen, window, state)
+        found["shape"] = state.betas  # once, whatever the number of frames
+        found["acceleration"], found["jerk"] = _smoothness_residuals(model, window, joints)
+        found["feet"] = _foot_residuals(model, window, landmarks)
+        found["anchor"] = _anchor_residuals(window, start, state)
+        found["height"] = _height_residual(window, state.betas)
+        return half_squares(found)
 
-        def moved(old, u):
-            return old + jnp.einsum("vw,w...->v...", window.smoother, u, precision=EXACT)
-
-        return FitState(
-            begun.betas + state.betas * (1 - jnp.max(window.timed)),  # in time the shape is known
-            moved(begun.global_orient, state.global_orient),
-            moved(begun.transl, state.transl),
-            moved(begun.body_pose, state.body_pose),
-        )
-
-    def residuals(unknowns: FitState) -> dict[str, Any]:
-        state = smooth(unknowns)
-
-        def of_frame(seen, own, origin):
-            here = dataclasses.replace(problem, origin=origin)
-            found = frame_residuals(here, seen, own, window.scales[0])
-            return found, here.landmarks_and_joints(own)
-
-        by_frame = jax.vmap(of_frame, in_axes=(0, frame_axes(state), 0))
-        found, (landmarks, joints) = by_frame(seen, state, origins)
-        found["shape"] = state.betas
-        # how joints accelerate, between frames that follow each other
-        times = window.timed[1:, None, None]
-        second = accelerations(joints[:, heavy]) * times[1:] * window.rate**2
-        third = jnp.diff(second, axis=0) * window.rate
-        slack = window.scales[1]
-        found["acceleration"] = robust(second / (_ACCELERATION * slack), _PRIOR.robust_scale)
-        found["jerk"] = robust(third * times[2:] / (_JERK * slack), _PRIOR.robust_scale)
-        # feet that stand still
-        steps = jnp.diff(landmarks[:, feet], axis=0) * window.rate / _PRIOR.held_speed
-        found["feet"] = robust(jnp.sqrt(window.held)[..., None] * steps, _PRIOR.robust_scale)
-        # frames that another window has solved
-        found["anchor"] = []
-        for name in ("global_orient", "transl", "body_pose"):
-            moved = getattr(state, name) - getattr(begun, name)
-            weights = (_PRIOR.anchor * window.anchored).reshape(-1, *[1] * (moved.ndim - 1))
-            found["anchor"].append(weights * moved)
-        tall = window.tall[0] + jnp.sum(window.tall[1:] * state.betas)
-        found["height"] = window.height[1] * (tall - window.height[0]) / _PRIOR.height
-        return found
-
-    none = jax.tree.map(jnp.zeros_like, begun)
-    state = smooth(_descended(lambda unknowns: half_squares(residuals(unknowns)), none))
+    unknowns = _descended(loss, jax.tree.map(jnp.zeros_like, start))
+    state = _state_of_unknowns(unknowns, start, window)
     poses = jax.vmap(pose_of, in_axes=(0, frame_axes(state)))(origins, state)
     return poses, state.betas
+
+
+def _frame_origins(problem: KeypointProblem, window: _Window) -> Origin:
+    """Returns the origin of each frame, a batch of w. The root's rotation and the position are
+    those with which the window begins. All other joints have their usual rotations, because the
+    prior of poses is about these.
+    """
+    origin = replace(problem.origin, betas=jnp.zeros_like(window.betas))
+    begun = window.poses.rotations
+    usual_joints = problem.origin.pose.rotations.at[0].set(0)
+    roots = jnp.zeros_like(begun).at[:, 0].set(begun[:, 0])
+    poses = replace(window.poses, rotations=usual_joints + roots)
+    return jax.vmap(lambda pose: replace(origin, pose=pose))(poses)
+
+
+def _start_state(origins: Origin, window: _Window) -> FitState:
+    """Returns the state x_0 that stands for the poses and the shape with which the window begins.
+    All frames share its shape.
+    """
+
+    def of_frame(origin: Origin, pose: BodyPose) -> FitState:
+        return state_of(origin, window.betas, pose)
+
+    start = jax.vmap(of_frame)(origins, window.poses)
+    return replace(start, betas=window.betas)
+
+
+def _state_of_unknowns(unknowns: FitState, start: FitState, window: _Window) -> FitState:
+    """Returns the state x = x_0 + S u for the unknowns u, where x_0 is `start`. S mixes frames, so
+    the shape is added without it.
+    """
+
+    def moved(old: Float[Array, "w ..."], u: Float[Array, "w ..."]) -> Float[Array, "w ..."]:
+        return old + jnp.einsum("vw,w...->v...", window.smoother, u, precision=EXACT)
+
+    return FitState(
+        betas=start.betas + unknowns.betas * window.shape_is_free,
+        global_orient=moved(start.global_orient, unknowns.global_orient),
+        transl=moved(start.transl, unknowns.transl),
+        body_pose=moved(start.body_pose, unknowns.body_pose),
+    )
+
+
+def _residuals_of_frames(
+    problem: KeypointProblem,
+    origins: Origin,
+    seen: Observations,
+    window: _Window,
+    state: FitState,
+) -> tuple[dict[str, Any], Float[Array, "w k 3"], Float[Array, "w j 3"]]:
+    """Returns the residuals of each frame by itself, as `frame_residuals` does, and the landmarks,
+    (w, k, 3), and joints, (w, j, 3), of the body in each frame, metres.
+    """
+
+    def of_frame(seen: Observations, state: FitState, origin: Origin) -> tuple[Any, Any]:
+        from_origin = dataclasses.replace(problem, origin=origin)
+        found = frame_residuals(from_origin, seen, state, window.scales[0])
+        return found, from_origin.landmarks_and_joints(state)
+
+    by_frame = jax.vmap(of_frame, in_axes=(0, frame_axes(state), 0))
+    found, (landmarks, joints) = by_frame(seen, state, origins)
+    return found, landmarks, joints
+
+
+def _smoothness_residuals(
+    model: LandmarkModel, window: _Window, joints: Float[Array, "w j 3"]
+) -> tuple[Float[Array, "w2 e 3"], Float[Array, "w3 e 3"]]:
+    """Returns the residuals of the joints' accelerations, (w - 2, e, 3), and of their jerk, (w - 3,
+    e, 3). The e joints are the body's and the last one of each finger. Frames that do not follow
+    each other in time have residuals of 0.
+    """
+    expected = {*BODY_NAMES, *(f"{side}_{each}3" for side in ("left", "right") for each in FINGERS)}
+    chosen = np.asarray([name in expected for name in model.joint_names])
+    times = window.timed[1:, None, None]
+    acceleration = accelerations(joints[:, chosen]) * times[1:] * window.rate**2
+    jerk = jnp.diff(acceleration, axis=0) * window.rate
+    slack = window.scales[1]
+    return (
+        robust(acceleration / (_ACCELERATION * slack), _PRIOR.robust_scale),
+        robust(jerk * times[2:] / (_JERK * slack), _PRIOR.robust_scale),
+    )
+
+
+def _foot_residuals(
+    model: LandmarkModel, window: _Window, landmarks: Float[Array, "w k 3"]
+) -> Float[Array, "v f 3"]:
+    """Returns the residuals of the speeds of feet, (w - 1, f, 3). They are 0 for feet that do not
+    stand still.
+    """
+    steps = jnp.diff(landmarks[:, _foot_rows(model)], axis=0) * window.rate / _PRIOR.held_speed
+    return robust(jnp.sqrt(window.held)[..., None] * steps, _PRIOR.robust_scale)
+
+
+def _anchor_residuals(
+    window: _Window, start: FitState, state: FitState
+) -> list[Float[Array, "w ..."]]:
+    """Returns the residuals that hold frames to the poses that another window found: one array,
+    (w, ...), for each part of the state that poses a frame.
+    """
+    residuals = []
+    for part in ("global_orient", "transl", "body_pose"):
+        moved = getattr(state, part) - getattr(start, part)
+        one_per_frame = (-1, *[1] * (moved.ndim - 1))
+        weights = (_PRIOR.anchor * window.anchored).reshape(one_per_frame)
+        residuals.append(weights * moved)
+    return residuals
+
+
+def _height_residual(window: _Window, betas: Float[Array, " s"]) -> Float[Array, ""]:
+    """Returns the residual of the person's height, (). It is 0 if the height is not known."""
+    tall = window.tall[0] + jnp.sum(window.tall[1:] * betas)
+    known = window.height[1]
+    return known * (tall - window.height[0]) / _PRIOR.height
 
 
 def _descended(loss: Callable[[FitState], Float[Array, ""]], start: Any) -> FitState:
@@ -552,11 +625,6 @@ def _descended(loss: Callable[[FitState], Float[Array, ""]], start: Any) -> FitS
     return found
 
 
-def _roots_of(rotations: Float[Array, "m j 3"]) -> Float[Array, "m j 3"]:
-    """Returns rotations, (m, j, 3), in which only the root's rotation is kept. All others are 0."""
-    return jnp.zeros_like(rotations).at[:, 0].set(rotations[:, 0])
-
-
 # Feet and floor
 # --------------------------------------------------------------------------------------------------
 
@@ -568,8 +636,9 @@ def _landmarks(
     return jax.vmap(lambda pose: pose_landmarks(model, betas, pose))(poses)
 
 
-def _feet(model: LandmarkModel, landmarks: Float[Array, "m k 3"]) -> Float[np.ndarray, "m f 3"]:
-    return np.asarray(landmarks)[:, [model.names.index(name) for name in _FEET]]
+def _foot_rows(model: LandmarkModel) -> Int[np.ndarray, " f"]:
+    """Returns the indices of the landmarks of `_FEET`, (f,)."""
+    return np.asarray([model.names.index(name) for name in _FEET])
 
 
 def _static_feet(
@@ -579,7 +648,8 @@ def _static_feet(
     frame and this one, (m, f), 0 to 1. It is 0 in the first frame.
     """
     points, _ = _landmarks(model, jnp.asarray(betas, jnp.float32), poses)
-    moved = np.diff(_feet(model, points), axis=0, prepend=np.nan) * fps
+    feet = np.asarray(points)[:, _foot_rows(model)]
+    moved = np.diff(feet, axis=0, prepend=np.nan) * fps
     moved[..., 2] /= 2  # depths of a single camera are unsteady
     speed = np.nan_to_num(np.linalg.norm(moved, axis=-1), nan=np.inf)
     # metres a second: a point that is slower than the first stands still, one that is faster than
