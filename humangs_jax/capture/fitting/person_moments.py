@@ -416,45 +416,85 @@ def evidence_of(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> tuple[Ev
     """Returns the landmarks, with left and right exchanged in the mirrored views, and cameras to
     start from.
     """
-    # the landmarks of mirrored views, in the order of their mirror images
-    focal, std, kinds = _focal_lengths(seen)
+    seen = _unmirrored(seen, mirrored)
+    points, weights = seen.points - np.asarray(seen.sizes)[:, None] / 2, seen.visibility
+    focal, focal_std, kinds = _focal_lengths(seen)
+    evidence = Evidence(
+        points=points,
+        weights=weights,
+        noise=_noise(points, weights),
+        world=_centred_world(seen, points, focal),
+        focal=focal,
+        focal_std=focal_std,
+        kinds=kinds,
+        bones=_bones(seen.names),
+    )
+    return evidence, _first_rig(evidence)
+
+
+def _unmirrored(seen: PersonViews, mirrored: Bool[np.ndarray, " c"]) -> PersonViews:
+    """Returns the views with left and right exchanged in the mirrored ones.
+
+    A detector that takes the back for the front may also see the body turned round. If the
+    exchanged 3D landmarks show a mirrored body, their depths are negated.
+    """
     mirror = [seen.names.index(mirrored_name(name)) for name in seen.names]
     order = np.where(mirrored[:, None], mirror, np.arange(len(mirror)))
+    views = np.arange(len(order))[:, None]
+    visibility, world = seen.visibility[views, order], seen.world[views, order]
+    for view in np.flatnonzero(mirrored):
+        known = visibility[view] > SEEN
+        if handedness(*only_known(world[view], seen.names, known)) < 0:
+            world[view, :, 2] *= -1
+    points = seen.points[views, order]
+    return dataclasses.replace(seen, points=points, visibility=visibility, world=world)
 
-    def pick(values: np.ndarray) -> np.ndarray:
-        """Returns values (c, k, ...) with the landmarks of mirrored views exchanged."""
-        at = order.reshape(*order.shape, *[1] * (values.ndim - 2))
-        return np.take_along_axis(values, at, axis=1)
 
-    points, weights = pick(seen.points - np.asarray(seen.sizes)[:, None] / 2), pick(seen.visibility)
-    world = pick(seen.world)
-    for own, shown, flipped in zip(world, weights > SEEN, mirrored, strict=True):
-        # the detector saw the body turned round as well
-        if flipped and handedness(*only_known(own, seen.names, shown)) < 0:
-            own[:, 2] *= -1
-    # 3D landmarks in the axes of their camera, centred, and of one size in all views
-    K = focal[:, None, None] * np.diag([1, 1, 0]) + np.diag([0, 0, 1])
+def _noise(
+    points: Float[np.ndarray, "c k 2"], weights: Float[np.ndarray, "c k"]
+) -> Float[np.ndarray, " c"]:
+    """Returns the standard deviation of the detections in each view, (c,), pixels. It is
+    proportional to the person's size in the photo.
+    """
+    sizes = []
+    for own, weight in zip(points, weights, strict=True):
+        low, high = np.quantile(own[weight > 0], OUTER, axis=0)
+        sizes.append((high - low).max())
+    return NOISE * np.asarray(sizes)
+
+
+def _centred_world(
+    seen: PersonViews, points: Float[np.ndarray, "c k 2"], focal: Float[np.ndarray, " c"]
+) -> Float[np.ndarray, "c k 3"]:
+    """Returns the detector's 3D landmarks in the axes of each camera, (c, k, 3), metres. They are
+    relative to their weighted mean, and have one size in all views.
+
+    points: (c, k, 2), pixels from the principal point. focal: (c,), pixels.
+    """
+    weights = seen.visibility
+    # the ray to the person goes through the hips, or through all landmarks if a hip is not seen
     hips = np.asarray([name in ("left_hip", "right_hip") for name in seen.names])
-    both_hips = (weights * hips).all(1, where=hips, keepdims=True)
-    middle = np.where(both_hips, weights * hips, weights)
-    world = in_camera_axes(world, points, middle, K)
-    means = (weights[..., None] * world).sum(1) / weights.sum(1)[:, None]
-    world = world - means[:, None]
-    radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / weights.sum(1))
-    world *= (np.median(radii) / radii)[:, None, None]
-    # cameras to start from: the views turned together, each placed where its pixels are
-    shape, rotations = align_views(world, weights)
-    sizes = [
-        float(np.ptp(np.quantile(p[w > 0], OUTER, axis=0), axis=0).max())
-        for p, w in zip(points, weights, strict=True)
-    ]
-    noise = NOISE * np.asarray(sizes)
-    offsets = np.einsum("cab,kb->cka", rotations, shape)
-    places = np.stack(
-        [place_person(*own) for own in zip(points, weights, offsets, focal, strict=True)]
-    )
-    evidence = Evidence(points, weights, noise, world, focal, std, kinds, _bones(seen.names))
-    return evidence, Rig(shape, rotations, places, focal)
+    both_hips = weights.all(1, where=hips, keepdims=True)
+    middle_weights = np.where(both_hips, weights * hips, weights)
+    K = focal[:, None, None] * np.diag([1, 1, 0]) + np.diag([0, 0, 1])
+    world = in_camera_axes(seen.world, points, middle_weights, K)
+    # the mean moves to the origin
+    total = weights.sum(1)
+    world = world - ((weights[..., None] * world).sum(1) / total[:, None])[:, None]
+    # all views get the median size
+    radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / total)
+    return world * (np.median(radii) / radii)[:, None, None]
+
+
+def _first_rig(evidence: Evidence) -> Rig:
+    """Returns cameras to start from, and the mean landmarks. The views are turned onto each other,
+    and each camera is placed so that the landmarks project to their pixels.
+    """
+    landmarks, rotations = align_views(evidence.world, evidence.weights)
+    offsets = np.einsum("cab,kb->cka", rotations, landmarks)
+    views = zip(evidence.points, evidence.weights, offsets, evidence.focal, strict=True)
+    places = np.stack([place_person(*view) for view in views])
+    return Rig(landmarks, rotations, places, evidence.focal)
 
 
 def _bones(names: Sequence[str]) -> Int[np.ndarray, "b 2 2"]:
