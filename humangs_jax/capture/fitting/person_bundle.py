@@ -493,41 +493,52 @@ class NormalEquations:
 
 
 def normal_equations(evidence: Evidence, rows: Rows, of: Derivatives) -> NormalEquations:
-    """Returns the normal equations of all residuals."""
+    """Returns the normal equations of all residuals.
+
+    There are c views, k landmarks, g kinds of camera, and m = 9 c + g unknowns of the cameras: nine
+    of each view, then the y of each kind. A landmark's residuals in a view depend on the landmark,
+    on the view's nine unknowns, and on the y of the view's kind.
+    """
     c, k = evidence.weights.shape
     g = len(rows.focal)
-    own = np.eye(g)[evidence.kinds]  # (c, g) 1 for the kind of a view
     m = VIEW * c + g
-    landmark, view, focal = of.by_landmark, of.by_view, of.by_focal
+    of_views, of_kinds = slice(0, VIEW * c), slice(VIEW * c, m)
+    kind_of_view = np.eye(g)[evidence.kinds]  # (c, g), 1 at the kind of a view
 
-    # between landmarks and cameras
-    transposed = np.swapaxes(landmark, -1, -2)
+    # J^T J between landmarks and cameras
+    by_landmark_t = np.swapaxes(of.by_landmark, -1, -2)
+    landmark_view = by_landmark_t @ of.by_view
+    landmark_focal = (by_landmark_t @ of.by_focal[..., None])[..., 0]
     between = np.zeros((k, 3, m))
-    between[..., : VIEW * c] = np.moveaxis(transposed @ view, 0, 2).reshape(k, 3, VIEW * c)
-    between[..., VIEW * c :] = np.einsum(
-        "cka,cg->kag", (transposed @ focal[..., None])[..., 0], own
-    )
+    between[..., of_views] = np.moveaxis(landmark_view, 0, 2).reshape(k, 3, VIEW * c)
+    between[..., of_kinds] = np.einsum("cka,cg->kag", landmark_focal, kind_of_view)
 
-    # between cameras: views among themselves, and with the kind of theirs
-    views = view.reshape(c, k * 5, VIEW)
-    zoom = focal.reshape(c, k * 5, 1)
-    turned = np.swapaxes(views, 1, 2)
+    # J^T J between cameras, with all rows of a view along one axis
+    by_view = of.by_view.reshape(c, -1, VIEW)
+    by_focal = of.by_focal.reshape(c, -1, 1)
+    by_view_t = np.swapaxes(by_view, 1, 2)
+    view_kind = ((by_view_t @ by_focal) * kind_of_view[:, None]).reshape(VIEW * c, g)
+    diagonal = kind_of_view.T @ np.sum(by_focal**2, axis=(1, 2))
     cameras = np.zeros((m, m))
-    blocks = np.zeros((c, VIEW, c, VIEW))
-    blocks[np.arange(c), :, np.arange(c)] = turned @ views
-    cameras[: VIEW * c, : VIEW * c] = blocks.reshape(VIEW * c, VIEW * c)
-    cross = ((turned @ zoom) * own[:, None]).reshape(VIEW * c, g)
-    cameras[: VIEW * c, VIEW * c :], cameras[VIEW * c :, : VIEW * c] = cross, cross.T
-    cameras[VIEW * c :, VIEW * c :] = np.diag(own.T @ np.sum(zoom**2, axis=(1, 2)) + 1)
+    for view, block in enumerate(by_view_t @ by_view):
+        own = slice(VIEW * view, VIEW * (view + 1))
+        cameras[own, own] = block
+    cameras[of_views, of_kinds] = view_kind
+    cameras[of_kinds, of_views] = view_kind.T
+    cameras[of_kinds, of_kinds] = np.diag(diagonal + 1)  # each y is a residual, too
 
-    seen = rows.seen.reshape(c, k * 5, 1)
-    by_focal = own.T @ np.sum(zoom * seen, axis=(1, 2)) + rows.focal
+    # J^T r
+    seen = rows.seen.reshape(c, -1, 1)
+    gradient_landmarks = np.sum(by_landmark_t @ rows.seen[..., None], axis=0)[..., 0]
+    gradient_views = (by_view_t @ seen).ravel()
+    gradient_kinds = kind_of_view.T @ np.sum(by_focal * seen, axis=(1, 2)) + rows.focal
+
     return NormalEquations(
-        landmarks=np.sum(transposed @ landmark, axis=0),
+        landmarks=np.sum(by_landmark_t @ of.by_landmark, axis=0),
         cameras=cameras,
         between=between,
-        by_landmarks=np.sum(transposed @ rows.seen[..., None], axis=0)[..., 0],
-        by_cameras=np.concatenate([(turned @ seen).ravel(), by_focal]),
+        by_landmarks=gradient_landmarks,
+        by_cameras=np.concatenate([gradient_views, gradient_kinds]),
         tied=of.tied,
         tied_rows=rows.tied,
         kinds=g,
