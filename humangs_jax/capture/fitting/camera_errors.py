@@ -8,6 +8,16 @@ A detector's landmarks have errors too, but these differ from landmark to landma
 only reported if its correction exceeds several standard errors. The standard errors come from the
 scatter over landmarks (a sandwich estimate, clustered by landmark). Cameras are turned one after
 the other, as long as each turn clearly explains residuals.
+
+Axes of arrays, also in `einsum`:
+
+    m           moments
+    c, d        views of a moment
+    k           landmarks, which are free points
+    i           x and y of a pixel
+    a, b, p, q  coordinates in space, or components of a rotation vector
+    n           cameras
+    u           unknowns: the rotation vectors of cameras, one after the other
 """
 
 import dataclasses
@@ -276,39 +286,55 @@ class _Seen:
     ) -> "_Linearized":
         """Returns the equations for the rotations of the cameras, linearised at `turned` and
         `points`. The points are eliminated by the Schur complement.
+
+        The cost of one landmark at one moment is 1/2 sum_c w_c |e_c + P_c x + T_c t_c|^2. Here w
+        are the weights, e the errors, x the step of the point, t the rotations of the views, and P
+        and T the derivatives of the pixels by both. Eliminating x leaves, at t = 0:
+
+            step      x = -H^-1 sum_c w_c P_c^T e_c            H = sum_c w_c P_c^T P_c
+            gradient  w_c T_c^T r_c                            r_c = e_c + P_c x
+            Hessian   -M_c H^-1 M_d^T, for c = d plus          M_c = w_c T_c^T P_c
+                      w_c T_c^T T_c
         """
         seen = self._projected(turned, points)
         by_point, by_turn = seen.derivatives()
-        # a step of Gauss and Newton for each point, with the cameras held still
-        own = np.einsum("mck,mckia,mckib->mkab", weights, by_point, by_point)
-        ridge = 1e-9 + 1e-6 * np.trace(own, axis1=-2, axis2=-1)[..., None, None]
-        inverse = np.linalg.inv(own + ridge * np.eye(3))
+        # the Gauss-Newton step of each point, -x, with the cameras held still
+        point_hessians = np.einsum("mck,mckia,mckib->mkab", weights, by_point, by_point)
+        ridge = 1e-9 + 1e-6 * np.trace(point_hessians, axis1=-2, axis2=-1)[..., None, None]
+        inverse = np.linalg.inv(point_hessians + ridge * np.eye(3))
         step = np.einsum(
             "mkab,mck,mckib,mcki->mka", inverse, weights, by_point, seen.errors, optimize=True
         )
-        # gradients: what the cameras can still do about the errors that this step leaves
-        left = seen.errors - np.einsum("mckib,mkb->mcki", by_point, step)
-        of_views = np.einsum("mck,mckia,mcki->mcka", weights, by_turn, left)
-        # Hessians: the Schur complement of the points, for each pair of views
+        # gradients by the rotation of each view
+        remaining = seen.errors - np.einsum("mckib,mkb->mcki", by_point, step)
+        gradients = np.einsum("mck,mckia,mcki->mcka", weights, by_turn, remaining)
+        # Hessians by the rotations of each pair of views
         mixed = np.einsum("mck,mckia,mckib->mckab", weights, by_turn, by_point)
-        of_pairs = -np.einsum("mckap,mkpq,mdkbq->mcdkab", mixed, inverse, mixed, optimize=True)
-        every = np.arange(of_pairs.shape[1])
-        of_pairs[:, every, every] += np.einsum("mck,mckia,mckib->mckab", weights, by_turn, by_turn)
-        return _Linearized(self._by_camera(of_views, of_pairs), seen.errors, points - step)
+        pair_hessians = -np.einsum("mckap,mkpq,mdkbq->mcdkab", mixed, inverse, mixed, optimize=True)
+        views = np.arange(pair_hessians.shape[1])
+        pair_hessians[:, views, views] += np.einsum(
+            "mck,mckia,mckib->mckab", weights, by_turn, by_turn
+        )
+        return _Linearized(self._by_camera(gradients, pair_hessians), seen.errors, points - step)
 
     def _by_camera(
-        self, of_views: Float[np.ndarray, "m c k 3"], of_pairs: Float[np.ndarray, "m c c k 3 3"]
+        self,
+        gradients: Float[np.ndarray, "m c k 3"],
+        pair_hessians: Float[np.ndarray, "m c c k 3 3"],
     ) -> "_Equations":
         """Returns the equations for the cameras. Gradients of views and Hessians of pairs of views
-        are summed over the views of each camera.
+        are summed over the moments and over the views of each camera.
         """
-        k, n = of_views.shape[2], self.count
-        gradients, matrices = np.zeros((n, k, 3)), np.zeros((n, n, k, 3, 3))
-        np.add.at(gradients, self.camera, of_views)
-        np.add.at(matrices, (self.camera[:, :, None], self.camera[:, None]), of_pairs)
+        k, n = gradients.shape[2], self.count
+        of_cameras, of_camera_pairs = np.zeros((n, k, 3)), np.zeros((n, n, k, 3, 3))
+        # `np.add.at` adds all views of a camera, where += would keep one
+        np.add.at(of_cameras, self.camera, gradients)
+        camera_pairs = (self.camera[:, :, None], self.camera[:, None])
+        np.add.at(of_camera_pairs, camera_pairs, pair_hessians)
+        # the axes (n, 3) of cameras and rotation vectors become the axis u
         return _Equations(
-            gradients.transpose(1, 0, 2).reshape(k, 3 * n),
-            matrices.transpose(2, 0, 3, 1, 4).reshape(k, 3 * n, 3 * n),
+            gradients=of_cameras.transpose(1, 0, 2).reshape(k, 3 * n),
+            matrices=of_camera_pairs.transpose(2, 0, 3, 1, 4).reshape(k, 3 * n, 3 * n),
         )
 
 
