@@ -468,10 +468,14 @@ def _descend(evidence: Evidence, rig: Rig, scale: float, tolerance: float) -> tu
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Blocks of the normal equations J^T J and J^T r. They contain the rows `seen` and `focal`. The
-    rows `tied`, of size and bones, are kept separately and not multiplied.
+    """Blocks of J^T J and J^T r of the normal equations. They are sums over the residuals `seen`
+    and `focal` of `Rows`.
 
-    The cameras have m = 9 c + g unknowns.
+    The residuals `tied`, of size and bones, are not in these sums. They and their derivatives are
+    kept as they are.
+
+    The cameras have m = 9 c + g unknowns: 9 for each of c views, and 1 for each of g kinds of
+    cameras.
     """
 
     landmarks: Float[np.ndarray, "k 3 3"]
