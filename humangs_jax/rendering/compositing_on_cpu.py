@@ -34,7 +34,7 @@ from humangs_jax.rendering.splat_rows import (
     take_chunk,
     visible_alpha,
 )
-from humangs_jax.rendering.tiling import TileGrid, blocks_by_length
+from humangs_jax.rendering.tiling import TileGrid, TileLists, blocks_by_length
 
 
 class _Chain(NamedTuple):
@@ -63,87 +63,134 @@ def forward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Comp
     """Returns the drawing function (splats, items, starts, counts) -> `Composited`. Tile t has the
     splats `items[starts[t] : starts[t] + counts[t]]`.
     """
-    block, k, stop = config.block, config.chunk, config.transmittance_stop
 
     @joined_over_batch
     def forward(splats, items, starts, counts):
-        dtype, t = splats.dtype, counts.shape[0]
-        blocks = blocks_by_length(counts, block)
+        t, p, dtype = counts.shape[0], grid.pixels, splats.dtype
+        n = splats.shape[1] - FEATURES.start
+        blocks = blocks_by_length(counts, config.block)
 
-        def draw(b, drawn):
-            tile = lax.dynamic_slice_in_dim(blocks.tiles, b * block, block)
-            start, count = _lists_of(tile, starts, counts)
-
-            def body(chain):
-                i, transmittance, features, lengths, live, peaks, medians = chain
-                item, row, _, raw = take_chunk(
-                    splats, items, start + i * k, count - i * k, tile, grid, k
-                )
-                # one exp a pair: without the barrier each kernel that uses it computes it again
-                raw = lax.optimization_barrier(raw)
-                alpha = lax.optimization_barrier(visible_alpha(raw, config))
-                # features, weights and medians in one chain: `before` is T in front of splat j
-                before, weights = transmittance[:, None], []
-                for j in range(k):
-                    after = before * (1 - alpha[:, None, j])
-                    weight = jnp.where(after > stop, alpha[:, None, j] * before, 0.0)
-                    features = features + weight * row[:, j, FEATURES, None]
-                    weights.append(weight)
-                    before = after
-                    if medians is not None:
-                        reached = (weight[:, 0] > 0) & (after[:, 0] <= HALF)
-                        nearer = jnp.minimum(medians, row[:, j, Z, None])
-                        medians = jnp.where(reached, nearer, medians)
-                # the largest weight of each splat on the pixels of this block
-                if config.visibility:
-                    highest = largest_weights(jnp.concatenate(weights, axis=1), tile, grid)
-                    peaks = peaks.at[item].max(highest, mode="drop")
-                # T itself in a second chain; from the stop on its sign is negative
-                for j in range(k):
-                    after = transmittance * (1 - alpha[:, j])
-                    transmittance = jnp.where(
-                        after > stop, after, jnp.minimum(transmittance, -transmittance)
-                    )
-                # a list is alive while it has items left and some pixel of its tile has not ended
-                lengths = jnp.where(live, jnp.minimum((i + 1) * k, count), lengths)
-                live = (jnp.max(transmittance, axis=1) > 0) & ((i + 1) * k < count)
-                return _Chain(i + 1, transmittance, features, lengths, live, peaks, medians)
+        def draw_block(b, drawn):
+            tiles = lax.dynamic_slice_in_dim(blocks.tiles, b * config.block, config.block)
+            lists = TileLists(items, *_lists_of(tiles, starts, counts))
 
             # every pixel of the block starts with T = 1 and no features
-            ones = jnp.ones((block, grid.pixels), dtype)
-            zeros = jnp.zeros((block, splats.shape[1] - FEATURES.start, grid.pixels), dtype)
-            medians = None
-            if config.depth_median:
-                medians = jnp.full_like(ones, jnp.inf)
-            chain = _Chain(0, ones, zeros, jnp.zeros_like(count), count > 0, drawn.peaks, medians)
-            chain = lax.while_loop(lambda chain: jnp.any(chain.live), body, chain)
-
-            final = jnp.abs(chain.transmittance)  # the sign marked pixels that had ended
+            ones = jnp.ones((config.block, p), dtype)
+            zeros = jnp.zeros((config.block, n, p), dtype)
+            medians = jnp.full_like(ones, jnp.inf) if config.depth_median else None
+            unread = jnp.zeros_like(lists.counts)
+            chain = _Chain(0, ones, zeros, unread, lists.counts > 0, drawn.peaks, medians)
+            chain = lax.while_loop(
+                lambda chain: jnp.any(chain.live),
+                lambda chain: _draw_chunk(chain, splats, lists, tiles, grid, config),
+                chain,
+            )
 
             def placed(of_all, of_block):
                 """Returns `of_all`, the values of all tiles, with the tiles of this block replaced
                 by `of_block`. Padding tiles are dropped.
                 """
-                return of_all.at[tile].set(of_block, mode="drop", unique_indices=True)
+                return of_all.at[tiles].set(of_block, mode="drop", unique_indices=True)
 
-            medians = None
+            final = jnp.abs(chain.transmittance)  # the sign marked pixels that had ended
+            medians_of_tiles = None
             if config.depth_median:
-                medians = placed(drawn.medians, chain.medians)
-            features = placed(drawn.features, chain.features)
-            transmittance = placed(drawn.transmittance, final)
-            lengths = placed(drawn.lengths, chain.lengths)
-            return Composited(features, transmittance, lengths, chain.peaks, medians)
+                medians_of_tiles = placed(drawn.medians, chain.medians)
+            return Composited(
+                features=placed(drawn.features, chain.features),
+                transmittance=placed(drawn.transmittance, final),
+                lengths=placed(drawn.lengths, chain.lengths),
+                peaks=chain.peaks,
+                medians=medians_of_tiles,
+            )
 
         empty = Composited(
-            features=jnp.zeros((t, splats.shape[1] - FEATURES.start, grid.pixels), dtype),
-            transmittance=jnp.ones((t, grid.pixels), dtype),
+            features=jnp.zeros((t, n, p), dtype),
+            transmittance=jnp.ones((t, p), dtype),
             lengths=jnp.zeros(t, jnp.int32),
             peaks=jnp.zeros(splats.shape[0], dtype),
-            medians=jnp.full((t, grid.pixels), jnp.inf, dtype) if config.depth_median else None,
+            medians=jnp.full((t, p), jnp.inf, dtype) if config.depth_median else None,
         )
-        return lax.fori_loop(0, blocks.used, draw, empty)
+        return lax.fori_loop(0, blocks.used, draw_block, empty)
 
     return forward
+
+
+def _draw_chunk(
+    chain: _Chain,
+    splats: Float[Array, "g width"],
+    lists: TileLists,
+    tiles: Int[Array, " block"],
+    grid: TileGrid,
+    config: SplatConfig,
+) -> _Chain:
+    """Draws the next chunk of each list of a block. Returns the values for the chunk after it.
+
+    lists: the lists of the block, one for each of its `tiles`.
+    """
+    i, k = chain.chunk, config.chunk
+    item, row, _, raw = take_chunk(
+        splats, lists.items, lists.starts + i * k, lists.counts - i * k, tiles, grid, k
+    )
+    # one exp a pair: without the barrier each kernel that uses it computes it again
+    raw = lax.optimization_barrier(raw)
+    alpha = lax.optimization_barrier(visible_alpha(raw, config))
+
+    # the first chain: everything but T
+    features, medians, weights = _blend(chain, row, alpha, config.transmittance_stop)
+    peaks = chain.peaks
+    if config.visibility:
+        highest = largest_weights(jnp.concatenate(weights, axis=1), tiles, grid)
+        peaks = peaks.at[item].max(highest, mode="drop")
+
+    # the second chain: T
+    transmittance = _fade(chain.transmittance, alpha, config.transmittance_stop)
+
+    # how far the lists were read, and which of them go on
+    lengths = jnp.where(chain.live, jnp.minimum((i + 1) * k, lists.counts), chain.lengths)
+    live = (jnp.max(transmittance, axis=1) > 0) & ((i + 1) * k < lists.counts)
+    return _Chain(i + 1, transmittance, features, lengths, live, peaks, medians)
+
+
+def _blend(
+    chain: _Chain, row: Float[Array, "block k width"], alpha: Float[Array, "block k p"], stop: float
+) -> tuple[Array, Array | None, list[Array]]:
+    """Blends the splats of a chunk, one after the other. Returns the features and the medians
+    behind the chunk, as in `_Chain`, and the weight w of each splat, k arrays (block, 1, p).
+
+    T is computed here and once more in `_fade`, because XLA then makes one kernel of each chain.
+    """
+    features, medians, weights = chain.features, chain.medians, []
+    before = chain.transmittance[:, None]  # T in front of splat j; negative in pixels that ended
+    for j in range(alpha.shape[1]):
+        after = before * (1 - alpha[:, None, j])
+        weight = jnp.where(after > stop, alpha[:, None, j] * before, 0.0)
+        features = features + weight * row[:, j, FEATURES, None]
+        weights.append(weight)
+        before = after
+        if medians is not None:
+            reached = (weight[:, 0] > 0) & (after[:, 0] <= HALF)
+            nearer = jnp.minimum(medians, row[:, j, Z, None])
+            medians = jnp.where(reached, nearer, medians)
+    return features, medians, weights
+
+
+def _fade(
+    transmittance: Float[Array, "block p"], alpha: Float[Array, "block k p"], stop: float
+) -> Float[Array, "block p"]:
+    """Returns T behind a chunk, (block, p). Where a pixel has ended, it is minus the final T.
+
+    transmittance: T in front of the chunk, negative in the same way.
+    """
+    for j in range(alpha.shape[1]):
+        after = transmittance * (1 - alpha[:, j])
+        transmittance = jnp.where(after > stop, after, _ended(transmittance))
+    return transmittance
+
+
+def _ended(transmittance: Array) -> Array:
+    """Returns -T for pixels that end here, with T > 0, or that have ended, with -T already."""
+    return jnp.minimum(transmittance, -transmittance)
 
 
 class _BackwardChain(NamedTuple):
