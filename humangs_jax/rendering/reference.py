@@ -15,12 +15,13 @@ use it in float64 on small images.
 
 import functools
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.numerics import safe_sqrt
 from humangs_jax.geometry import transform
@@ -71,6 +72,23 @@ def render_reference(
     return _reference(*drawn, splat_config(config), features, shifts)
 
 
+class _State(NamedTuple):
+    """What the pixels have seen of the Gaussians so far."""
+
+    color: Float[Array, "h w n"]
+    """Sum of w times the color and the further features, (h, w, n). w is the weight, alpha T."""
+    depth_sum: Float[Array, "h w"]
+    """Sum of w times the depth."""
+    squared_depth_sum: Float[Array, "h w"]
+    """Sum of w times the square of the depth."""
+    median: Float[Array, "h w"]
+    """Depth of the Gaussian behind which T is one half or less; 0 before it."""
+    transmittance: Float[Array, "h w"]
+    """T, the product of 1 - alpha."""
+    ended: Bool[Array, "h w"]
+    """Whether the pixel has ended."""
+
+
 @jax.jit
 def _reference(
     gaussians: Gaussians,
@@ -81,26 +99,28 @@ def _reference(
     shifts: Array | None,
 ) -> Rendering:
     """Returns the rendering of all Gaussians on all pixels, see the module."""
-    # Gaussians on the image: centres, axes, opacities as they are drawn
+    # the Gaussians on the image, the nearest first
     centers, axes, depths, visible = _project(gaussians, camera, config)
     if shifts is not None:
         centers = centers + shifts
     eps2d = added_variance(gaussians.pixel_footprint, config.eps2d)
-    determinants, opacities = _determinant(axes, eps2d), gaussians.opacities
-    if gaussians.pixel_footprint is not None and eps2d > 0:  # dimmed as `projection` says
-        away = 1.0 if camera.lens == "orthographic" else depths
-        contained = eps2d * jnp.minimum((gaussians.pixel_footprint * camera.K[0, 0] / away) ** 2, 1)
-        opacities = opacities * jnp.sqrt(_determinant(axes, contained) / determinants)
-    elif config.antialiased and eps2d > 0:
-        opacities = opacities * safe_sqrt(_determinant(axes, 0.0) / determinants)
-    # the nearest first, and all pixels
+    determinants = _determinant(axes, eps2d)
+    opacities = _drawn_opacities(gaussians, camera, config, axes, depths, determinants)
     order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
+
+    # all pixels
     y, x = jnp.mgrid[: camera.height, : camera.width] + 0.5
     pixels = jnp.stack([x, y], axis=-1).astype(centers.dtype)
+    blank = jnp.zeros((camera.height, camera.width), centers.dtype)
+
+    # what is blended: colors and further features
+    colors = _seen_colors(gaussians, camera, visible)
+    if features is not None:
+        colors = jnp.concatenate([colors, features], axis=-1)
+    no_color = jnp.zeros((*blank.shape, colors.shape[1]), blank.dtype)
 
     def draw(state, splat):
-        color, (first, second), median, transmittance, ended = state
-        center, axis, determinant, depth, is_visible, opacity, rgb = splat
+        center, axis, determinant, depth, is_visible, opacity, color = splat
         # alpha of this Gaussian at each pixel
         d = pixels - center
         squared = jnp.sum(_cross(axis, d[..., None]) ** 2, axis=-1) + eps2d * jnp.sum(d**2, axis=-1)
@@ -108,55 +128,83 @@ def _reference(
         alpha = jnp.where(raw < config.alpha_max, raw, config.alpha_max)
         alpha = jnp.where(is_visible & (raw >= config.alpha_min), alpha, 0.0)
         # a pixel ends before the Gaussian that would leave too little
-        ended = ended | (transmittance * (1 - alpha) <= config.transmittance_stop)
+        before = state.transmittance
+        ended = state.ended | (before * (1 - alpha) <= config.transmittance_stop)
         alpha = jnp.where(ended, 0.0, alpha)
-        weight, after = alpha * transmittance, transmittance * (1 - alpha)
-        state = (
-            color + weight[..., None] * rgb,
-            (first + weight * depth, second + weight * depth**2),
-            jnp.where((transmittance > 0.5) & (after <= 0.5), depth, median),
-            after,
-            ended,
+        # this Gaussian is added with its weight
+        weight = alpha * before
+        after = before * (1 - alpha)
+        state = _State(
+            color=state.color + weight[..., None] * color,
+            depth_sum=state.depth_sum + weight * depth,
+            squared_depth_sum=state.squared_depth_sum + weight * depth**2,
+            median=jnp.where((before > 0.5) & (after <= 0.5), depth, state.median),
+            transmittance=after,
+            ended=ended,
         )
         return state, None
 
-    # colors along the line of sight
-    blank = jnp.zeros((camera.height, camera.width), centers.dtype)
-    colors = gaussians.colors
-    if gaussians.harmonics is not None:
-        sight = jnp.where(
-            visible[:, None], transform.apply(camera.cam_from_world, gaussians.means), 1.0
-        )
-        if camera.lens == "orthographic":
-            sight = jnp.zeros_like(sight).at[:, 2].set(1.0)
-        sight = jnp.matmul(sight, camera.cam_from_world[:3, :3], precision=transform.EXACT)
-        sight = sight / jnp.linalg.norm(sight, axis=-1, keepdims=True)
-        functions = _harmonics(sight, math.isqrt(gaussians.harmonics.shape[1]))
-        added = jnp.einsum("gk,gkc->gc", functions, gaussians.harmonics, precision=transform.EXACT)
-        colors = jnp.maximum(colors + added, 0)
-    if features is not None:
-        colors = jnp.concatenate([colors, features], axis=-1)
-    # the loop over the Gaussians, and the image over the background
-    colored = jnp.zeros((*blank.shape, colors.shape[1]), blank.dtype)
-    state = colored, (blank, blank), blank, blank + 1, blank > 0
+    start = _State(no_color, blank, blank, blank, transmittance=blank + 1, ended=blank > 0)
     splats = centers, axes, determinants, depths, visible, opacities, colors
-    (color, (first, second), median, transmittance, _), _ = lax.scan(
-        draw, state, jax.tree.map(lambda leaf: leaf[order], splats)
-    )
-    alpha = 1 - transmittance
+    splats = jax.tree.map(lambda leaf: leaf[order], splats)
+    seen, _ = lax.scan(draw, start, splats)
+
+    # the image over the background
+    alpha = 1 - seen.transmittance
     some = alpha > 0
-    depth = jnp.where(some, first / jnp.where(some, alpha, 1.0), 0.0)
-    rgb = color[..., :3] + transmittance[..., None] * background
+    depth = jnp.where(some, seen.depth_sum / jnp.where(some, alpha, 1.0), 0.0)
+    rgb = seen.color[..., :3] + seen.transmittance[..., None] * background
+    distortion = None
+    if config.distortion:
+        distortion = 2 * (alpha * seen.squared_depth_sum - seen.depth_sum**2)
     return Rendering(
         rgb,
         alpha,
         depth,
         jnp.int32(0),
-        features=None if features is None else color[..., 3:],
-        depth_sum=first if config.depth_sum else None,
-        depth_median=lax.stop_gradient(median) if config.depth_median else None,
-        distortion=2 * (alpha * second - first**2) if config.distortion else None,
+        features=None if features is None else seen.color[..., 3:],
+        depth_sum=seen.depth_sum if config.depth_sum else None,
+        depth_median=lax.stop_gradient(seen.median) if config.depth_median else None,
+        distortion=distortion,
     )
+
+
+def _drawn_opacities(
+    gaussians: Gaussians,
+    camera: Camera,
+    config: SplatConfig,
+    axes: Float[Array, "g 2 3"],
+    depths: Float[Array, " g"],
+    determinants: Float[Array, " g"],
+) -> Float[Array, " g"]:
+    """Returns the opacities as they are drawn, (g,). They are dimmed as `projection` says, because
+    the added variance enlarges the Gaussians. determinants: with the added variance, (g,).
+    """
+    eps2d = added_variance(gaussians.pixel_footprint, config.eps2d)
+    if gaussians.pixel_footprint is not None and eps2d > 0:
+        away = 1.0 if camera.lens == "orthographic" else depths
+        contained = eps2d * jnp.minimum((gaussians.pixel_footprint * camera.K[0, 0] / away) ** 2, 1)
+        return gaussians.opacities * jnp.sqrt(_determinant(axes, contained) / determinants)
+    if config.antialiased and eps2d > 0:
+        return gaussians.opacities * safe_sqrt(_determinant(axes, 0.0) / determinants)
+    return gaussians.opacities
+
+
+def _seen_colors(gaussians: Gaussians, camera: Camera, visible: Array) -> Float[Array, "g 3"]:
+    """Returns the colors along the line of sight, (g, 3). visible: whether each is drawn, (g,)."""
+    if gaussians.harmonics is None:
+        return gaussians.colors
+    # directions from the camera to the Gaussians, in its frame, then in that of the means
+    sight = transform.apply(camera.cam_from_world, gaussians.means)
+    sight = jnp.where(visible[:, None], sight, 1.0)
+    if camera.lens == "orthographic":
+        sight = jnp.zeros_like(sight).at[:, 2].set(1.0)
+    sight = jnp.matmul(sight, camera.cam_from_world[:3, :3], precision=transform.EXACT)
+    sight = sight / jnp.linalg.norm(sight, axis=-1, keepdims=True)
+    # harmonics of these directions
+    functions = _harmonics(sight, math.isqrt(gaussians.harmonics.shape[1]))
+    added = jnp.einsum("gk,gkc->gc", functions, gaussians.harmonics, precision=transform.EXACT)
+    return jnp.maximum(gaussians.colors + added, 0)
 
 
 def _project(
