@@ -78,8 +78,8 @@ def _composite_bwd(
 ) -> tuple[Array, None]:
     splats, lists, features, transmittance, lengths = saved
     g = cotangents.features
-    total = jnp.sum(g * features, axis=1) + cotangents.transmittance * transmittance
-    arrays = splats, lists.items, lists.starts, lengths, g, total
+    Q = jnp.sum(g * features, axis=1) + cotangents.transmittance * transmittance
+    arrays = splats, lists.items, lists.starts, lengths, g, Q
     sums = _scheduled(backward_by_blocks, backward_by_chunks, grid, config, *arrays)
     return _splat_gradients(splats, sums), None
 

@@ -187,7 +187,7 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
     log_stop = _log_stop(config)
 
     @joined_over_batch
-    def backward(splats, items, starts, lengths, cotangents, totals):
+    def backward(splats, items, starts, lengths, g_of_tiles, Q_of_tiles):
         dtype, t, p = splats.dtype, lengths.shape[0], grid.pixels
         step = _chunks_per_step(grid, dtype, items.shape[0], t)
         chunks = cut(starts, lengths, items.shape[0], step)
@@ -195,36 +195,39 @@ def backward_by_chunks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
 
         def draw(i, handed):
             sums, faded_tail, seen_tail = handed
-            # alpha and T of all pairs of this step, as in the forward pass
             c = _slice(chunks, i, step)
             item, row, centre, raw = take_chunk(
                 splats, items, c.starts, c.counts, c.tiles, grid, CHUNK
             )
-            g, total = (v.at[c.tiles].get(mode="fill", fill_value=0) for v in (cotangents, totals))
+            g, Q = (v.at[c.tiles].get(mode="fill", fill_value=0) for v in (g_of_tiles, Q_of_tiles))
+            # alpha, T and w of all pairs of this step, as in the forward pass
             alpha, fading = _fading(raw, config)
             before, since = _sums_before(fading, c.tiles, faded_tail)
             transmittance = jnp.exp(before[:, None] + since)
             live = before[:, None] + since + fading > log_stop
             weights = jnp.where(live, alpha * transmittance, 0.0)
-            # g . f of each pair, and dL/d log alpha with what the splats behind it add
-            along = sum(
+            # dL/dalpha of each pair; `behind` is Q - sum_{i <= k} w_i g . f_i
+            g_dot_f = sum(
                 row[..., FEATURES][..., f, None] * g[:, None, f]
                 for f in range(splats.shape[1] - FEATURES.start)
             )
-            gained = weights * along
-            seen_before, seen_since = _sums_before(gained, c.tiles, seen_tail)
-            behind = total[:, None] - (seen_before[:, None] + seen_since + gained)
-            slopes = (along * transmittance - behind / (1 - alpha)) * raw
-            slopes = jnp.where((weights > 0) & (raw < config.alpha_max), slopes, 0.0)
+            w_g_dot_f = weights * g_dot_f
+            seen_before, seen_since = _sums_before(w_g_dot_f, c.tiles, seen_tail)
+            behind = Q[:, None] - (seen_before[:, None] + seen_since + w_g_dot_f)
+            dL_dalpha = g_dot_f * transmittance - behind / (1 - alpha)
+            # e = dL/d log alpha, 0 where alpha was clamped or skipped
+            e = dL_dalpha * raw
+            e = jnp.where((weights > 0) & (raw < config.alpha_max), e, 0.0)
 
-            # sums over pixels, moved from the tile's centre to the splat's
-            moments = product(slopes.reshape(-1, p), powers).reshape(step, CHUNK, 6)
-            features = product(weights, jnp.moveaxis(g, 1, 2))
-            rows = jnp.concatenate([moments_about_splat(moments, *centre), features], axis=-1)
-            # the list that runs on into the next step hands on its two sums
+            # sums over pixels: moments of e, moved from the tile's centre to the splat's, and w g
+            moments = product(e.reshape(-1, p), powers).reshape(step, CHUNK, 6)
+            feature_gradients = product(weights, jnp.moveaxis(g, 1, 2))
+            moments = moments_about_splat(moments, *centre)
+            rows = jnp.concatenate([moments, feature_gradients], axis=-1)
             sums = sums.at[item].add(rows, mode="drop")
+            # the list that runs on into the next step hands on its two sums
             faded_tail = _tail(c.tiles, before, since + fading)
-            seen_tail = _tail(c.tiles, seen_before, seen_since + gained)
+            seen_tail = _tail(c.tiles, seen_before, seen_since + w_g_dot_f)
             return sums, faded_tail, seen_tail
 
         sums, tail = jnp.zeros(splats.shape, dtype), _no_tail(t, p, dtype)

@@ -221,7 +221,7 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
     block, k, stop = config.block, config.chunk, config.transmittance_stop
 
     @joined_over_batch
-    def backward(splats, items, starts, lengths, cotangents, totals):
+    def backward(splats, items, starts, lengths, g_of_tiles, Q_of_tiles):
         dtype = splats.dtype
         powers = jnp.asarray(monomials(grid, dtype))
         blocks = blocks_by_length(lengths, block)
@@ -229,18 +229,18 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
         def draw(b, sums):
             tile = lax.dynamic_slice_in_dim(blocks.tiles, b * block, block)
             start, count = _lists_of(tile, starts, lengths)
-            g, total = (v.at[tile].get(mode="fill", fill_value=0) for v in (cotangents, totals))
+            g, Q = (v.at[tile].get(mode="fill", fill_value=0) for v in (g_of_tiles, Q_of_tiles))
             trips = (jnp.max(count) + k - 1) // k
 
             def body(chain):
                 i, transmittance, seen, sums = chain
-                item, row, offset, raw = take_chunk(
+                item, row, centre, raw = take_chunk(
                     splats, items, start + i * k, count - i * k, tile, grid, k
                 )
                 # one exp a pair: without the barrier each kernel that uses it computes it again
                 raw = lax.optimization_barrier(raw)
                 # the chain of T front to back, with the decisions of the forward pass
-                weights, slopes = [], []
+                weights, e = [], []
                 for j in range(k):
                     # a kernel runs the chain of two splats: what it computes for splat j redoes the
                     # chain from the last stored T on; storing T after every splat costs more
@@ -249,22 +249,23 @@ def backward_by_blocks(grid: TileGrid, config: SplatConfig) -> Callable[..., Arr
                     alpha = visible_alpha(raw[:, j], config)
                     after = transmittance * (1 - alpha)
                     weight = jnp.where(after > stop, alpha * transmittance, 0.0)
-                    along = sum(
+                    g_dot_f = sum(
                         row[:, j, 6 + c, None] * g[:, c]
                         for c in range(splats.shape[1] - FEATURES.start)
                     )
-                    seen = seen + weight * along
-                    slope = (along * transmittance - (total - seen) / (1 - alpha)) * raw[:, j]
-                    slopes.append(
-                        jnp.where((weight > 0) & (raw[:, j] < config.alpha_max), slope, 0.0)
-                    )
+                    seen = seen + weight * g_dot_f
+                    dL_dalpha = g_dot_f * transmittance - (Q - seen) / (1 - alpha)
+                    # e = dL/d log alpha, 0 where alpha was clamped or skipped
+                    e_j = dL_dalpha * raw[:, j]
+                    e.append(jnp.where((weight > 0) & (raw[:, j] < config.alpha_max), e_j, 0.0))
                     weights.append(weight)
                     transmittance = after
-                weights, slopes = jnp.stack(weights, axis=1), jnp.stack(slopes, axis=1)
+                weights, e = jnp.stack(weights, axis=1), jnp.stack(e, axis=1)
                 # matrix products: XLA's row reductions are slow on CPUs
-                moments = product(slopes.reshape(block * k, -1), powers).reshape(block, k, 6)
-                features = product(weights, jnp.moveaxis(g, 1, 2))
-                rows = jnp.concatenate([moments_about_splat(moments, *offset), features], axis=-1)
+                moments = product(e.reshape(block * k, -1), powers).reshape(block, k, 6)
+                feature_gradients = product(weights, jnp.moveaxis(g, 1, 2))
+                moments = moments_about_splat(moments, *centre)
+                rows = jnp.concatenate([moments, feature_gradients], axis=-1)
                 following = i + 1
                 sums = sums.at[item].add(rows, mode="drop")
                 return _BackwardChain(following, transmittance, seen, sums)
