@@ -24,7 +24,8 @@ Derivatives: fragments are constants (`stop_gradient`). `interpolate_attributes`
 with respect to the attributes.
 """
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -282,6 +283,15 @@ def _window(first: Array, end: Array, start: Array, size: int) -> tuple[Array, A
     return item, slot - first[item], slot < end[-1]
 
 
+class _ZBuffer(NamedTuple):
+    """The nearest face so far at each pixel. Pixels are numbered row by row."""
+
+    depth: Float[Array, " hw"]
+    """z of the face, (h w,); infinity where there is none."""
+    face_ids: Int[Array, " hw"]
+    """Number of the face, (h w,); `NO_FACE` where there is none."""
+
+
 def _z_buffer(
     corners: Array,
     first_row: Array,
@@ -290,54 +300,74 @@ def _z_buffer(
     width: int,
     height: int,
     config: RasterConfig,
-) -> tuple[Array, Array]:
-    """Returns the depth and the face number of every pixel, (h w,) each. They are infinity and
-    `NO_FACE` where there is no face.
+) -> _ZBuffer:
+    """Returns the z-buffer with all faces drawn. The first row of pixels of face i is first_row[i].
+    Its rows own the slots row_begin[i] .. row_end[i] - 1.
     """
 
-    def draw_rows(state):
-        start, depth, face_ids = state
-        face, place, used = _window(row_begin, row_end, start, config.rows_per_step)
-        row = first_row[face] + place
+    def draw_rows(row_slot, buffer):
+        # from faces to rows of pixels, and to the span of each row
+        face, row_of_face, is_row = _window(row_begin, row_end, row_slot, config.rows_per_step)
+        row = first_row[face] + row_of_face
         first_column, columns = _spans(corners[face], row, width)
-        columns = jnp.where(used, columns, 0)
-        end = cumsum(columns)
-        begin = end - columns
+        columns = jnp.where(is_row, columns, 0)
+        pixel_end = cumsum(columns)
+        pixel_begin = pixel_end - columns
 
-        def draw_fragments(state):
-            start, depth, face_ids = state
-            span, place, used = _window(begin, end, start, config.fragments_per_step)
-            pixel = row[span] * width + first_column[span] + place
-            x, y = _pixel_centers(pixel, width, corners.dtype)
-            _, z, inside = _weigh(corners[face[span]], x, y)
-            drawn = jnp.where(used & inside, pixel, width * height)  # out of bounds: dropped
-            before = depth.at[drawn].get(mode="fill", fill_value=-1.0)
-            depth = depth.at[drawn].min(z, mode="drop")
-            nearest = depth.at[drawn].get(mode="fill", fill_value=-1.0)
-            # a pixel that came nearer forgets its face; then the lowest of the faces at its new
-            # depth takes it
-            face_ids = face_ids.at[jnp.where(nearest < before, drawn, width * height)].set(
-                NO_FACE, mode="drop"
+        def draw_pixels(pixel_slot, buffer):
+            # from spans to their pixels
+            span, column_of_span, is_pixel = _window(
+                pixel_begin, pixel_end, pixel_slot, config.fragments_per_step
             )
-            wins = jnp.where(z == nearest, drawn, width * height)
-            face_ids = face_ids.at[wins].min(face[span], mode="drop")
-            return start + config.fragments_per_step, depth, face_ids
+            pixel = row[span] * width + first_column[span] + column_of_span
+            return _draw_fragments(buffer, corners, face[span], pixel, is_pixel, width)
 
-        def more(state):
-            return state[0] < end[-1]
+        return _in_steps(draw_pixels, buffer, pixel_end, config.fragments_per_step)
 
-        _, depth, face_ids = lax.while_loop(
-            more, draw_fragments, (jnp.zeros((), jnp.int32), depth, face_ids)
-        )
-        return start + config.rows_per_step, depth, face_ids
+    empty = _ZBuffer(
+        depth=jnp.full(width * height, jnp.inf, corners.dtype),
+        face_ids=jnp.full(width * height, NO_FACE, jnp.int32),
+    )
+    return _in_steps(draw_rows, empty, row_end, config.rows_per_step)
 
-    depth = jnp.full(width * height, jnp.inf, corners.dtype)
-    face_ids = jnp.full(width * height, NO_FACE, jnp.int32)
 
-    def more(state):
-        return state[0] < row_end[-1]
+def _in_steps(
+    draw: Callable[[Array, _ZBuffer], _ZBuffer], buffer: _ZBuffer, end: Array, size: int
+) -> _ZBuffer:
+    """Returns the buffer after draw(start, buffer) with start = 0, size, 2 size ... until all slots
+    are drawn. end: end of each item's slots, as in `_window`.
+    """
 
-    return lax.while_loop(more, draw_rows, (jnp.zeros((), jnp.int32), depth, face_ids))[1:]
+    def step(state):
+        start, buffer = state
+        buffer = draw(start, buffer)
+        return start + size, buffer
+
+    first = jnp.zeros((), jnp.int32)
+    _, buffer = lax.while_loop(lambda state: state[0] < end[-1], step, (first, buffer))
+    return buffer
+
+
+def _draw_fragments(
+    buffer: _ZBuffer, corners: Array, face: Array, pixel: Array, used: Array, width: int
+) -> _ZBuffer:
+    """Returns the buffer with fragments drawn: fragment i is of the face face[i] at the pixel
+    pixel[i], (n,) each. Those that are not `used`, (n,), are left out.
+    """
+    nowhere = buffer.depth.shape[0]  # out of bounds: dropped
+    x, y = _pixel_centers(pixel, width, corners.dtype)
+    _, z, inside = _weigh(corners[face], x, y)
+    drawn = jnp.where(used & inside, pixel, nowhere)
+    # the smallest depth of each pixel
+    before = buffer.depth.at[drawn].get(mode="fill", fill_value=-1.0)
+    depth = buffer.depth.at[drawn].min(z, mode="drop")
+    nearest = depth.at[drawn].get(mode="fill", fill_value=-1.0)
+    # a pixel that came nearer forgets its face, and takes the lowest of the faces at its new depth
+    nearer = jnp.where(nearest < before, drawn, nowhere)
+    face_ids = buffer.face_ids.at[nearer].set(NO_FACE, mode="drop")
+    winner = jnp.where(z == nearest, drawn, nowhere)
+    face_ids = face_ids.at[winner].min(face, mode="drop")
+    return _ZBuffer(depth, face_ids)
 
 
 def sample_texture(
