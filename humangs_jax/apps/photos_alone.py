@@ -158,39 +158,72 @@ class _Choice(NamedTuple):
 
 
 def _look(images: Path, files: list[Path], looked_at: list[Path], choice: _Choice) -> _Looked:
-    names = [file.relative_to(images).as_posix() for file in looked_at]
-    others = others_as_shown(choice.others, images, files)
-    shown = detect.without_others(map(detect.upright, looked_at), others)
-    photos = detect.detect_photos(names, shown)
-    # where nobody found fits a given mask, the detector looks at the photo cut to it
-    if choice.masks is not None:
-        masks = [upright_mask(choice.masks, images, file) for file in files]
-        pictures = [detect.upright(file) for file in looked_at]
-        cut = [on_white_background(*pair) for pair in zip(pictures, masks, strict=True)]
-        photos = detect.with_masked(photos, masks, cut)
-    photos = detect.without_hidden_landmarks(photos, others)
-    photos = same_people(photos)
+    """Finds the people in the photos, chooses the person, and returns what is seen of the person.
+
+    Arguments: images: folder of `looked_at`. files: the photos. looked_at: the pictures in which
+    people are looked for, one per photo: the photos themselves, or reduced copies.
+    Raises: see `_chosen`.
+    """
+    photos = _people_in(images, files, looked_at, choice)
     photos, number = _chosen(photos, images, files, choice)
     # cameras are found from photos with the person only
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
-    everywhere = [photos[i].people[number] for i in shown]
-    people = [found for found in everywhere if found is not None]
-    # EXIF gives the focal length of the file, which may have been reduced since
-    known = (
-        (focal_length(files[i]), np.hypot(*image_size(files[i])), np.hypot(*photos[i].size))
-        for i in shown
-    )
-    focal = [np.nan if each is None else each * now / before for each, before, now in known]
-    seen = PersonViews(
-        points=np.stack([found.person.points[:, :2] for found in people]),
-        visibility=np.stack([found.person.points[:, 2] for found in people]),
-        world=np.stack([found.person.world for found in people]),
+    files_shown = [files[i] for i in shown]
+    seen = _views_of_person([photos[i] for i in shown], files_shown, number)
+    return _Looked(photos, number, shown, seen, _cropped(files_shown))
+
+
+def _people_in(
+    images: Path, files: list[Path], looked_at: list[Path], choice: _Choice
+) -> list[PhotoPeople]:
+    """Returns the photos with the people who are found in them. A person has the same number in all
+    photos. Arguments: see `_look`.
+    """
+    names = [file.relative_to(images).as_posix() for file in looked_at]
+    # what is in front of the person is painted over, so that the detector does not see it
+    others = others_as_shown(choice.others, images, files)
+    pictures = detect.without_others(map(detect.upright, looked_at), others)
+    photos = detect.detect_photos(names, pictures)
+    # where nobody found fits a given mask, the detector looks at the photo cut to it
+    if choice.masks is not None:
+        masks = [upright_mask(choice.masks, images, file) for file in files]
+        cut = [
+            on_white_background(detect.upright(file), mask)
+            for file, mask in zip(looked_at, masks, strict=True)
+        ]
+        photos = detect.with_masked(photos, masks, cut)
+    photos = detect.without_hidden_landmarks(photos, others)
+    return same_people(photos)
+
+
+def _views_of_person(photos: list[PhotoPeople], files: list[Path], number: int) -> PersonViews:
+    """Returns the landmarks of a person in photos that all show the person.
+
+    Arguments: files: file of each photo, whose EXIF may give the focal length. number: number of
+    the person.
+    """
+    detections = [photo.people[number] for photo in photos]
+    found = [each.person for each in detections if each is not None]
+    focal = [_focal_at_size(file, photo.size) for file, photo in zip(files, photos, strict=True)]
+    return PersonViews(
+        points=np.stack([person.points[:, :2] for person in found]),
+        visibility=np.stack([person.points[:, 2] for person in found]),
+        world=np.stack([person.world for person in found]),
         names=MEDIAPIPE_33.names,
-        sizes=tuple(photos[i].size for i in shown),
+        sizes=tuple(photo.size for photo in photos),
         focal=np.asarray(focal),
-        photos=tuple(names[i] for i in shown),
+        photos=tuple(photo.name for photo in photos),
     )
-    return _Looked(photos, number, shown, seen, _cropped([files[i] for i in shown]))
+
+
+def _focal_at_size(file: Path, size: tuple[int, int]) -> float:
+    """Returns the focal length of a photo, in pixels of a copy of the photo. NaN if it is unknown.
+    size: width and height of the copy.
+    """
+    focal = focal_length(file)
+    if focal is None:
+        return np.nan
+    return focal * np.hypot(*size) / np.hypot(*image_size(file))
 
 
 def _cropped(files: list[Path]) -> tuple[str, ...]:
