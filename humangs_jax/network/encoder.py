@@ -11,7 +11,7 @@ from the centre of its first texel to the centre of its last texel (`align_corne
 of the texels the features are 0.
 """
 
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -177,33 +177,24 @@ class PatchTransformer(Encoder):
         Raises: ValueError if images are not made of whole patches, or if the encoder looks at rays,
         and images and cameras differ in size.
         """
-        # every patch of every view
+        dtype, patch_size = ctx.runtime.compute_dtype, self.patch_size
+        views = len(inputs.images)
+        height, width = (side // patch_size for side in inputs.images.shape[1:3])
+
+        # the patches that become tokens: those of all views, or those in the foreground
         see = _photo_pixels
         if self.geometry == "rays_and_positions":
             see = encoder_pixels
-        patches = patchify(see(inputs, ctx), self.patch_size)
-        views, height, width = (
-            len(inputs.images),
-            *(side // self.patch_size for side in inputs.images.shape[1:3]),
-        )
-        dtype, present = ctx.runtime.compute_dtype, inputs.view_count
-        packing = None
-        dropped = jnp.zeros((), jnp.int32)
-        count = None
-        if present is not None:
-            count = present * height * width
-        # only patches that the person touches, packed to the front; the rest of the capacity is
-        # padding
+        patches = patchify(see(inputs, ctx), patch_size)
         if ctx.tokens == "foreground":
-            touched = touched_patches(inputs.foreground, present, self.patch_size)
-            packing = pack_patches(
-                touched, min(ctx.runtime.token_capacity or len(touched), len(touched))
-            )
-            dropped, count = jnp.sum(touched, dtype=jnp.int32) - packing.count, packing.count
-            patches = patches.at[packing.indices].get(mode="fill", fill_value=NOWHERE)
-        # tokens, and one more for the whole subject
+            chosen = _foreground_patches(patches, inputs, ctx, patch_size)
+        else:
+            chosen = _all_patches(patches, inputs.view_count, height, width)
+
+        # their tokens, behind the one of the whole subject
         features, class_token = self.transformer.width, self.transformer.class_token
-        tokens = Tokenizer(features, self.texture, dtype, name="tokenizer")(patches)
+        tokens = Tokenizer(features, self.texture, dtype, name="tokenizer")(chosen.patches)
+        count = chosen.count
         if class_token:
             first = self.param(
                 "class_token", nn.initializers.truncated_normal(INIT_STD), (1, features)
@@ -212,24 +203,70 @@ class PatchTransformer(Encoder):
             if count is not None:
                 count = count + 1
 
-        # maps of the layers that are read; patches without a token are 0
+        # the layers that are read, without the token of the whole subject
         depths = Transformer(self.transformer, ctx.runtime, name="transformer")(tokens, count)
-        global_token = depths[-1][0] if class_token else None
-        depths = [x[int(class_token) :] for x in depths]
+        global_token = None
+        if class_token:
+            global_token = depths[-1][0]
+            depths = [x[1:] for x in depths]
         if self.upsampler is None or self.upsampler.features == "final":
             depths = depths[-1:]
-        if packing is not None:
-            depths = [_unpack_tokens(x, packing, views * height * width) for x in depths]
+
+        # their maps; patches without a token are 0
+        if chosen.packing is not None:
+            depths = [_unpack_tokens(x, chosen.packing, views * height * width) for x in depths]
         maps = [x.reshape(views, height, width, features) for x in depths]
         if self.upsampler is None:
-            return Encoding(maps[0], global_token, dropped, packing, self.patch_size)
-        real = None
-        if present is not None:
-            real = jnp.arange(views) < present
-        upsampled = Upsampler(self.upsampler, dtype, ctx.axis_name, name="upsampler")(
-            maps, ctx.train, real
-        )
-        return Encoding(upsampled, global_token, dropped, packing, self.patch_size)
+            result = maps[0]
+        else:
+            real_views = None
+            if inputs.view_count is not None:
+                real_views = jnp.arange(views) < inputs.view_count
+            upsampler = Upsampler(self.upsampler, dtype, ctx.axis_name, name="upsampler")
+            result = upsampler(maps, ctx.train, real_views)
+        return Encoding(result, global_token, chosen.dropped, chosen.packing, patch_size)
+
+
+class _ChosenPatches(NamedTuple):
+    """The patches that become tokens."""
+
+    patches: Float[Array, "l pixels 12"]
+    """Pixels of the patches, (l, pixels, 12)."""
+    count: Int[Array, ""] | None
+    """Number of real patches, which come first. The others are padding. None: all are real."""
+    dropped: Int[Array, ""]
+    """Number of foreground patches for which the token capacity had no room."""
+    packing: Packing | None
+    """Which patches they are. None: all patches of all views."""
+
+
+def _all_patches(
+    patches: Float[Array, "p pixels 12"], view_count: Int[Array, ""] | None, height: int, width: int
+) -> _ChosenPatches:
+    """Returns all patches of all views. Views beyond `view_count` are padding, and so are their
+    patches. height, width: number of patches along the sides of a view.
+    """
+    count = None
+    if view_count is not None:
+        count = view_count * height * width
+    return _ChosenPatches(patches, count, dropped=jnp.zeros((), jnp.int32), packing=None)
+
+
+def _foreground_patches(
+    patches: Float[Array, "p pixels 12"],
+    inputs: HumanGSInputs,
+    ctx: ForwardContext,
+    patch_size: int,
+) -> _ChosenPatches:
+    """Returns the patches that the person touches, packed to the front of the token capacity. The
+    slots behind them are padding.
+    """
+    touched = touched_patches(inputs.foreground, inputs.view_count, patch_size)
+    capacity = min(ctx.runtime.token_capacity or len(touched), len(touched))
+    packing = pack_patches(touched, capacity)
+    dropped = jnp.sum(touched, dtype=jnp.int32) - packing.count
+    packed = patches.at[packing.indices].get(mode="fill", fill_value=NOWHERE)
+    return _ChosenPatches(packed, packing.count, dropped, packing)
 
 
 def encoder_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "v h w 12"]:
