@@ -16,6 +16,7 @@ but the checkpoints, which all write.
 """
 
 import contextlib
+import dataclasses
 import functools
 import json
 import logging
@@ -36,7 +37,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.progress import bar, say, stage
-from humangs_jax.data.loading import Waiting
+from humangs_jax.data.loading import Example, Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import only_writer, write_text
 from humangs_jax.io.images import DRAWN, write_png
@@ -304,6 +305,62 @@ class TrainingInterrupted(KeyboardInterrupt):
         self.state = state
 
 
+@dataclasses.dataclass(frozen=True)
+class _Validations:
+    """What the validations of a run look at. Each process validates with arrays of its own."""
+
+    people: SourceFactory | None
+    """Function that makes a source of the people. None: there are no validations."""
+    count: int
+    """Number of people that a validation looks at."""
+    body: BodyModel
+    """Body that carries the Gaussians."""
+    networks: LossNetworks
+    """Networks of the metrics that need them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """What stays the same during a call of `train`."""
+
+    config: TrainConfig
+    """Configuration of the run, with all its stages."""
+    people: SourceFactory
+    """Function that makes a source of the people to train on."""
+    body: BodyModel
+    """Body that carries the Gaussians, on all devices."""
+    networks: LossNetworks
+    """Networks of the losses that need them, on all devices."""
+    mesh: Mesh | None
+    """Devices among which the run is divided. None: there is only one."""
+    validations: _Validations
+    """What validations look at."""
+    end: int
+    """Number of steps of the run after which the call returns."""
+    out: Path
+    """Folder of the run."""
+    leading: bool
+    """Whether this process writes the log, the sheets and the weights. It is True in one process
+    only.
+    """
+    checkpoints: Checkpoints
+    """Checkpoints of the run, which all processes write."""
+
+
+@dataclasses.dataclass
+class _Current:
+    """Where a run stands. Its steps change this record."""
+
+    state: TrainState
+    """State after the last step done."""
+    best_score: float | None
+    """Highest psnr of a validation so far. None: no validation had one."""
+    waiting: Waiting = dataclasses.field(default_factory=Waiting)
+    """Time that this call has waited for data."""
+    stopped: bool = False
+    """Whether the run was asked to stop before its end."""
+
+
 @checked_arguments
 def train(
     config: TrainConfig,
@@ -363,135 +420,205 @@ def train(
     with alone:
         save_config(out, config, write=leading)
 
-        def of(people):
-            if isinstance(people, Sequence):
-                return captured_people(people, body)
-            return people
-
-        make_source = of(training)
-        unseen = of(validation) if validation else None
+        # captures' parameters belong to the body as it was given
+        people = _as_source_factory(training, body)
+        unseen = _as_source_factory(validation, body) if validation else None
         body = gaussian_body(body, config.model)
+        validations = _Validations(unseen, validated, body, networks)
 
+        # several devices share the state, and each has the whole body and the networks
         mesh = training_mesh(fsdp)
         if mesh.size == 1:
             mesh = None
-        state, own_networks, own_body = init_state(config, variables), networks, body
-        if mesh is not None:
-            state = place(state, state_shardings(state, mesh))
-            body, networks = place((body, networks), replicated(mesh))
+        state = init_state(config, variables)
         checkpoints = Checkpoints(out / "checkpoints", config.keep_checkpoints)
-        best = None
-        if checkpoints.steps:
-            state, best_step = checkpoints.restore(state), checkpoints.best_step
-            best = None
-            if best_step is not None:
-                best = checkpoints.score(best_step)
-        begin = int(state.step)
+        current = _resumed(state, mesh, checkpoints)
+        if mesh is not None:
+            body, networks = place((body, networks), replicated(mesh))
+
+        begin = int(current.state.step)
         end = config.steps
         if stop_at is not None:
             end = min(config.steps, stop_at)
+        run = _Run(
+            config=config,
+            people=people,
+            body=body,
+            networks=networks,
+            mesh=mesh,
+            validations=validations,
+            end=end,
+            out=out,
+            leading=leading,
+            checkpoints=checkpoints,
+        )
 
-        for first, _ in config.spans(begin, end)[1:]:
-            _rehearse(make_source, config, first, state, body, networks, mesh)
-
-        waiting = Waiting()
+        stages = config.spans(begin, end)
+        for first, _ in stages[1:]:
+            _rehearse(run, current.state, first)
         with (
             stop_requested() as stopping,
             RunLog(out, begin, config.steps, leading, progress) as log,
         ):
-            watch, stop = Watch(log, state), False
-            for first, last in config.spans(begin, end):
-                part = config.at(first)
-                loader = stage_loader(make_source, config, first, mesh)
-                examples = []
-                if unseen is not None:
-                    examples = validation_examples(unseen, part, validated)
-                batches = loader.batches(first, last, waiting=waiting)
-                for step, batch in batches:
-                    if step == first and mesh is None:
-                        # costs nothing: once, and the arrays are in memory
-                        for line in bad_samples(loader, step, batch):
-                            log.event(step, "sample", line, samples=[line])
-                        part = with_measured_room(part, state.variables, body, batch)
-                    with stage("compiling the step") if step == first else contextlib.nullcontext():
-                        state, metrics = train_step(state, batch, body, part, networks, mesh)
-                    done = step + 1
-                    watch(done, metrics, functools.partial(bad_samples, loader, step))
-                    if watch.overflowed and part.splat.max_pairs != config.splat.max_pairs:
-                        part = with_twice_the_room(part, body)
-                        log.event(done, "room", f"{NO_ROOM}: there is twice the room from now on")
-                    stop = stopping(done)
-                    if done % config.log_every == 0 or done == end or stop:
-                        log.steps(
-                            done,
-                            jax.device_get(metrics),
-                            part.batch_size,
-                            waiting,
-                            len(loader.source.broken),
-                        )
-                    log.bar.update(1)
-                    validating = unseen is not None and (
-                        done % config.validate_every == 0 or done == config.steps
-                    )
-                    if not (
-                        validating or stop or done == end or done % config.checkpoint_every == 0
-                    ):
-                        continue
-                    recorded = part.model.with_conventions(
-                        tokens=part.model.tokens
-                    )  # what the weights were trained with
-                    variables = state.variables
-                    if mesh is not None:
-                        variables = whole(state.variables, mesh)
-                    score = None
-                    if validating:
-                        numbers, images = validate(
-                            variables, own_body, examples, part, own_networks
-                        )
-                        score = (
-                            None if math.isnan(numbers["psnr"]) else numbers["psnr"]
-                        )  # NaN is no score
-                        if leading:
-                            _report(
-                                log, out, done, numbers, sheet(examples[:SHOWN], images[:SHOWN])
-                            )
-                    if leading:
-                        save_weights(out / "weights.safetensors", variables, recorded, "float16")
-                    if score is not None and (best is None or score > best):
-                        best = score
-                        if leading:
-                            save_weights(out / "best.safetensors", variables, recorded, "float16")
-                    checkpoints.save(state, score)
-                    if stop:
-                        break
-                batches.close()
-                if stop:
+            watch = Watch(log, current.state)
+            for first, last in stages:
+                _run_stage(run, current, first, last, log, watch, stopping)
+                if current.stopped:
                     break
             watch.look()
             checkpoints.close()
             # a single process may be asked to stop after its last step; several agree only on steps
-            stop = stop or (jax.process_count() == 1 and stopping(end))
-        if stop:
-            raise TrainingInterrupted(state, config.steps)
-        return state
+            if jax.process_count() == 1 and stopping(end):
+                current.stopped = True
+        if current.stopped:
+            raise TrainingInterrupted(current.state, config.steps)
+        return current.state
 
 
-def _rehearse(
-    make_source: SourceFactory,
-    config: TrainConfig,
-    step: int,
-    state: TrainState,
-    body: BodyModel,
-    networks: LossNetworks,
-    mesh: Mesh | None,
+def _as_source_factory(
+    people: Sequence[str | Path] | SourceFactory, body: BodyModel
+) -> SourceFactory:
+    """Returns a function that makes a source of people. They are given as such a function, or as
+    capture folders.
+    """
+    if isinstance(people, Sequence):
+        return captured_people(people, body)
+    return people
+
+
+def _resumed(state: TrainState, mesh: Mesh | None, checkpoints: Checkpoints) -> _Current:
+    """Returns where the newest checkpoint stands, or the start of a new run if there is none. The
+    state is divided among the devices of the mesh.
+
+    state: of a run that begins.
+    """
+    if mesh is not None:
+        state = place(state, state_shardings(state, mesh))
+    if not checkpoints.steps:
+        return _Current(state, best_score=None)
+    state = checkpoints.restore(state)
+    best_score = None
+    if checkpoints.best_step is not None:
+        best_score = checkpoints.score(checkpoints.best_step)
+    return _Current(state, best_score)
+
+
+def _run_stage(
+    run: _Run,
+    current: _Current,
+    first: int,
+    last: int,
+    log: RunLog,
+    watch: Watch,
+    stopping: Callable[[int], bool],
 ) -> None:
+    """Does the steps from `first` to `last` - 1, which have one configuration. If the run is asked
+    to stop, the function saves the state after the current step and returns.
+
+    stopping: see `stop_requested`.
+    """
+    config, part = run.config, run.config.at(first)
+    loader = stage_loader(run.people, config, first, run.mesh)
+    examples = []
+    if run.validations.people is not None:
+        examples = validation_examples(run.validations.people, part, run.validations.count)
+
+    with contextlib.closing(loader.batches(first, last, waiting=current.waiting)) as batches:
+        for step, batch in batches:
+            # one look at the first batch, which costs little while its arrays are in memory
+            if step == first and run.mesh is None:
+                for line in bad_samples(loader, step, batch):
+                    log.event(step, "sample", line, samples=[line])
+                part = with_measured_room(part, current.state.variables, run.body, batch)
+
+            # the step, which is compiled when a stage begins
+            with stage("compiling the step") if step == first else contextlib.nullcontext():
+                current.state, metrics = train_step(
+                    current.state, batch, run.body, part, run.networks, run.mesh
+                )
+            done = step + 1
+
+            # whether the step before failed, or had too little room
+            watch(done, metrics, functools.partial(bad_samples, loader, step))
+            if watch.overflowed and part.splat.max_pairs != config.splat.max_pairs:
+                part = with_twice_the_room(part, run.body)
+                log.event(done, "room", f"{NO_ROOM}: there is twice the room from now on")
+
+            # log lines, validations and checkpoints are due at intervals and at the end
+            current.stopped = stopping(done)
+            ending = current.stopped or done == run.end
+            if ending or done % config.log_every == 0:
+                broken = len(loader.source.broken)
+                log.steps(done, jax.device_get(metrics), part.batch_size, current.waiting, broken)
+            log.bar.update(1)
+
+            validating = run.validations.people is not None and (
+                done % config.validate_every == 0 or done == config.steps
+            )
+            if validating or ending or done % config.checkpoint_every == 0:
+                variables = current.state.variables
+                if run.mesh is not None:
+                    variables = whole(variables, run.mesh)
+                score = None
+                if validating:
+                    score = _validated(run, part, variables, examples, done, log)
+                _save(run, current, part, variables, score)
+            if current.stopped:
+                return
+
+
+def _validated(
+    run: _Run,
+    part: TrainConfig,
+    variables: Variables,
+    examples: list[Example],
+    done: int,
+    log: RunLog,
+) -> float | None:
+    """Validates the network after `done` steps, and reports metrics and images. Returns the psnr,
+    which is the score of these variables, or None if it is NaN.
+
+    part: configuration of the stage. examples: see `validation_examples`.
+    """
+    validations = run.validations
+    numbers, images = validate(variables, validations.body, examples, part, validations.networks)
+    if run.leading:
+        _report(log, run.out, done, numbers, sheet(examples[:SHOWN], images[:SHOWN]))
+    if math.isnan(numbers["psnr"]):
+        return None
+    return numbers["psnr"]
+
+
+def _save(
+    run: _Run,
+    current: _Current,
+    part: TrainConfig,
+    variables: Variables,
+    score: float | None,
+) -> None:
+    """Writes the weights and a checkpoint, and the best weights if `score` is the highest so far.
+
+    part: configuration of the stage. score: see `_validated`; None: there was no validation.
+    """
+    # weights record the tokens that they were trained with
+    model = part.model.with_conventions(tokens=part.model.tokens)
+    if run.leading:
+        save_weights(run.out / "weights.safetensors", variables, model, "float16")
+    if score is not None and (current.best_score is None or score > current.best_score):
+        current.best_score = score
+        if run.leading:
+            save_weights(run.out / "best.safetensors", variables, model, "float16")
+    run.checkpoints.save(current.state, score)
+
+
+def _rehearse(run: _Run, state: TrainState, step: int) -> None:
     """Traces a step of a later stage, so that sizes that do not fit raise before the run and not in
     the middle of it.
     """
-    batch = stage_loader(make_source, config, step, mesh).batch_at(step)
-    part = config.at(step)
-    one = functools.partial(update, config=compiled_for(part), mesh=mesh)
-    jax.eval_shape(one, state, batch, body, networks, seed_numbers(part.seed))
+    batch = stage_loader(run.people, run.config, step, run.mesh).batch_at(step)
+    part = run.config.at(step)
+    one = functools.partial(update, config=compiled_for(part), mesh=run.mesh)
+    jax.eval_shape(one, state, batch, run.body, run.networks, seed_numbers(part.seed))
 
 
 def _report(
