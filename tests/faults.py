@@ -56,9 +56,9 @@ FAULTS = [
     # a pickle runs, or takes more than it holds
     (PICKLE, "if key not in self.names:", "if key[0] not in ('os', *[k[0] for k in self.names]):"),
     (PICKLE, "abs(argument) >= LARGEST_INTEGER", "abs(argument) < 0"),
-    (PICKLE, "if not 0 <= index <= self.count or not stack:", "if not stack:"),
+    (PICKLE, "if not 0 <= index <= self.count or not self.stack:", "if not self.stack:"),
     (PICKLE, "key is None or key > LARGEST_KEY", "key is None"),
-    (PICKLE, "self.memo[index] = stack[-1] or 0", "self.memo[index] = 0"),
+    (PICKLE, "self.memo[index] = self.stack[-1] or 0", "self.memo[index] = 0"),
     (PICKLE, "if within and (end > self.frame_end", "if within and (False"),
     (PICKLE, "made = 1 + sum(part or 0 for part in taken)", "made = 1"),
     (PICKLE, "if self.file.tell() != self.seen:", "if self.file.tell() == self.seen:"),

@@ -123,52 +123,84 @@ class _Looked:
         """
         name, stack = opcode.name, self.stack
         if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
-            index = argument
-            if name == "MEMOIZE":
-                index = len(self.memo)
-            # the unpickler makes a list with a place for each index: there is none without a value
-            if not 0 <= index <= self.count or not stack:
-                raise InvalidFileError("refused an index of the memo that is beyond its values")
-            self.memo[index] = stack[-1] or 0
+            self._memoize(name, argument)
             return
         if name in ("GET", "BINGET", "LONG_BINGET"):
             stack.append(self.memo.get(argument, 0))
             return
+        # POP also takes a mark, and takes nothing from an empty stack
         if name == "POP":
             del stack[-1:]
             return
 
-        # what it takes from the stack: all behind the last mark, and so many before
-        before = opcode.stack_before
-        below = None
-        if pickletools.markobject in before:
-            below = before.index(pickletools.markobject)
-        items: list[int | None] = []
-        if below is not None:
-            at = len(stack)
-            while at and stack[at - 1] is not None:
-                at -= 1
-            items = stack[at:]
-            del stack[max(0, at - 1) :]
-        count = len(before) if below is None else below
-        taken = stack[len(stack) - count :] if count else []
-        if len(taken) < count:
-            raise InvalidFileError(
-                "refused an instruction that takes more from the stack than there is"
-            )
-        if count:
-            del stack[len(stack) - count :]
+        taken, items = self._popped(opcode)
 
-        keys = {"SETITEM": taken[1:2], "SETITEMS": items[::2], "DICT": items[::2]}.get(name, ())
+        # all values that a key is made of are hashed, and a mark is no key
+        keys: list[int | None] = []
+        if name == "SETITEM":  # it takes a dict, a key and a value
+            keys = taken[1:2]
+        elif name in ("SETITEMS", "DICT"):  # keys and values alternate
+            keys = items[::2]
         if any(key is None or key > LARGEST_KEY for key in keys):
             raise InvalidFileError(
                 "a dict with keys other than strings, numbers and short tuples of these"
             )
+
+        # all but DUP, which is refused, leave at most one value: it is made of all that they took
         if name == "MARK":
             stack.append(None)
         elif opcode.stack_after:
             made = 1 + sum(part or 0 for part in taken) + sum(part or 0 for part in items)
             stack.append(min(made, COUNTED))
+
+    def _memoize(self, name: str, argument: Any) -> None:
+        """Puts the top of `stack` into `memo`, as the instruction `name` does.
+
+        Raises: InvalidFileError for an index that is beyond the values of the pickle.
+        """
+        index = argument
+        if name == "MEMOIZE":
+            index = len(self.memo)
+        # the unpickler makes a list with a place for each index: there is none without a value
+        if not 0 <= index <= self.count or not self.stack:
+            raise InvalidFileError("refused an index of the memo that is beyond its values")
+        self.memo[index] = self.stack[-1] or 0
+
+    def _popped(self, opcode: Any) -> tuple[list[int | None], list[int | None]]:
+        """Removes from `stack` what an instruction takes, and returns it in two parts.
+
+        Every instruction takes a fixed number of values: `taken`. Some instructions also take the
+        last mark and all values above it, which are `items`. For SETITEMS with two entries:
+
+            bottom  ...  | dict  | mark | key  value  key  value |  top
+                         | taken |      | items                  |
+
+        REDUCE takes no mark: `taken` is its function and arguments, and `items` is empty. If an
+        instruction needs a mark and there is none, `items` is the whole stack. The unpickler
+        refuses such a pickle.
+
+        Raises: InvalidFileError if the stack has fewer values than `taken` needs.
+        """
+        stack, before = self.stack, opcode.stack_before
+        needed = len(before)
+        items: list[int | None] = []
+        if pickletools.markobject in before:
+            needed = before.index(pickletools.markobject)
+            above = len(stack)
+            while above > 0 and stack[above - 1] is not None:
+                above -= 1
+            items = stack[above:]
+            mark = max(0, above - 1)
+            del stack[mark:]
+
+        if len(stack) < needed:
+            raise InvalidFileError(
+                "refused an instruction that takes more from the stack than there is"
+            )
+        first = len(stack) - needed
+        taken = stack[first:]
+        del stack[first:]
+        return taken, items
 
 
 class Call(NamedTuple):
