@@ -14,6 +14,7 @@ from humangs_jax.synthetic import surfaces
 from humangs_jax.synthetic.anatomy import Anatomy, Joint, Vector, smoothstep
 from humangs_jax.synthetic.outfits import HEADWEAR, drawn, row
 from humangs_jax.synthetic.surfaces import (
+    Boundaries,
     Field,
     Points,
     Surface,
@@ -137,6 +138,34 @@ _CROWN = 0.4356
 """Height of the crown, template coordinates."""
 _NECK_HEIGHT = 0.189
 """Height of the neck, template coordinates."""
+_SKULL_RADIUS = 0.09
+"""Radius of the skull, metres. An angle times this is a length around the skull."""
+_BRIM = 0.385
+"""Height of the hairline at the forehead, above which hair is a dome, template coordinates."""
+_CHIN = 0.24
+"""Height of the chin, between the head and the neck with the shoulders, template coordinates."""
+_NAPE = 0.23
+"""Height of the nape, below which hair begins to stand off the neck, template coordinates."""
+_SHOULDERS = 0.17
+"""Height of the shoulders beside the neck, below which hair lies on them, template coordinates."""
+_LOWEST = -0.3
+"""Height of the lowest silhouette below falling hair, template coordinates."""
+_FACE = 0.125
+"""Depth (z) in front of which there is only the middle of the face, template coordinates."""
+_EAR_SIDE = 0.0735
+"""Distance from the middle (|x|) beyond which there are only ears, template coordinates."""
+_EAR_HEIGHTS = (0.26, 0.36)
+"""Heights between which the ears lie, template coordinates."""
+_HEAD_SIDE = 0.1
+"""Distance from the middle (|x|) within which the head lies, template coordinates."""
+_BACK_SIDE = 0.12
+"""Distance from the middle (|x|) within which hair lies on the back, template coordinates."""
+_FRONT_HEM = 0.15
+"""Height where hair ends on the shoulders in front, template coordinates."""
+_HEM_AZIMUTHS = (0, 1.2, 1.75, 2.2, np.pi)
+"""Azimuths of the corners of the hem of long hair, radians. In order: middle and end of the front,
+behind the ear, beginning and middle of the back.
+"""
 
 SHORT_LINE = (
     [0.0, 0.55, 0.95, 1.2, 1.36, 1.42, 1.86, 1.95, 2.3, 3.15],
@@ -307,63 +336,105 @@ def falling_tube(
     bottom: float,
     opening: _Opening,
     wave: float = 0.004,
-    ends: float | None = None,
+    ends: float = _FRONT_HEM,
     over: float = 0.0,
 ) -> Surface:
     """Builds long hair, a hood or a headscarf: the enlarged skull, from which a tube falls.
 
     thickness: by which the skull is enlarged, metres. bottom: template height where the tube ends
     at the back. opening: where the face is free. wave: height of waves, metres. ends: template
-    height where the tube ends in front. None: 0.15, where hair ends on the shoulders. over:
-    distance of the clothes below from the skin, metres.
+    height where the tube ends in front. over: distance of the clothes below from the skin, metres.
     """
-    skin, template = anatomy.skin, anatomy.skin.template
     to_rest, center = _skull(anatomy)
-    # silhouettes of the head without its ears, and of neck and shoulders
-    scale = 1 + thickness / 0.09
-    ears = (np.abs(template[:, 0]) > 0.0735) & (template[:, 1] > 0.26) & (template[:, 1] < 0.36)
-    head = (
-        (template[:, 1] > 0.24) & (np.abs(template[:, 0]) < 0.1) & ~ears & (template[:, 2] < 0.125)
-    )
-    levels = np.concatenate([np.arange(-0.3, 0.24, 0.02), np.linspace(0.24, _CROWN - 0.0015, 24)])
-    spine = np.repeat(center[None, [0, 2]], len(levels), 0)
-    points = skin.vertices[head]
-    skull = blurred(boundaries(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.012))
-    falling = surfaces.hanging(skull, 0.25)
-    trunk = (np.abs(template[:, 0]) < 0.12) & (template[:, 1] < 0.24) & (template[:, 1] > -0.35)
-    points = skin.vertices[trunk]
-    back = blurred(boundaries(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.02), 2)
-
-    # rings from the crown down: a dome, then a tube
+    head, back = _silhouettes(anatomy)
+    scale = 1 + thickness / _SKULL_RADIUS
     top = _CROWN + (_CROWN - SKULL[1]) * (scale - 1)
-    dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))
-    rows = np.concatenate([dome, np.arange(SKULL[1] - 0.02, min(bottom, 0.3), -0.022)])
-    row_height, angle, faces = surfaces.tube(rows, surfaces.circle(60))
+    row_height, angle, faces = surfaces.tube(_ring_heights(top, bottom), surfaces.circle(60))
     height = to_rest(row_height)
+
+    # the head is enlarged about the middle of the skull: `inner` are heights before that
     inner = center[1] + (height - center[1]) / scale
-    # the dome above the brim
-    brim, summit = to_rest(0.385), center[1] + (to_rest(top) - center[1]) / scale
-    vault = np.sqrt(np.clip(1 - np.clip((inner - brim) / (summit - brim), 0, 1) ** 2, 0, 1))
-    radius = scale * vault * falling.radius(np.minimum(inner, brim), angle)
-    # it lies on the back and what is worn there, and has waves
-    on_back = back.radius(height, angle) + (0.034 + over) * smoothstep(-0.23, -0.17, -row_height)
-    radius = np.maximum(radius, on_back * (row_height < 0.24))
+    summit = center[1] + (to_rest(top) - center[1]) / scale
+    brim = to_rest(_BRIM)
+    # above the brim it is an ellipsoid, which closes at the summit
+    risen = np.clip((inner - brim) / (summit - brim), 0, 1)
+    dome = np.sqrt(np.clip(1 - risen**2, 0, 1))
+    radius = scale * dome * head.radius(np.minimum(inner, brim), angle)
+
+    # below the head it lies on the back, 34 mm above what is worn there
+    distance = (0.034 + over) * smoothstep(-_NAPE, -_SHOULDERS, -row_height)
+    on_back = back.radius(height, angle) + distance
+    radius = np.maximum(radius, on_back * (row_height < _CHIN))
+
+    # waves are about 0.4 rad wide and 0.3 m long; they begin at the middle of the skull
     waves = ripples(rng, around(3, angle, height * 4), 1.2)
     radius = radius + smoothstep(0.0, 0.12, SKULL[1] - row_height) * wave * waves
+
+    # its paint is that of a cylinder around the skull
     vertices = around(radius, angle, height, center[[0, 2]]).astype(np.float32)
-    # the hem, and the opening for the face
-    signed = (angle + np.pi) % (2 * np.pi) - np.pi
-    front = 0.15 if ends is None else ends
-    lowest = [front, front, max(bottom, front), bottom, bottom]
-    hem = np.interp(np.abs(signed), [0, 1.2, 1.75, 2.2, np.pi], lowest)
-    hem = hem + 0.012 * ripples(rng, around(5, angle, 0 * angle), 1.5)
-    flat = around(0.09, angle, row_height, SKULL[[0, 2]]).astype(np.float32)
     surface = Surface(vertices, faces, _falling_weights(anatomy, vertices, row_height))
-    surface = surface.painted(flat, flat - np.asarray([0, 0, 0.02], np.float32), 0.09)
-    surface = cut(surface, np.minimum(opening(signed, row_height), row_height - hem))
-    return finished(
-        surface.moved(smooth(surface.vertices, surface.faces, 1, keep_hems=True)), 2, 0.008
+    template = around(_SKULL_RADIUS, angle, row_height, SKULL[[0, 2]]).astype(np.float32)
+    cloth = template - np.asarray([0, 0, SKULL[2]], np.float32)
+    surface = surface.painted(template, cloth, _SKULL_RADIUS)
+
+    # the opening for the face and the hem are cut
+    above_hem = row_height - _hem(rng, angle, bottom, ends)
+    surface = cut(surface, np.minimum(opening(_signed(angle), row_height), above_hem))
+    softened = smooth(surface.vertices, surface.faces, 1, keep_hems=True)
+    return finished(surface.moved(softened), 2, 0.008)
+
+
+def _silhouettes(anatomy: Anatomy) -> tuple[Boundaries, Boundaries]:
+    """Returns the silhouettes of the head, and of neck, shoulders and back. Their centres are on
+    the vertical axis through the middle of the skull.
+
+    The silhouettes of the head leave out the ears and the middle of the face. Downwards they get
+    narrower by at most 0.25 m per metre, like hair that hangs from the widest part of the head.
+    """
+    x, y, z = anatomy.skin.template.T
+    side = np.abs(x)
+    on_ear = (side > _EAR_SIDE) & (y > _EAR_HEIGHTS[0]) & (y < _EAR_HEIGHTS[1])
+    on_head = (y > _CHIN) & (side < _HEAD_SIDE) & ~on_ear & (z < _FACE)
+    on_back = (side < _BACK_SIDE) & (y < _CHIN) & (y > _LOWEST - 0.05)
+
+    # slices are thinner on the head, and the highest one is where the crown still has an area
+    to_rest, center = _skull(anatomy)
+    levels = np.concatenate(
+        [np.arange(_LOWEST, _CHIN, 0.02), np.linspace(_CHIN, _CROWN - 0.0015, 24)]
     )
+    axis = np.repeat(center[None, [0, 2]], len(levels), 0)
+
+    def measured(chosen, window):
+        """Returns the silhouettes of chosen vertices. window: half a slice's thickness, metres."""
+        points = anatomy.skin.vertices[chosen]
+        return boundaries(points[:, 1], points[:, [0, 2]], to_rest(levels), axis, window)
+
+    head = surfaces.hanging(blurred(measured(on_head, 0.012)), 0.25)
+    back = blurred(measured(on_back, 0.02), 2)
+    return head, back
+
+
+def _ring_heights(top: float, bottom: float) -> Float[np.ndarray, " r"]:
+    """Returns the template heights of the rings of a tube that falls from a dome, from the top
+    down. The dome ends at the middle of the skull, the tube at the lower one of `bottom` and 0.3.
+    """
+    dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))
+    tube = np.arange(SKULL[1] - 0.02, min(bottom, 0.3), -0.022)
+    return np.concatenate([dome, tube])
+
+
+def _signed(angle: Field) -> Field:
+    """Returns angles (n,) as azimuths in [-pi, pi), radians."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _hem(rng: np.random.Generator, angle: Field, bottom: float, ends: float) -> Field:
+    """Returns the template heights (n,) of an irregular hem at angles (n,). bottom, ends: heights
+    of the hem at the back and in front.
+    """
+    corners = [ends, ends, max(bottom, ends), bottom, bottom]
+    even = np.interp(np.abs(_signed(angle)), _HEM_AZIMUTHS, corners)
+    return even + 0.012 * ripples(rng, around(5, angle, 0 * angle), 1.5)
 
 
 def _bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
@@ -434,7 +505,7 @@ def _painted(surface: Surface) -> Surface:
     same positions around `SKULL`.
     """
     flat = surface.vertices - surface.vertices.mean(0)
-    return surface.painted(flat + SKULL, flat, 0.09)
+    return surface.painted(flat + SKULL, flat, _SKULL_RADIUS)
 
 
 def eyeballs(anatomy: Anatomy) -> Surface:
