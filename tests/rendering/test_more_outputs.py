@@ -70,6 +70,31 @@ def test_everything_that_is_asked_for_equals_the_reference_with_all_gradients(sc
             np.testing.assert_allclose(a, b, atol=FLOAT64 * np.abs(b).max())
 
 
+def test_gaussians_with_footprints_equal_the_reference():
+    """Footprints below and above a pixel dim the opacities by different factors."""
+    with jax.enable_x64(True):
+        gaussians = random_gaussians(3)
+        pixels = np.random.default_rng(1).uniform(0, 2, COUNT)
+        depths = np.maximum(np.asarray(gaussians.means[:, 2]), 1.0)
+        gaussians = replace(
+            gaussians, pixel_footprint=jnp.asarray(pixels * depths) / camera().K[0, 0]
+        )
+        view, weights = camera(), np.random.default_rng(2).normal(size=(HEIGHT, WIDTH, 3))
+
+        def drawn(draw):
+            def loss(gaussians):
+                rgb = draw(gaussians, view, PLAIN).rgb
+                return jnp.sum(weights * rgb), rgb
+
+            return jax.jit(jax.value_and_grad(loss, has_aux=True))(gaussians)
+
+        (_, ours), gradients = drawn(render)
+        (_, exact), expected = drawn(render_reference)
+        np.testing.assert_allclose(ours, exact, atol=FLOAT64)
+        for a, b in zip(jax.tree.leaves(gradients), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, atol=FLOAT64 * np.abs(b).max())
+
+
 @pytest.mark.slow
 def test_nothing_is_returned_that_was_not_asked_for():
     gaussians = random_gaussians(0, np.float32)
