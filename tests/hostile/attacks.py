@@ -232,6 +232,14 @@ def sparse(kind="csc", shape=(3, 3), indptr=(0, 1, 1, 1), indices=(0,)):
     return name_of("scipy.sparse", f"{kind}_matrix") + EMPTY_TUPLE + NEWOBJ + state + BUILD
 
 
+def of_equal_hashes(count):
+    """Returns keys and values, all None, for a dict: the keys are integers with one hash, so that
+    a dict of them takes seconds to minutes.
+    """
+    keys = (i * sys.hash_info.modulus for i in range(8, 8 + count))
+    return b"".join(b"\x8a\x0a" + key.to_bytes(10, "little") + b"N" for key in keys)
+
+
 EIGHT = raw(bytes(8))
 STATE = EMPTY_DICT + word("x") + number(1) + SETITEM + BUILD
 FIELD = EMPTY_DICT + word("f") + dtype("O8") + number(0) + TUPLE2 + SETITEM
@@ -286,6 +294,7 @@ PICKLES = {
     + REDUCE,
     "a set": b"\x8f" + MARK + doubled(64) + b"\x90",
     "a key of 72 bits": EMPTY_DICT + b"\x8a\x09" + b"\xff" * 8 + b"\x00N" + SETITEM,
+    "keys of equal hashes": EMPTY_DICT + MARK + of_equal_hashes(60_000) + b"u",
     "lists in lists": doubled_list(40),
     "marks": MARK * 100_000,
     "nothing on the stack": REDUCE,
