@@ -334,11 +334,13 @@ def test_a_dropped_glb_moves_and_its_other_animations_are_offered(browser, avata
 
 
 def test_a_file_that_is_no_motion_gets_one_line_and_changes_nothing(browser):
-    before = browser.run("return document.getElementById('motion-name').textContent")
+    # names are shown with the next frame that is drawn
+    shown = "await humangs.settle(); return document.getElementById('motion-name').textContent"
+    before = browser.run(shown)
     message = drop(browser, "notes.txt", b"hello")
     assert (
         message.startswith("notes.txt")
         and "expected a motion as .npz (ours, AMASS), .bvh or .glb" in message
         and "\n" not in message
     )
-    assert browser.run("return document.getElementById('motion-name').textContent") == before
+    assert browser.run(shown) == before
