@@ -86,7 +86,7 @@ def import_photos(
         others: folder of masks of other people and of things in front of the person. Only some
             photos need to have one.
         own_masks: whether to write the masks of our detector.
-        reduce: whether large photos may be reduced. They are not if there are masks of others.
+        reduce: whether large photos may be reduced. It has no effect with `masks` or `others`.
         also: names and contents of JSON files that are written with the capture.
     Raises: ValueError (one line) if no camera is found, or if photos show several large people and
     none is chosen. Also as `import_cameras`.

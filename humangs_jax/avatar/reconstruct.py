@@ -502,12 +502,15 @@ def with_blended_leg_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Av
     Gaussians whose blended transform collapses keep their weights, see `SMALLEST_VOLUME`. The
     shapes of Gaussians are not corrected. Gradients do not pass through the weights.
     """
+    # the new weights
     gaussians, vertices, own = avatar.gaussians, avatar.rest_vertices, avatar.skinning_weights
     per_vertex = len(gaussians.means) // len(vertices)
     points = jax.lax.stop_gradient(gaussians.means)
     distances = jnp.linalg.norm(points - jnp.repeat(vertices, per_vertex, axis=0), axis=-1)
     legs = jnp.asarray([[name in names for name in avatar.joint_names] for names in LEGS])
     spread = blend_leg_weights(points, distances, own, vertices, own[::per_vertex], legs, reach)
+
+    # the linear part of a blended transform, inverted by its cofactors
     transforms = joint_transforms(
         avatar.rest_joints, avatar.parents, pose.rotations, pose.translation
     )
@@ -516,6 +519,8 @@ def with_blended_leg_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Av
     crossed = jnp.stack([jnp.cross(columns[i - 2], columns[i - 1]) for i in range(3)], axis=1)
     volumes = jnp.sum(columns[0] * crossed[:, 0], axis=-1)
     safe = volumes > SMALLEST_VOLUME
+
+    # the places in T-pose from which the new transforms lead to the old places in the pose
     moved = transform.apply(before, gaussians.means) - after[:, :3, 3]
     held = jnp.einsum(
         "gab,gb->ga",

@@ -78,6 +78,7 @@ class Compiled(Generic[T]):
         self.signature = inspect.signature(function)
         self.static = tuple(name for name in static if name in self.signature.parameters)
         self.options = options
+        # by the key of a call: its program, and the function that will be compiled for it
         self._programs: dict[Any, Future[Any]] = {}
         self._functions: dict[Any, Any] = {}
         self._lock = threading.Lock()
@@ -87,7 +88,7 @@ class Compiled(Generic[T]):
         """The function as `jax.jit` compiles it. It is made late, because the options may depend on
         the device.
         """
-        return self._jitted(self.function)
+        return self._jit(self.function)
 
     def _jitted_for(self, call: "_Call") -> Any:
         """Returns the function as `jax.jit` compiles it for the program of one call.
@@ -104,9 +105,9 @@ class Compiled(Generic[T]):
         def function(*args: Any, **kwargs: Any) -> Any:
             return self.function(*args, **kwargs)
 
-        return self._functions.setdefault(call.key, self._jitted(function))
+        return self._functions.setdefault(call.key, self._jit(function))
 
-    def _jitted(self, function: Callable[..., Any]) -> Any:
+    def _jit(self, function: Callable[..., Any]) -> Any:
         """Returns a function as `jax.jit` compiles it."""
         options = None if self.options is None else self.options()
         return jax.jit(function, static_argnames=self.static, compiler_options=options)
@@ -408,5 +409,5 @@ def _write(file: Path, data: bytes) -> None:
             os.replace(temporary.name, file)
         except BaseException:
             temporary.close()
-            os.unlink(temporary.name)
+            Path(temporary.name).unlink(missing_ok=True)  # Ctrl-C may come when it has its name
             raise

@@ -433,6 +433,7 @@ def train(
         state = init_state(config, variables)
         checkpoints = Checkpoints(out / "checkpoints", config.keep_checkpoints)
         current = _resumed(state, mesh, checkpoints)
+        del state  # so that its memory is free when the first step has replaced it
         if mesh is not None:
             body, networks = place((body, networks), replicated(mesh))
 

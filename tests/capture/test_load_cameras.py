@@ -140,7 +140,8 @@ def test_lenses_that_no_camera_here_has_are_refused(tmp_path, changes, problem):
 
 
 def test_cameras_beside_splats_of_3dgs(tmp_path):
-    # the camera stands at (1, 2, 3) and looks along the world's x, its y points along the world's -z
+    # the camera stands at (1, 2, 3) and looks along the world's x
+    # its y points along the world's -z
     entry = {
         "img_name": "r_0",
         "width": 80,

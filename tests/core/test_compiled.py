@@ -114,6 +114,18 @@ def test_another_source_is_another_program(folder, monkeypatch):
     assert len(traces) == 1
 
 
+def test_another_processor_is_another_program(folder, monkeypatch):
+    """A folder that JAX's own variable names may be on a disk that several machines share."""
+    x = np.ones(4, np.float32)
+    anew()(CAMERA, x, 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "processor", lambda: "another")
+        patch.setattr(module, "_surroundings", module._surroundings.__wrapped__)  # nothing cached
+        traces.clear()
+        anew()(CAMERA, x, 2)
+    assert len(traces) == 1
+
+
 def test_nothing_is_kept_after_the_source_was_edited(folder, monkeypatch):
     monkeypatch.setattr(module, "source_has_changed", lambda: True)
     anew()(CAMERA, np.ones(4, np.float32), 2)

@@ -232,6 +232,7 @@ def test_numbers_in_a_png_say_how_colors_are_encoded(tmp_path):
     wanted = COLORS / 255
     p3 = np.rint(255 * to_p3(wanted))
     light = np.rint(65535 * srgb_to_light(wanted))
+    # each chunk alone, before one of less weight, and with numbers that no colors have
     files = {
         "cICP": png(p3, chunk(b"cICP", bytes([12, 13, 0, 1]))),
         "cICP before another": png(

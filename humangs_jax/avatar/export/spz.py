@@ -228,8 +228,8 @@ def read_spz(data: bytes, notes: list[str]) -> Gaussians:
 
 
 def _checked_header(start: bytes, versions: Sequence[int], size: int) -> _Header:
-    """Returns the header of a file of `size` bytes, after checks. They check version, degree, and
-    number of Gaussians, and that a file of this size may unpack to the bytes of so many Gaussians.
+    """Returns the header of a file of `size` bytes. First it checks the version, the degree, the
+    number of Gaussians, and whether a file of `size` bytes may unpack to this number of Gaussians.
 
     start: the first bytes of the file, unpacked. versions: the versions that are read.
 

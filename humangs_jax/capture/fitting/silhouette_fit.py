@@ -410,6 +410,7 @@ class SilhouetteFit:
         memory: Float[np.ndarray, " n"] | None = None,
     ) -> "SilhouetteFit":
         """Returns the constants of a refinement of a capture. memory: see `refine_capture`."""
+        # the photos are reduced to the size at which silhouettes are compared
         small = max(capture.images.shape[1:3]) <= config.longest_side
         looked_at = capture if small else capture.resized(config.longest_side)
         cameras, masks = looked_at.cameras, looked_at.masks
@@ -417,6 +418,8 @@ class SilhouetteFit:
             masks = np.zeros(looked_at.images.shape[:3], np.float32)
         faces = np.asarray(capture.body.faces)
         hidden = _with_rim(looked_at.unknown, len(masks))
+
+        # keypoints are in pixels of the given photos
         if keypoints is None:
             model = landmark_model(capture.body, ())
             in_photos = observations = None
