@@ -327,7 +327,7 @@ class Bench:
             return jax.tree.map(lambda x: x[i], poses)
 
         endless = (pose(i) for i in turns()), (cameras[i] for i in turns())
-        renderings = draw(avatar, *endless, how=how)
+        renderings = draw(avatar, *endless, how=how, at_once=1)
         return (jax.block_until_ready(rendering) for rendering in renderings)
 
     def painted_times(self) -> dict[str, Any]:

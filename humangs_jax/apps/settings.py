@@ -358,7 +358,8 @@ def measure(
     def pose(i):
         return jax.tree.map(lambda x: x[i], poses)
 
-    drawn = draw(avatar, map(pose, range(FRAMES + 1)), cameras, how=splatting_of(shot, avatar))
+    how = splatting_of(shot, avatar)
+    drawn = draw(avatar, map(pose, range(FRAMES + 1)), cameras, how=how, at_once=1)
 
     def frame():
         return jax.block_until_ready(next(drawn))

@@ -19,6 +19,7 @@ from humangs_jax.core.arrays import from_host, taken
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.core.compiled import compiled
 from humangs_jax.core.configuration import ArgumentError
+from humangs_jax.core.processes import in_threads, usable_cores
 from humangs_jax.core.progress import COMPILING, bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
@@ -56,6 +57,12 @@ MOST_TRACKED = 1 << 25
 """The largest number of points on which the extent is measured, in all frames together. They take
 400 MB. A motion of more than 32,768 frames is measured on fewer Gaussians.
 """
+MOST_FRAMES = 4
+"""The largest number of frames that are drawn at the same time on a CPU."""
+PIXELS_AT_ONCE = 1 << 22
+"""Number of pixels that these frames have together, if there is more than one. Drawing needs some
+100 bytes a pixel.
+"""
 A_POSE = 48.0
 """Degrees by which the arms hang down in the A-pose, as in the viewer's page."""
 
@@ -69,10 +76,11 @@ def draw(
     background: Background = None,
     how: SplatConfig | None = None,
     exposure_gains: Float[np.ndarray, "v 3"] | None = None,
+    at_once: int | None = None,
 ) -> Iterator[Rendering]:
     """Yields one rendering for each pose and its camera. how: the configuration. None: the preset
     `avatar.rendering`, for which the avatar was trained. exposure_gains: factors on the colors in
-    each image, (v, 3), see `data.exposure`.
+    each image, (v, 3), see `data.exposure`. at_once: as for `draw_gaussians`.
     """
     if how is None:
         how = SPLAT_PRESETS[avatar.rendering]
@@ -85,7 +93,7 @@ def draw(
             )
 
         gaussians = (lit(g, e) for g, e in zip(gaussians, exposure_gains, strict=True))
-    return draw_gaussians(gaussians, cameras, background, how)
+    return draw_gaussians(gaussians, cameras, background, how, at_once)
 
 
 def draw_gaussians(
@@ -93,21 +101,40 @@ def draw_gaussians(
     cameras: Iterable[Camera],
     background: Background = None,
     how: SplatConfig = SPLAT_PRESETS["exact"],
+    at_once: int | None = None,
 ) -> Iterator[Rendering]:
-    """Yields one rendering for each frame of Gaussians and its camera.
+    """Yields one rendering for each frame of Gaussians and its camera. at_once: the number of
+    frames that are drawn at the same time. None: as many as cores and memory allow.
 
     Buffers are planned for the first frame, with room to spare. Programs are compiled once per
     image size, and again only if a frame needs more room than that.
     """
-    config = None
-    for frame, camera in zip(gaussians, cameras, strict=True):
-        config = config or plan_near(frame, camera, how)
+    frames = zip(gaussians, cameras, strict=True)
+    first = next(frames, None)
+    if first is None:
+        return
+    plans = [plan_near(*first, how)]  # the last one is that of the next frame
+
+    def drawn(frame: Gaussians, camera: Camera) -> Rendering:
         try:
-            rendering = render(frame, camera, config, background)
+            return render(frame, camera, plans[-1], background)
         except BufferOverflowError:
-            config = plan_buffers(frame, camera, how)
-            rendering = render(frame, camera, config, background)
-        yield rendering
+            larger = plan_buffers(frame, camera, how)
+            plans.append(larger)
+            return render(frame, camera, larger, background)
+
+    yield drawn(*first)  # alone, so that its program is compiled once
+    if at_once is None:
+        at_once = _frames_at_once(first[1])
+    yield from in_threads(drawn, frames, at_once)
+
+
+def _frames_at_once(camera: Camera) -> int:
+    """Returns the number of frames that are drawn at the same time. Each needs its own memory."""
+    if jax.default_backend() != "cpu":
+        return 1
+    pixels = camera.width * camera.height
+    return max(1, min(usable_cores(), MOST_FRAMES, PIXELS_AT_ONCE // pixels))
 
 
 def splatting_of(shot: FrameSettings, avatar: Avatar) -> SplatConfig:
@@ -409,7 +436,7 @@ def images(
     progress: str | None = None,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """Yields one image for each pose and its camera, (h, w, 3), or (h, w, 4) with alpha, see
-    `composite_over`. Each is drawn when it is asked for.
+    `composite_over`. Frames are drawn when they are asked for, a few of them ahead.
 
     progress: the label of a progress bar; None: no bar.
     """
@@ -434,8 +461,8 @@ def motion_frames(
     turn: float = 0.0,
     progress: bool = True,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
-    """Yields the frames of a moving avatar, which the camera follows. Each is drawn when it is
-    asked for. See `motion_views` and `images`.
+    """Yields the frames of a moving avatar, which the camera follows. See `motion_views` and
+    `images`.
     """
     if shot is None:
         shot = FrameSettings()

@@ -12,7 +12,6 @@ folders.
 
 import dataclasses
 import functools
-import os
 import re
 import zipfile
 from collections.abc import Iterable, Iterator
@@ -32,6 +31,7 @@ from typing import (
 from tyro.conf import Positional, arg
 
 from humangs_jax.core.configuration import Range, at_least, check_range, marks_in
+from humangs_jax.core.processes import usable_cores
 from humangs_jax.core.progress import say
 from humangs_jax.core.registry import alternatives
 from humangs_jax.refinement.config import ITERATIONS_ALONE, RefineConfig
@@ -431,8 +431,4 @@ def shard_of(text: str) -> tuple[int, int]:
 
 def cores(workers: int | None) -> int:
     """Returns the number of processes: `workers`, or if None one for each core that may be used."""
-    if hasattr(os, "sched_getaffinity"):
-        available = len(os.sched_getaffinity(0))
-    else:
-        available = os.cpu_count() or 1
-    return available if workers is None else workers
+    return usable_cores() if workers is None else workers

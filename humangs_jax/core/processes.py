@@ -6,6 +6,7 @@ afterwards. glibc gives blocks above 32 MiB back to the system, and the next cal
 its pages to be mapped anew. `keep_freed_memory` prevents this.
 """
 
+import collections
 import contextlib
 import ctypes
 import functools
@@ -177,6 +178,54 @@ def _begin(prepare: Callable[..., object], given: tuple[Any, ...]) -> None:
     )
     jax.config.update("jax_platforms", "cpu")
     prepare(*given)
+
+
+def usable_cores() -> int:
+    """Returns the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def in_threads(
+    work: Callable[..., T], tasks: Iterable[tuple[Any, ...]], threads: int
+) -> Iterator[T]:
+    """Yields work(*arguments) for each task, in the order of the tasks. At most `threads` tasks run
+    at a time, and at most one more result waits for the caller.
+
+    XLA draws an image on one core of a CPU, but several programs run at the same time. The settings
+    of JAX that a block of code may change are those of the calling thread.
+
+    If the caller stops, by Ctrl-C or otherwise, or if a task fails, tasks that have not begun are
+    dropped.
+
+    Raises: anything that `work` raises, when it is the task's turn.
+    """
+    if threads == 1:
+        for arguments in tasks:
+            yield work(*arguments)
+        return
+    import concurrent.futures
+
+    import jax
+
+    wide, precision = jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision
+
+    def run(arguments: tuple[Any, ...]) -> T:
+        with jax.enable_x64(wide), jax.default_matmul_precision(precision):
+            return work(*arguments)
+
+    pool = concurrent.futures.ThreadPoolExecutor(threads, "humangs")
+    begun: collections.deque[concurrent.futures.Future[T]] = collections.deque()
+    try:
+        for arguments in tasks:
+            begun.append(pool.submit(run, arguments))
+            if len(begun) > threads:
+                yield begun.popleft().result()
+        while begun:
+            yield begun.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def end_with_parent() -> None:

@@ -62,6 +62,26 @@ def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
         assert rendering.overflow == 0 and rendering.alpha.max() > 0.5
 
 
+@pytest.mark.parametrize("at_once", [1, 3])
+def test_frames_are_those_of_their_poses_and_cameras(at_once):
+    gaussians = [blobs(count) for count in (80, 60, 80, 60, 80)]
+    camera = Camera(jnp.asarray([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]]), jnp.eye(4), 64, 64)
+    cameras = [camera.resized(size, size) for size in (64, 48, 64, 64, 48)]
+    drawn = frames.draw_gaussians(iter(gaussians), iter(cameras), at_once=at_once)
+    for rendering, frame, camera in zip(drawn, gaussians, cameras, strict=True):
+        np.testing.assert_allclose(rendering.rgb, render(frame, camera).rgb, atol=ROUNDING)
+    with pytest.raises(ValueError, match="zip"):
+        list(frames.draw_gaussians(iter(gaussians[:1]), iter(cameras)))
+    assert list(frames.draw_gaussians(iter([]), iter([]))) == []
+
+
+def test_large_frames_are_drawn_one_at_a_time(monkeypatch):
+    monkeypatch.setattr(frames, "usable_cores", lambda: 64)
+    camera = Camera(jnp.eye(3), jnp.eye(4), 512, 512)
+    at_once = [frames._frames_at_once(camera.resized(side, side)) for side in (512, 1448, 4096)]
+    assert at_once == [4, 2, 1]
+
+
 def test_each_camera_has_its_exposure():
     avatar = two_balls(1)
     pose, how = frames.rest_pose_of(avatar), SPLAT_PRESETS["exact"]

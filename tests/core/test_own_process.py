@@ -1,4 +1,4 @@
-"""The peak of memory, interrupts that wait, and workers that end with their process."""
+"""The peak of memory, interrupts that wait, threads, and workers that end with their process."""
 
 import multiprocessing
 import os
@@ -9,10 +9,18 @@ import sys
 import threading
 import time
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.core.processes import in_processes, peak_memory, started_deaf, undisturbed
+from humangs_jax.core.processes import (
+    in_processes,
+    in_threads,
+    peak_memory,
+    started_deaf,
+    undisturbed,
+)
 
 PROGRAM = """
 import resource
@@ -119,6 +127,52 @@ def test_work_that_ends_early_ends_its_own_processes_and_no_others():
     finally:
         other.kill()
         other.join()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_results_of_threads_come_in_the_order_of_the_tasks(threads):
+    def late(number):
+        time.sleep(0.02 * (number % 3 == 0))
+        return number
+
+    assert list(in_threads(late, ((n,) for n in range(20)), threads)) == list(range(20))
+    assert list(in_threads(late, [], threads)) == []
+
+
+def test_as_many_tasks_run_at_a_time_as_there_are_threads():
+    meeting = threading.Barrier(3)
+    running = in_threads(meeting.wait, [(60,)] * 6, 3)  # fails unless three are there
+    assert sorted(running) == [0, 0, 1, 1, 2, 2]
+
+
+def test_few_tasks_begin_before_the_caller_asks():
+    begun = []
+    running = in_threads(begun.append, ((n,) for n in range(50)), 2)
+    next(running)
+    time.sleep(0.05)
+    assert len(begun) <= 3
+    running.close()
+    assert len(begun) <= 3
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_first_error_of_a_task_is_raised_in_its_turn(threads):
+    found = []
+    with pytest.raises(ZeroDivisionError):
+        for result in in_threads(lambda x: 1 / x, [(2,), (1,), (0,), (4,)], threads):
+            found.append(result)
+    assert found == [0.5, 1]
+
+
+def test_settings_of_jax_hold_in_the_threads():
+    """JAX keeps what a block of code sets for the thread that runs the block."""
+
+    def made(number):
+        return jnp.zeros(number).dtype, jax.config.jax_default_matmul_precision
+
+    with jax.enable_x64(True), jax.default_matmul_precision("highest"):
+        assert set(in_threads(made, [(1,), (2,)], 2)) == {(np.dtype("float64"), "highest")}
+    assert set(in_threads(made, [(1,), (2,)], 2)) == {(np.dtype("float32"), None)}
 
 
 POOL = """
