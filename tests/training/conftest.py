@@ -33,7 +33,10 @@ def _compiled_quickly(request):
     Most steps run a few times only.
     """
     if getattr(request.module, "OPTIMIZED", False):
+        before = jax.config.read("jax_disable_most_optimizations")
+        jax.config.update("jax_disable_most_optimizations", False)
         yield
+        jax.config.update("jax_disable_most_optimizations", before)
         return
     with mock.patch.object(step, "compiled_update", quick_update):
         yield
