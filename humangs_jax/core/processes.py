@@ -14,6 +14,7 @@ import gc
 import hashlib
 import multiprocessing
 import os
+import pickle
 import platform
 import signal
 import stat
@@ -139,16 +140,20 @@ def in_processes(
     Arguments: work: a function. tasks: the arguments of `work` by name. workers: largest number of
     processes. prepare: called as prepare(*given) when a process starts. All of these are pickled.
 
-    Raises: OSError if a process is killed; anything that `work` raises.
+    Raises: OSError if a process is killed; PicklingError and others if the arguments cannot be
+    pickled; anything that `work` raises.
     """
     import concurrent.futures.process
 
+    # Python pickles tasks in a thread of the pool. If that fails while the processes end, this
+    # thread and another one of the pool wait for each other for ever (seen with 3.12.1)
+    calls = {name: pickle.dumps((work, arguments)) for name, arguments in tasks.items()}
     context = multiprocessing.get_context("spawn")  # a forked process may hang in jax's threads
     count = min(workers, len(tasks))
     with concurrent.futures.ProcessPoolExecutor(count, context, _begin, (prepare, given)) as pool:
         try:
             with started_deaf():
-                futures = {pool.submit(work, *arguments): name for name, arguments in tasks.items()}
+                futures = {pool.submit(_call, call): name for name, call in calls.items()}
             for future in concurrent.futures.as_completed(futures):
                 yield futures[future], future.result()
         except concurrent.futures.process.BrokenProcessPool as error:
@@ -161,6 +166,12 @@ def in_processes(
             for process in started:
                 process.terminate()
             raise
+
+
+def _call(pickled: bytes) -> Any:
+    """Returns the result of a pickled function and its arguments."""
+    work, arguments = pickle.loads(pickled)
+    return work(*arguments)
 
 
 def _begin(prepare: Callable[..., object], given: tuple[Any, ...]) -> None:

@@ -119,14 +119,19 @@ def test_work_that_ends_early_ends_its_own_processes_and_no_others():
     other = context.Process(target=time.sleep, args=(60,), daemon=True)
     other.start()
     try:
-        # work that cannot be pickled fails while its processes are still starting
-        with pytest.raises((pickle.PicklingError, AttributeError), match="lambda"):
-            list(in_processes(lambda: 0, {"one": (), "two": ()}, 2, print))
+        with pytest.raises(ValueError, match="must be non-negative"):
+            list(in_processes(time.sleep, {"wrong": (-1,), "long": (60,)}, 2, print))
         other.join(0.2)
         assert multiprocessing.active_children() == [other]
     finally:
         other.kill()
         other.join()
+
+
+def test_work_that_cannot_be_pickled_fails_before_processes_start(monkeypatch):
+    monkeypatch.setattr(multiprocessing, "get_context", None)
+    with pytest.raises((pickle.PicklingError, AttributeError), match="lambda"):
+        list(in_processes(lambda: 0, {"one": (), "two": ()}, 2, print))
 
 
 @pytest.mark.parametrize("threads", [1, 3])
