@@ -21,7 +21,7 @@ from experiments.costs import costs_of, temporary_mb
 from experiments.harness import Run, entry
 from experiments.results import markdown_table
 from experiments.timing import medians
-from humangs_jax.avatar.reconstruct import reconstruct_views, stack_captures
+from humangs_jax.avatar.reconstruct import reconstruct, reconstruct_views, stack_captures
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.data.views import gaussian_body, prepare_inputs, to_network_views
@@ -284,3 +284,33 @@ def reconstruction_batches(
     header = ["subjects in a batch", "subjects a second", f"relative to {sizes[0]}"]
     header += ["working memory, MB"]
     run.show(markdown_table(header, rows, "rrrr"), {"ms": each, "memory_mb": memory})
+
+
+@entry
+def reconstruction_calls(run: Run, runs: int = 9) -> None:
+    """Measures a call of `hg.reconstruct` once its programs are compiled, with the demo's four
+    photos and the shipped weights, and how much of it the programs need.
+
+    The rest is work on the host: checks, exposure, masks and crops. Each call gets a capture that
+    was not prepared before.
+
+    Options:
+        runs: timed calls of each, in turns; the median counts
+    """
+    (variables, config), capture = load_weights(), load_capture(DEMO_CAPTURE)
+    body, views, sized = stack_captures(config, [capture])
+    views = jax.tree.map(lambda leaf: leaf[0], views)
+    program = jax.jit(reconstruct_views).lower(variables, sized, body, views).compile()
+    unprepared = itertools.cycle([load_capture(DEMO_CAPTURE) for _ in range(runs + 1)])
+    times = medians(
+        {
+            "hg.reconstruct": lambda: jax.block_until_ready(
+                reconstruct(variables, config, next(unprepared))
+            ),
+            "its programs": lambda: jax.block_until_ready(program(variables, sized, body, views)),
+        },
+        runs,
+    )
+    rows = [[name, *(f"{time:.0f}" for time in pair)] for name, pair in times.items()]
+    found = {name: list(map(float, pair)) for name, pair in times.items()}
+    run.show(markdown_table(["", "wall, ms", "CPU ms"], rows, "lrr"), found)
