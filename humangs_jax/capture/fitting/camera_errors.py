@@ -1,13 +1,13 @@
-"""Checks a calibration: finds cameras with a wrong rotation. Such a camera sees all landmarks
-shifted from where the other cameras see them.
+"""Checks a calibration: finds cameras with a wrong rotation. In the photos of such a camera, all
+landmarks are shifted from where they should be according to the other cameras.
 
 The corrections come from linearised bundle adjustment, in which every landmark of every moment is a
 free point (Triggs et al. 2000, "Bundle Adjustment").
 
 A detector's landmarks have errors too, but these differ from landmark to landmark. So a camera is
-only reported if its correction exceeds several standard errors. The standard errors come from the
-scatter over landmarks (a sandwich estimate, clustered by landmark). Cameras are turned one after
-the other, as long as each turn clearly explains residuals.
+only reported if its correction exceeds several standard errors and lowers the cost clearly. The
+standard errors come from the scatter over landmarks (a sandwich estimate, clustered by landmark).
+Cameras are turned one after the other, as long as each turn passes these tests.
 
 Axes of arrays, also in `einsum`:
 
@@ -47,8 +47,8 @@ _PRIOR = np.radians(1.0)
 points together would be undetermined, because they change no residual.
 """
 _ITERATIONS = 8
-"""Number of iterations that reweight the residuals. After them, as many iterations move only the
-points, with fixed weights and cameras.
+"""Number of iterations that turn the cameras, move the points and reweight the residuals. After
+them, as many iterations move only the points, for the cameras as given and with the last weights.
 """
 
 
@@ -61,21 +61,21 @@ class _Decision:
     least_gain: float = 25.0
     """A rotation has to lower the cost by at least this much to count.
 
-    A detector with the same error in all landmarks of a view looks like a rotation. For five
-    synthetic people in rooms with exact cameras, rotations lowered the cost by 5 to 16. For five
-    photos of a man with a wrong calibration they lowered it by 32 to 121.
+    If a detector has the same error in all landmarks of a view, this looks like a rotation of the
+    camera. For five synthetic people in rooms with exact cameras, rotations lowered the cost by 5
+    to 16. For five photos of a man with a wrong calibration, rotations lowered it by 32 to 121.
     """
     least_degrees: float = 0.3
-    """Rotations up to this angle are not reported, degrees. They hardly matter: a third of a degree
-    moves a point by 1.5 cm at a distance of 3 m.
+    """Rotations up to this angle are not reported, degrees. They hardly matter: 0.3 degrees move a
+    point by 1.6 cm at a distance of 3 m.
     """
     most_degrees: float = 8.0
     """Nothing is reported if any rotation exceeds this angle, degrees. The calibration then has
     another error.
     """
     alike: float = 0.9
-    """Another camera is named as a possible cause, too, if turning it in place of the reported
-    camera lowers the cost by more than this share of what turning the reported camera does.
+    """Another camera is also named as a possible cause if it explains nearly as much: turned in
+    place of the reported camera, it has to reach more than this share of the decrease of the cost.
     """
     most_cameras: int = 64
     """Largest number of cameras. If there are more, no errors are looked for."""
@@ -95,7 +95,7 @@ class CameraError:
     explain the residuals almost as well. The name of a camera is the name of its first view.
     """
     rotation: tuple[float, float, float]
-    """Rotation that corrects the camera, as axis-angle in the camera's axes, radians."""
+    """Rotation that corrects the camera: a rotation vector in the camera's axes, radians."""
 
     @property
     def degrees(self) -> float:
@@ -103,16 +103,16 @@ class CameraError:
         return float(np.degrees(np.linalg.norm(self.rotation)))
 
     def __str__(self) -> str:
-        """Describes the error in one line."""
+        """Returns one line that names the camera and the angle."""
         return f"camera {' or '.join(self.names)} is off by {self.degrees:.1f} degrees"
 
 
 def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[CameraError, ...]:
-    """Returns the cameras that are turned according to the keypoints. The camera that explains most
-    of the residuals comes first.
+    """Returns the cameras whose rotation is wrong according to the keypoints. The camera that
+    explains most of the residuals comes first.
 
-    The result is empty for fewer than three or more than `most_cameras` cameras, or if too few
-    landmarks are seen. It is also empty if a rotation exceeds `most_degrees`.
+    The result is empty for fewer than three or more than `_Decision.most_cameras` cameras, or if
+    too few landmarks are seen. It is also empty if a rotation exceeds `_Decision.most_degrees`.
     """
     camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
     if not 3 <= camera_of.max() + 1 <= _DECISION.most_cameras:
@@ -195,11 +195,11 @@ class _Seen:
         camera_of: Int[np.ndarray, " v"],
     ) -> "_Seen | None":
         """Returns the keypoints of at most 24 moments, evenly chosen. Only the main landmarks of
-        the body are taken. Landmarks within a face or a hand are left out, because their errors are
-        alike.
+        the body are taken, with nose, eyes and ears. Other landmarks of a face or a hand are left
+        out, because their errors are alike.
 
-        The result is None if fewer than 8 landmarks are seen by two views at a moment. camera_of:
-        index of each view's camera, (v,).
+        A landmark counts if at least two views see it at the same moment. The result is None if
+        fewer than 8 landmarks count. camera_of: index of each view's camera, (v,).
         """
         # landmarks that err independently: those of a face or a hand err together
         parts = (
@@ -252,8 +252,8 @@ class _Seen:
         return step.equations
 
     def _middle(self) -> Float[np.ndarray, "m k 3"]:
-        """Returns the start of the points, (m, k, 3), metres. All of them start at the point that
-        is nearest to the optical axes of all cameras.
+        """Returns the positions at which the points start, (m, k, 3), metres. All points start at
+        the same position, which is nearest to the optical axes of all cameras.
         """
         axes = self.matrices[..., 2, :3]
         centers = -np.einsum("mcba,mcb->mca", self.matrices[..., :3, :3], self.matrices[..., :3, 3])
@@ -405,7 +405,7 @@ class _Solved(NamedTuple):
     gain: float
     """By how much these rotations lower the cost."""
     clear: float
-    """Size of the last camera's rotation, in standard errors."""
+    """Size of the last camera's rotation in standard errors, a root mean square over three axes."""
 
 
 def _solved(equations: _Equations, cameras: list[int]) -> _Solved:

@@ -88,8 +88,8 @@ class Contradiction:
     """Agreement of cameras and keypoints with the remedy. None if there is no remedy."""
 
     def __str__(self) -> str:
-        """Returns one line that says how large the disagreement is, or that the person would be
-        behind the cameras, and which change removes it, if one is known.
+        """Returns one line about the disagreement. It states the median distance, or that the
+        person would be behind the cameras. If a remedy is known, the line states it, too.
         """
         off = f"landmarks miss each other by {self.found.pixels:.0f} px"
         share = f"{off}, {self.found.missed:.0%} of the person's size"
@@ -104,13 +104,14 @@ def find_contradiction(photos: Photos, keypoints: Keypoints) -> Contradiction | 
     """Returns the contradiction between the keypoints of one person and the calibration of the
     photos, or None.
 
-    The result is None if keypoints and calibration agree, or if too few landmarks are seen in
-    several views. It is None if they agree after the cameras that `find_camera_errors` finds were
-    corrected. If no usual mistake explains the contradiction, it is None if all views except one
-    agree.
+    The result is None if one of these holds:
 
-    If no remedy is known, a small contradiction gives None, too, because the person may have moved
-    between the photos.
+    - Keypoints and calibration agree, or too few landmarks are seen in several views.
+    - They agree after the cameras that `find_camera_errors` finds were corrected.
+    - No usual mistake explains the contradiction, and the other views agree if one of at least four
+      views is left out.
+    - No remedy is known, the contradiction is small, and the person is neither mirrored nor behind
+      the cameras. The person may have moved between the photos.
     """
     K = np.asarray(photos.cameras.K, np.float64)
     matrices = np.asarray(photos.cameras.cam_from_world, np.float64)

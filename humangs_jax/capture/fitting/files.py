@@ -7,7 +7,7 @@ fit.npz has the input of a fit to keypoints, and the uncertainty of its result:
                                                              them
     noise (m,)               std of the detections, pixels
     joint_std (m, j)         std of the joints' positions, metres
-    determined (m, j)        share of the joints' rotations that the views determine
+    determined (m, j)        share of each joint's rotation that the views determine
     shape_covariance (s, s)
     places (k, 3)            offsets of the set's landmarks that the fit found, metres
     certainty (k,)           weights of the set's landmarks that the fit found
@@ -48,7 +48,7 @@ KEYS = ("set", "names", "points", "confidences", *_FOUND, "places", "certainty")
 
 
 class UnknownViewError(ValueError):
-    """Error: the capture has views that its fit does not know, because photos were added later."""
+    """The capture has views that its fit.npz does not have, because photos were added later."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class FitRecord:
     noise: Float[np.ndarray, " m"]
     """Standard deviation of the detections in each frame, (m,), pixels."""
     joint_std: Float[np.ndarray, "m j"]
-    """Standard deviations of the joints' positions, (m, j), metres."""
+    """Standard deviations of the joints' positions, (m, j), metres, see `Uncertainty.joint_std`."""
     determined: Float[np.ndarray, "m j"]
     """Share of each joint's rotation that the views determine, (m, j)."""
     shape_covariance: Float[np.ndarray, "s s"]
@@ -71,7 +71,7 @@ class FitRecord:
     def of_views(self, names: Sequence[str]) -> Keypoints:
         """Returns the keypoints of the named views, in their order.
 
-        Raises: UnknownViewError.
+        Raises: UnknownViewError if the record does not have one of the names.
         """
         missing = [name for name in names if name not in self.names]
         if missing:
@@ -150,13 +150,15 @@ def check_place(
     overwrite: bool,
     inputs: Iterable[str | Path | None] = (),
 ) -> Path:
-    """Returns the folder to which a fit of the capture `source` will be written. Checks beforehand
-    that it can be written there.
+    """Returns the folder to which a fit of the capture `source` will be written. Checks that the
+    fit can be written there.
 
     Arguments: out: the folder. None: the capture folder itself, in which body and cameras are
     replaced. overwrite: whether an existing fit may be replaced. inputs: further files and folders
-    that the fit reads, or None. If `out` is another folder, it must not contain them or the photos.
-    Raises: ArgumentError if the capture folder itself has a body, and `overwrite` is False. For
+    that the fit reads. Entries of None are ignored. If `out` is another folder, the capture, its
+    photos and the inputs must not lie in it.
+    Raises: CaptureError if the capture.json of `source` cannot be read or is invalid. ArgumentError
+    if the fit is written into the capture folder, a body is there, and `overwrite` is False. For
     another folder, ValueError as in `check_replaceable`. OSError if the place cannot be written to.
     """
     source = capture_folder(source)
@@ -188,11 +190,11 @@ def write_fitted(
     record: FitRecord | None = None,
 ) -> None:
     """Writes cameras, body and report of a capture. If `target` is the capture folder `source`,
-    they are written into it. If not, the folder `target` is replaced, and also gets copies of the
-    photos.
+    the files are written into it. If not, the folder `target` is replaced, and also gets copies of
+    the images, masks and files of unknown pixels.
 
     Arguments: record: record of a fit to keypoints. If it is None, the target has no fit.npz
-    afterwards. An old fit.npz in the source belongs to other cameras.
+    afterwards, because an old fit.npz belongs to other cameras.
     """
     source, target = capture_folder(source), Path(target)
     description = read_description(source / "capture.json")

@@ -79,7 +79,7 @@ class Uncertainty(NamedTuple):
 
     @property
     def joint_std(self) -> Float[np.ndarray, "m j"]:
-        """Root mean square distance between the fitted and the true joint that is expected, (m, j),
+        """Expected root mean square distance between each fitted joint and the true joint, (m, j),
         metres.
         """
         return np.sqrt(np.trace(self.joint_covariances, axis1=-2, axis2=-1))
@@ -191,7 +191,8 @@ def examine(capture: Capture, keypoints: Keypoints, record: FitRecord | None = N
         capture: the capture with its body.
         keypoints: keypoints in the order of the capture's views.
         record: record of the fit to these keypoints, from which noise and undetermined joints are
-            taken. None: the noise is estimated from the median error.
+            taken. None: the noise is estimated from the median error, and the report names no
+            undetermined joints.
     Raises: ValueError if keypoints and capture differ in the number of views, if the record has
     fewer frames or another number of joints than the capture, or if the body has none of the
     landmarks.
@@ -267,8 +268,8 @@ def _exchanges(
     views: Int[np.ndarray, "m c"],
     names: tuple[str, ...],
 ) -> tuple[Swap, ...]:
-    """Returns the cameras, sides and hands that seem to be exchanged. If the hands of a view are
-    exchanged, its sides are not reported as exchanged in addition.
+    """Returns the cameras, sides and hands that seem to be exchanged. Exchanged sides are not
+    reported if the hands of the view, or of one of its alternatives, are exchanged.
     """
     hands = find_exchanged_hands(keypoints, names)
     explained = {swap.views[0] for swap in hands}
@@ -307,8 +308,8 @@ def _quantile(values: Float[np.ndarray, "..."], share: float) -> float:
 
 def calls_of_fit(body: BodyModel, kind: KeypointSet, views: int) -> Iterator[Call]:
     """Yields the compiled functions that `fit_photos` and its report call for photos of one moment,
-    each with arguments of the right shapes, in the order of their use. The shapes depend on the
-    body, the set `kind` and the number of views.
+    each with arguments of the right shapes. The shapes depend on the body, the set `kind` and the
+    number of views.
     """
     model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)
     k, one = len(kind.names), (1, views)

@@ -264,7 +264,7 @@ def _rigid_starts(
 
 
 def _cube_rotations() -> Float[np.ndarray, "24 3 3"]:
-    """Returns the 24 rotations that map the axes to each other."""
+    """Returns the 24 rotations that map the axes to each other, in either direction."""
     signed = (
         np.eye(3)[list(order)] * np.asarray(signs)[:, None]
         for order in itertools.permutations(range(3))
@@ -390,9 +390,9 @@ def _certainty_found(
     noise of this one.
 
     The noise of a landmark is estimated from the median error of its keypoints and of its mirror
-    image's keypoints, in frames in which several views show the landmark. It is a mean of this
-    estimate and the usual noise. With fewer keypoints the usual noise has more weight. It is at
-    least half the usual noise.
+    image's keypoints, in frames in which several views show the landmark. The noise that is used is
+    a mean of this estimate and the usual noise, and at least half the usual noise. With fewer
+    keypoints the usual noise has more weight.
     """
     names = problem.model.names
 

@@ -1,19 +1,20 @@
-"""Fits a motion to the keypoints of a video of one camera that stands still. One fit covers all
-frames, with one shape. Its stages are:
+"""Fits a motion to the keypoints of a video of one camera that stands still. All frames have one
+shape. The stages are:
 
-    start    turns and places the trunk of each frame by the detector's 3D landmarks, smoothed over
-             time
-    shape    fits the shape, unless it is known, to frames from all over the video, whose order is
-             ignored
-    motion   fits overlapping windows of `WINDOW` frames to the keypoints with their noise, the
-             detector's depths, the priors of poses, and accelerations and jerk of the joints
+    start    finds the orientation and the position of the body in each frame from the keypoints and
+             the detector's 3D landmarks, and smooths both over time
+    shape    fits the shape, unless it is known, to frames from all over the video. The order of the
+             frames is ignored
+    motion   fits the poses in overlapping windows of at most `WINDOW` frames. Residuals are those
+             of the keypoints, of the detector's depths, of the priors, and of the joints'
+             accelerations and jerk
     feet     fits the motion once more, and holds feet still where the motion shows that they stand
-    floor    turns the world so that the person stands along y
+    floor    turns the world so that the person stands along y, and moves the floor to y = 0
 
 A window's state is x = x_0 + S u, where u are the unknowns of the solver. This preconditioning has
 S = (1 + w D^T D)^(-1/2), where D takes third differences over time. In u the jerk is about as stiff
-as the keypoints. So the solver carries a correction through all frames in few steps. All stages use
-one compiled program.
+as the keypoints. So the solver carries a correction through all frames in few steps. The stages
+shape, motion and feet share one compiled program.
 
 The method follows HTD-Refine (https://arxiv.org/abs/2605.26879) and GVHMR
 (https://arxiv.org/abs/2409.06662).
@@ -61,9 +62,9 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry.transform import EXACT
 
 WINDOW, OVERLAP = 120, 24
-"""Number of frames in a window, and number of frames that two successive windows share."""
+"""Largest number of frames in a window, and number of frames that two successive windows share."""
 _STEPS, _STEP_LENGTH = 120, 0.1
-"""Number of Adam steps in each stage of a window, and the learning rate at the first step."""
+"""Number of Adam steps in each fit of a window, and the learning rate at the first step."""
 _ACCELERATION, _JERK = 10.0, 100.0
 """Expected standard deviations of a joint's acceleration, m/s^2, and of its jerk, m/s^3. They are
 typical of people who dance.
@@ -96,16 +97,17 @@ _PRIOR = _MotionPrior()
 
 
 _LEVELS = ((30.0, 8.0), (10.0, 3.0), (5.0, 1.0))
-"""One row for each fit of the motion, in order: the robust scale of keypoints (in standard
-deviations), and the factor on the expected accelerations and jerk.
+"""Each row has the robust scale of keypoints and depths (in standard deviations), and the factor on
+the expected accelerations and jerk. The stage motion fits all windows once with each row, in this
+order. The stage shape uses the last two rows, and the stage feet uses the last row.
 """
 _FEET = ("left_heel", "left_foot_index", "right_heel", "right_foot_index")
-"""Landmarks of the feet that are held still while the foot stands."""
+"""Landmarks of the feet. Each is held still where the motion shows that it stands still."""
 _HIPS = ("left_hip", "right_hip")
 """Landmarks of the hips. Their middle is the origin of the detector's 3D landmarks."""
 _LEAST_SEEN = 6
-"""Smallest number of visible keypoints for a frame to get its own start. In other frames the start
-is interpolated.
+"""Smallest number of visible keypoints for a frame to get its own start. In other frames the
+position is interpolated, and the orientation is that of the nearest frame with its own start.
 """
 _LEAST_VISIBLE = 0.3
 """A keypoint counts as visible if its confidence exceeds this number."""
@@ -156,12 +158,12 @@ class _Window:
     1, f), 0 to 1.
     """
     anchored: Float[Array, " w"]
-    """1 for frames that are held to their first poses, 0 for others, (w,)."""
+    """1 for frames that are held to the poses with which the fit begins, 0 for others, (w,)."""
     height: Float[Array, "2"]
     """Height of the person, metres, and 1 if it is known, (2,). Both are 0 if it is not known."""
     tall: Float[Array, " s1"]
-    """Height of the mean body, then how much each shape coefficient of 1 adds to the height, (1 +
-    s,), metres.
+    """Height of the mean body, and after it how much each shape coefficient of 1 adds to the
+    height, (1 + s,), metres.
     """
     rate: Float[Array, ""]
     """Frames per second."""
@@ -188,10 +190,11 @@ def fit_motion(
         K: intrinsics of the camera, (3, 3), pixels.
         fps: frames per second.
         betas: shape of the person, (s,). None: the shape is fitted.
-        height: height of the person, metres. None: it follows from keypoints and prior. It has no
-            effect if `betas` is given.
-        watch: wraps the iterable of stages, for example to show a progress bar. It is called with
-            the stages and the number of windows, and returns the stages.
+        height: height of the person, metres. None: the height follows from keypoints and prior.
+            The argument has no effect if `betas` is given.
+        watch: wraps an iterable with about one item for each fit of a window, for example to show
+            a progress bar. It is called with this iterable and the number of windows, and returns
+            an iterable over the same items.
     Raises: ValueError if no frame shows the person, if the keypoints have no 3D landmarks, or if
     their set lacks hips or feet.
     """
@@ -265,6 +268,8 @@ def _start(
     """Returns the poses with which the fit starts. All joints but the root have the mean rotations
     of the prior of poses. The body's orientation and position in each frame are found from the
     keypoints and the detector's 3D landmarks, and smoothed over time.
+
+    Raises: ValueError if no frame shows the person in front of the camera.
     """
     problem = keypoint_problem(model)
     still = replace(zero_state(problem.origin), betas=jnp.asarray(betas, jnp.float32))
@@ -357,8 +362,8 @@ def _place(
 
 
 def _tallness(body: BodyModel) -> Float[np.ndarray, " s1"]:
-    """Returns the height of the mean body, then how much each shape coefficient of 1 adds to the
-    height, (1 + s,), metres.
+    """Returns the height of the mean body, and after it how much each shape coefficient of 1 adds
+    to the height, (1 + s,), metres.
     """
     template = np.asarray(body.template)
     top, bottom = template[:, 1].argmax(), template[:, 1].argmin()
@@ -369,8 +374,8 @@ def _tallness(body: BodyModel) -> Float[np.ndarray, " s1"]:
 def _of_height(
     betas: Float[np.ndarray, " s"], tall: Float[np.ndarray, " s1"], height: float | int | None
 ) -> Float[np.ndarray, " s"]:
-    """Returns the shape nearest to `betas` that has this height, metres. If the height is None, it
-    returns `betas`. tall: see `_tallness`.
+    """Returns the shape nearest to `betas` for which the person has this height, (s,). height:
+    metres. None: `betas` is returned. tall: see `_tallness`.
     """
     if height is None:
         return betas
@@ -398,8 +403,9 @@ def _joined(
 ) -> BodyPose:
     """Fits the windows one after the other, and returns the poses of all frames.
 
-    Two windows share some frames. In the first half of these, the second window is held to the
-    poses that the first one found. more: returns further arguments of `run` for a window.
+    Each window shares its first `OVERLAP` frames with the window before. In the first half of
+    these, it is held to the poses that the window before found. more: returns further arguments of
+    `run` for a window.
     """
     for i, window in enumerate(windows):
         anchored = np.zeros(len(window))
@@ -422,8 +428,8 @@ def _run(
     static: Float[np.ndarray, "w f"] | None = None,
     anchored: Float[np.ndarray, " w"] | None = None,
 ) -> tuple[BodyPose, Float[np.ndarray, " s"]]:
-    """Fits the poses of one window. Returns the poses of all frames, with new poses in `frames`,
-    and the shape.
+    """Fits the poses of one window, and the shape if `timed` is False. Returns the poses of all
+    frames, with new poses in `frames`, and the shape.
 
     Args:
         frames: indices of the frames of the window, (w,), at most `WINDOW` of them.
@@ -432,11 +438,12 @@ def _run(
         timed: whether the frames follow each other in time. If so, the shape is not fitted.
         static: how certain it is that the feet stand still, (w, f), as in `MotionFit.static`. None:
             feet are not held.
-        anchored: 1 for frames that are held to their poses, 0 for others, (w,). None: no frame is
-            held.
+        anchored: 1 for frames that are held to their poses in `poses`, 0 for others, (w,). None:
+            no frame is held.
     """
     count = len(frames)
-    # windows have one length, so that one program does for all: what is added shows nothing
+    # all windows are filled up to one length, so that they share one program; the keypoints of
+    # added frames have confidence 0
     padded = np.append(frames, np.full(WINDOW - count, frames[-1]))
 
     def filled(x):
@@ -499,8 +506,8 @@ def _solved(
 
 def _frame_origins(problem: KeypointProblem, window: _Window) -> Origin:
     """Returns the origin of each frame, a batch of w. The root's rotation and the position are
-    those with which the window begins. All other joints have their usual rotations, because the
-    prior of poses is about these.
+    those with which the window begins. All other joints have their usual rotations, which are the
+    means of the prior of poses.
     """
     origin = replace(problem.origin, betas=jnp.zeros_like(window.betas))
     begun = window.poses.rotations
@@ -545,8 +552,8 @@ def _residuals_of_frames(
     window: _Window,
     state: FitState,
 ) -> tuple[dict[str, Any], Float[Array, "w k 3"], Float[Array, "w j 3"]]:
-    """Returns the residuals of each frame by itself, as `frame_residuals` does, and the landmarks,
-    (w, k, 3), and joints, (w, j, 3), of the body in each frame, metres.
+    """Returns the residuals of `frame_residuals` for each frame, the body's landmarks in each
+    frame, (w, k, 3), metres, and the body's joints, (w, j, 3), metres.
     """
 
     def of_frame(seen: Observations, state: FitState, origin: Origin) -> tuple[Any, Any]:
@@ -581,8 +588,8 @@ def _smoothness_residuals(
 def _foot_residuals(
     model: LandmarkModel, window: _Window, landmarks: Float[Array, "w k 3"]
 ) -> Float[Array, "v f 3"]:
-    """Returns the residuals of the speeds of feet, (w - 1, f, 3). They are 0 for feet that do not
-    stand still.
+    """Returns the residuals of the speeds of the landmarks of `_FEET`, (w - 1, f, 3). They are 0
+    for landmarks that do not stand still (`_Window.held`).
     """
     steps = jnp.diff(landmarks[:, _foot_rows(model)], axis=0) * window.rate / _PRIOR.held_speed
     return robust(jnp.sqrt(window.held)[..., None] * steps, _PRIOR.robust_scale)
@@ -667,8 +674,8 @@ def _standing(
     fps: float,
 ) -> MotionFit:
     """Returns the motion in a world that is turned so that the person stands along y, and moved so
-    that the floor is at y = 0. If the person leans by 50 degrees or more, the person is taken to
-    lie, and the world is not turned.
+    that the floor is at y = 0. If the person leans by 50 degrees or more from the camera's upright
+    direction, the person is taken to lie, and the world is not turned.
     """
     shape = jnp.asarray(betas, jnp.float32)
     joints = np.asarray(_landmarks(model, shape, poses)[1], np.float64)
@@ -711,11 +718,11 @@ def _matrix(turn: Rotation, shift: Float[np.ndarray, "3"]) -> Float[np.ndarray, 
 def betas_of_joints(
     body: BodyModel, rest_joints: Float[np.ndarray, "j 3"]
 ) -> Float[np.ndarray, " s"]:
-    """Returns the shape coefficients for which the joints in the T-pose are nearest to
-    `rest_joints`, up to a translation, (s,). It is used for the joints of an avatar. rest_joints:
-    (j, 3), metres.
+    """Returns the shape coefficients for which the body's joints in the T-pose are nearest to
+    `rest_joints`, (s,). A translation between both does not count, and large coefficients are
+    avoided. rest_joints: joints in the T-pose, for example of an avatar, (j, 3), metres.
 
-    Raises: ValueError if the number of joints is not the body's.
+    Raises: ValueError if `rest_joints` is not an array (j, 3) for the body's j joints.
     """
     body = without_expression(body)
     mean = np.asarray(body.joint_regressor, np.float64) @ np.asarray(body.template, np.float64)

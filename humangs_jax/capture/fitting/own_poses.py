@@ -1,5 +1,5 @@
-"""Fits a pose for each photo if the person moved a little between photos that one pose nearly
-explains.
+"""Fits a separate pose for each photo. This is for photos that one pose nearly explains, although
+the person moved a little from photo to photo.
 
 A person who turns in front of a camera moves head, arms and legs by centimetres. Such photos do not
 show one moment, but their moments are not independent either. They share one shape and one set of
@@ -9,9 +9,9 @@ Photos of a video follow each other in time. Their deviations x_i from the share
 deviations, are an Ornstein-Uhlenbeck process: x_{i+1} - r x_i has the variance 1 - r^2, with r =
 exp(-t / MEMORY) for photos that are t seconds apart.
 
-More unknowns always fit the keypoints better. So the masks decide whether the person moved, after
-poses were fitted to the keypoints alone. If nobody moved, these poses follow the detector's errors,
-and the body agrees with the masks less than before.
+More unknowns always fit the keypoints better. So the poses are first fitted to the keypoints alone,
+and then the masks decide whether the person moved. If the person did not move, these poses follow
+the detector's errors, and the body agrees with the masks less than before.
 """
 
 import dataclasses
@@ -84,8 +84,8 @@ class Movement(NamedTuple):
 def find_movement(
     capture: Capture, keypoints: Keypoints, seconds: Float[np.ndarray, " v"] | None = None
 ) -> Movement:
-    """Returns how well the body agrees with the masks in the shared pose, and in a pose for each
-    photo that is fitted to keypoints alone.
+    """Returns how well the body agrees with the masks in the shared pose, and with a separate pose
+    for each photo. These poses are fitted to keypoints alone.
 
     Arguments:
         capture: photos with masks, and a body in poses that they share.
@@ -149,11 +149,13 @@ def record_of_photos(record: FitRecord, frames: Int[np.ndarray, " v"]) -> FitRec
 
 
 def movement_line(capture: Capture) -> str:
-    """Returns a line that says how far the person moved between photos, if each photo has a pose.
+    """Returns a line that says how far the person moved between the photos of a capture with a
+    separate pose for each photo.
 
     In each photo the skin is compared with the skin in the mean of all poses. The movement is the
-    mean distance between them, without the component along the camera's z axis, because a photo
-    does not show depths. The line states the largest movement of all photos, in centimetres.
+    mean distance between the two, without the component along the camera's z axis, because a photo
+    does not show depths. The line states the largest movement of all photos, in whole centimetres,
+    at least 1.
     """
     frames = np.asarray(capture.frames)
     poses = jax.tree.map(np.asarray, capture.poses)

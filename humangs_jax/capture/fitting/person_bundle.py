@@ -4,9 +4,9 @@ landmarks, and bundle adjustment follows.
 For one photo, a detector gives landmarks in metres in the axes of the photo's camera, as if the
 camera looked straight at the person. Their depths are guesses, 5 to 10 cm off, and the landmarks as
 a whole are turned by up to 20 degrees. The start consists of the rotations that bring the landmarks
-of all photos together (generalised Kabsch: Gower 1975, https://doi.org/10.1007/BF02291478). Bundle
-adjustment then mainly uses the pixels. The 3D landmarks keep the size, and decide what pixels leave
-open.
+of all photos together (generalised Kabsch: Gower 1975, https://doi.org/10.1007/BF02291478), and of
+the positions at which they project to their pixels. Bundle adjustment then mainly uses the pixels.
+The 3D landmarks keep the size, and decide what pixels leave open.
 
 The cost is half the sum of the squares of these residuals, with X = R_v L_k, p = X + t_v, u = (p_x,
 p_y) / p_z:

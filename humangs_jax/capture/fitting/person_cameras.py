@@ -104,10 +104,11 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
 
     Arguments: height: height of the person without shoes, metres. None: the person has the size of
     the detector's 3D landmarks.
-    Raises: ValueError with the name of a photo if all photos show too little of the person, if the
-    person is too small in a photo, if a focal length or the 3D landmarks are unusable, or if no
-    camera is found. It is also raised if there are no photos, if arrays have different lengths, or
-    if the height is not between 0.3 and 3 metres.
+    Raises: ValueError with the name of a photo if no photo shows enough of the person and the named
+    photo shows fewer than `FEWEST` landmarks. Also if the person is too small in a photo that is
+    used, if its focal length or 3D landmarks are unusable, or if no camera is found. ValueError if
+    there are no photos, if arrays have different lengths, or if the height is not between 0.3 and 3
+    metres.
     """
     _check(seen, height)
     # photos that show too little are left out where others show more
@@ -332,8 +333,8 @@ def _warnings(
 
 
 def scaled_to_height(capture: Capture, height: float) -> Capture:
-    """Returns the capture scaled so that the person has this height in the rest pose, metres.
-    Cameras, positions and shape are scaled together, so that the photos still fit.
+    """Returns the capture scaled so that the person has this height. Cameras, positions and shape
+    are scaled together, so that the photos still fit. height: height in the rest pose, metres.
     """
     betas = np.asarray(capture.betas, np.float64)
     before = shape_body(capture.body, jnp.asarray(betas, jnp.float32))

@@ -2,8 +2,8 @@
 moment.
 
 A detector that takes a person's back for the front exchanges left and right in a whole view. So
-each view is mirrored on trial, and is left mirrored if it then agrees better with the other views.
-Whether all views are mirrored is decided by the body: toes and nose point to the front.
+each view is mirrored on trial, and is left mirrored if it then agrees clearly better with the other
+views. The body shows whether all views are mirrored: toes and nose point to the front.
 
 A trial is an adjustment of the cameras with some views mirrored. Trials are only as exact as a
 comparison needs. The chosen trial is then made as exact as possible.
@@ -33,7 +33,9 @@ from humangs_jax.core.progress import bar, watched
 from humangs_jax.io.images import DIAGONAL_35MM
 
 USUAL_FOCAL = 29.0
-"""Focal length of a telephone's main camera, as the equivalent for 35-mm film, mm."""
+"""Focal length of a telephone's main camera, as the equivalent for 35-mm film, mm. It is assumed if
+no photo states a focal length.
+"""
 USUAL_STD = 0.2
 """Standard deviation of the logarithm of a focal length that is assumed and not known."""
 _EXIF_STD = 0.03
@@ -55,18 +57,18 @@ class _OneMoment:
     most_error: float = 0.02
     """Largest rms error of photos that show one moment.
 
-    It was measured on a man in a laboratory. 7 moments with four cameras each had 0.007 to 0.014.
-    Photos of several moments had 0.045 to 0.073. Four photos, one of which showed another moment,
-    had 0.033.
+    Rms errors were measured on photos of a man in a laboratory. For each of 7 moments, seen by four
+    cameras, they were 0.007 to 0.014. For photos of several moments they were 0.045 to 0.073. For
+    four photos, of which one showed another moment, the rms error was 0.033.
     """
     doubtful: float = 0.012
     """If the rms error exceeds this, the search for mirrored views is repeated from another start,
-    in which all views are mirrored. Detections of one moment with an error of 3 pixels of 900 have
-    0.004 to 0.007. With one mirrored view it is at least 0.02.
+    in which all views are mirrored. If detections of one moment are off by 3 pixels for a person of
+    900 pixels, the rms error is 0.004 to 0.007. With one mirrored view it is at least 0.02.
     """
     without_one: float = 0.015
     """If one photo is left out, the other photos show one moment only if their rms error is below
-    this. Three photos out of four that show several moments have at least 0.021.
+    this. If four photos show several moments, three of them have an rms error of at least 0.021.
     """
     fewest: int = 4
     """With at least this many photos, one photo may be left out because it contradicts the
@@ -87,7 +89,7 @@ class _OneMoment:
     less than this angle, degrees.
     """
     far: float = 0.2
-    """Larger errors of a landmark count as this error."""
+    """Errors of a landmark that are larger than this count as this error."""
 
 
 ONE_MOMENT = _OneMoment()
@@ -164,12 +166,12 @@ class Trial:
     cost: float
     """Half the sum of the squared residuals of the adjustment."""
     evidence: Evidence
-    """The landmarks of the photos, with left and right exchanged."""
+    """The landmarks of the photos, with left and right exchanged in the mirrored views."""
 
     @property
     def error(self) -> float:
         """Rms distance between projected and detected landmarks in all photos, as a share of the
-        person's size. See `_relative_error`.
+        person's size, corrected for the number of unknowns. See `_relative_error`.
         """
         return _relative_error(self._shares, self.evidence.weights)
 
@@ -249,7 +251,8 @@ def _without_one(
     seen: PersonViews, chosen: tuple[int, ...]
 ) -> tuple[Trial, tuple[int, ...]] | None:
     """Leaves out the one of the chosen photos that contradicts the others most. Returns the trial
-    of the other photos, and these photos. None if they do not show one moment either.
+    of the other photos, and the indices of these photos. The result is None if the other photos do
+    not show one moment either.
     """
     rests = [tuple(v for v in chosen if v != out) for out in chosen]
     trials = [
@@ -266,7 +269,7 @@ def _without_one(
 def _with_others(
     seen: PersonViews, trial: Trial, views: tuple[int, ...], others: Sequence[int]
 ) -> tuple[Trial, tuple[int, ...]]:
-    """Adds the other photos that agree with the trial, either mirrored or not.
+    """Adds those of the photos `others` that agree with the trial, as they are or mirrored.
 
     Returns a trial in which the cameras of `views` and of the added photos are fitted together, and
     the indices of all these photos.
@@ -314,7 +317,9 @@ def under_bar(items: Sequence[Any], what: str) -> Iterator[Any]:
 
 
 def best_trial(seen: PersonViews) -> Trial:
-    """Returns the trial that explains the landmarks best. Any views may be mirrored in it."""
+    """Returns the trial that explains the landmarks best. If there are several views, any of them
+    may be mirrored in it.
+    """
     views = len(seen.points)
     found = _try(seen, np.zeros(views, bool))
     if views > 1:
@@ -329,8 +334,9 @@ def best_trial(seen: PersonViews) -> Trial:
 
 
 def _least(seen: PersonViews, start: Trial) -> Trial:
-    """Mirrors one view after the other, each time the view that decreases the cost most, as long as
-    the cost decreases clearly. Returns the last trial.
+    """Mirrors one view after the other, as long as the cost decreases clearly. Each time it mirrors
+    the view that decreases the cost most. Returns the trial after the last clear decrease, or the
+    start if there was none.
     """
     views = np.arange(len(seen.points))
     while True:
@@ -357,9 +363,11 @@ def _polished(trial: Trial) -> Trial:
 
 
 def _relative_error(errors: Float[np.ndarray, "c k"], weights: Float[np.ndarray, "c k"]) -> float:
-    """Returns the rms error of the landmarks that are seen, in the unit of `errors`, (c, k). The
-    sum of squares is divided by the number of observed coordinates minus the number of unknowns of
-    points and cameras, but by a quarter of the coordinates at least.
+    """Returns the rms error of the landmarks that are seen. errors: shares of the person's size,
+    (c, k). Errors that exceed `_OneMoment.far` count as that error.
+
+    The sum of squares is divided by n - u, or by n / 4 if that is larger. Here n is the number of
+    observed coordinates, and u the number of unknowns of points and cameras up to a similarity.
     """
     views, shown = len(errors), weights.max(0) > SEEN
     numbers = 2 * (weights > SEEN).sum()

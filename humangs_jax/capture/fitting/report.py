@@ -27,13 +27,13 @@ class _Worth:
     """Limits that decide whether something in a fit gets a line in the report."""
 
     outliers: float = 0.3
-    """A view gives a warning if a larger share of its keypoints are outliers. A fit tolerates more
-    outliers, but a detector with so many errors probably saw something else.
+    """A view gives a warning if more than this share of its keypoints are outliers. A fit tolerates
+    more outliers, but a detector with so many errors probably saw something else.
     """
     off: float = 4.0
     """A view gives a warning if its median error exceeds the expected noise by more than this
-    factor. This is an error of 2 % of the person's height. Such a view shows another pose, or its
-    camera is wrong.
+    factor. The error is then more than 2 % of the person's size in the photo. Such a view shows
+    another pose, or its camera is wrong.
     """
     beyond_limit: float = np.rad2deg(0.05)
     """A joint is reported if it exceeds its limit by more than this angle, degrees. Smaller
@@ -119,15 +119,21 @@ class FitReport:
     """The report of a fit."""
 
     fitted: Literal["keypoints", "refinement"]
-    """What the body was fitted to: keypoints alone, or in a refinement masks and keypoints."""
+    """Kind of fit. "keypoints": a fit to keypoints alone. "refinement": a fit to masks, keypoints
+    or both.
+    """
     kept: bool = True
-    """Whether the result is used. If it is False, the start was better and is used."""
+    """Whether the result is used. False: it was not clearly better than the start, and the start is
+    used.
+    """
     errors: dict[str, Change] = dataclasses.field(default_factory=dict)
     """Errors by name, see `_LABELS`."""
     views: tuple[ViewReport, ...] = ()
     """A row for each view."""
     moved: dict[str, float] = dataclasses.field(default_factory=dict)
-    """How far cameras and body moved, with the keys of `how_far`. Empty if nothing moved."""
+    """How far a refinement moved cameras and body, with the keys of `how_far`. Empty if the start
+    was kept, and for a fit to keypoints.
+    """
     violations: tuple[Violation, ...] = ()
     """Joints that exceed their limits."""
     swaps: tuple[Swap, ...] = ()
@@ -212,8 +218,8 @@ _GROUPS = {
     "spine": ["spine1", "spine2", "spine3"],
     "collars": ["left_collar", "right_collar"],
 }
-"""Name of each group of joints, and its joints. They are reported under this name if all of them
-are undetermined.
+"""Joints of each group, by the name of the group. If all joints of a group are undetermined, the
+report has the group's name in place of their names.
 """
 
 
@@ -265,7 +271,8 @@ def keypoint_warnings(
     violations: Sequence[Violation],
     swaps: Sequence[Swap],
 ) -> tuple[str, ...]:
-    """Returns a line for each sign of a mistake in the keypoints.
+    """Returns lines about signs of a mistake: exchanges, views whose keypoints do not fit the body,
+    and joints far beyond their limits.
 
     expected: expected noise of the keypoints of each frame, (m,), pixels.
     """
@@ -321,11 +328,11 @@ def _span(views: Sequence[ViewReport], field: str, form: str) -> str:
 
 
 def how_far(start: Capture, refined: Capture) -> dict[str, float]:
-    """Returns how far two captures of one person differ. Each value is a mean.
+    """Returns how far two captures of the same photos differ. Each value is a mean.
 
     Keys: focal_factor, the refined focal length divided by the one at the start. camera_degrees and
-    camera_cm, rotation and shift of the cameras. joint_degrees, rotation of the joints. transl_cm,
-    shift of the root.
+    camera_cm, rotation and shift of the cameras. joint_degrees, rotation of the joints, root
+    included. transl_cm, change of the poses' translations.
     """
     both = (start, refined)
     focal = [np.asarray(each.cameras.K, float)[:, 0, 0] for each in both]

@@ -4,7 +4,7 @@ Each iteration matches the rendered silhouette of the body with the edge of the 
 iterative closest point method. It then takes a few steps of damped least squares, or of L-BFGS if
 there are many unknowns. `StateStd` gives a Gaussian prior around the start. Without this prior,
 cameras and people could move together. The result is kept only if its loss is clearly less than the
-loss of the start.
+loss of the start, and if its keypoint error is not much larger.
 """
 
 import dataclasses
@@ -470,8 +470,8 @@ class SilhouetteFit:
 
     def calls(self) -> Iterator[Call]:
         """Yields the compiled functions that `run` and `score` call, with arguments of the right
-        shapes. The one that takes longest to compile comes first. The values of the arguments do
-        not matter.
+        shapes. The function inside of `silhouettes.boundary_points` is left out. The function that
+        takes longest to compile comes first. The values of the arguments do not matter.
         """
         state, capture = start_state(self.origin, self.config), self.capture
         betas, cameras = self.origin.betas, self.cameras
@@ -544,7 +544,7 @@ class SilhouetteFit:
 
     def _keypoint_errors(self, capture: Capture, seen: Observations) -> Float[np.ndarray, "v k"]:
         """Returns the distances between the body's landmarks and the keypoints, (v, k), pixels of
-        the photos at full size. NaN where there is no keypoint.
+        the photos at full size. NaN where there is no keypoint, or the body lacks the landmark.
         """
         cameras = capture.cameras
         seen = replace(
@@ -686,10 +686,11 @@ def refine_capture(
     config: CaptureRefineConfig = DEFAULT_CONFIG,
     memory: Float[np.ndarray, " n"] | None = None,
 ) -> RefinedCapture:
-    """Refines cameras (rotation, centre, focal length), shape and poses of a capture.
+    """Refines cameras (rotation, centre, focal length), shape and poses of a capture. Returns the
+    refined capture and a report. If the refined capture is not clearly better, the start is
+    returned in its place.
 
-    If a view has an empty mask, only its keypoints count. The start is kept if the result is not
-    clearly better.
+    If a view has an empty mask, only its keypoints count.
 
     Args:
         capture: the start.

@@ -9,23 +9,23 @@ prior, half its square is the negative log prior.
                  landmarks                                    pose
     refinement   betas, poses, cameras, clothing              origin: a capture
 
-The rotation by global_orient is applied after the root's rotation in the origin. Rotation vectors
-are not added here, because near half a turn a sum does not measure a small rotation.
+The rotation by global_orient is applied after the root's rotation in the origin. The two rotation
+vectors are not added, because near half a turn a sum does not measure a small rotation.
 
-The module also has the prior of poses. For every joint it has the usual rotation, its standard
-deviation and its limits. They are rotation vectors of SMPL-X's joints by name, in radians about the
-axes of the T-pose: x to the person's left, y up, z forward. Limits are boxes of rotation vectors,
-and are generous for joints that turn about several axes (hips, shoulders).
+The module also has the prior of poses. For each joint, by its name in SMPL-X, it has the usual
+rotation vector, and for each component a standard deviation and two limits, all in radians. The
+axes are those of the T-pose: x to the person's left, y up, z forward. The limits are generous for
+joints that turn about several axes (hips, shoulders).
 
 The values are written for the left side. The right side is its mirror image (x, -y, -z). A knee
 bends about +x, the left elbow about -y, left fingers about -z. The left arm hangs at z = -1.4.
 
 The solver minimises half the sum of squared residuals over a pytree of numbers of about unit size.
-A robust loss enters as a residual with the loss as its square. There are two methods:
+A robust loss enters as a residual whose square is the loss. There are two methods:
 
     lbfgs   for many unknowns; cheap under vmap, and works through the renderer, which has a
             backward rule only
-    lm      Levenberg and Marquardt by normal equations, for few unknowns; quadratic near the
+    lm      Levenberg and Marquardt by normal equations, for few unknowns; converges fast near the
             solution
 """
 
@@ -61,8 +61,8 @@ def robust(errors: Float[Array, "*n d"], scale: Float[Array, ""] | float) -> Flo
     """Returns errors that are scaled down so that their squared lengths are the Geman-McClure loss:
     e c / sqrt(c^2 + |e|^2), where c is the scale.
 
-    Small errors hardly change, and no error stays longer than c. So a keypoint on another person
-    counts no more than about c.
+    Small errors hardly change, and no result is longer than c. So a keypoint on another person has
+    a residual of at most c.
     """
     return errors * (
         scale / jnp.sqrt(scale * scale + jnp.sum(jnp.square(errors), axis=-1, keepdims=True))
@@ -87,7 +87,8 @@ def solve(
         method: see the module's docstring.
         tolerance: the solver stops when a step changes each unknown and the loss by less than this
             number times (1 + its size).
-        free: pytree of booleans like start. Numbers that are False stay. None: all move.
+        free: pytree of booleans with the structure of `start`. A number moves only if its boolean
+            is True. None: all numbers move.
     Returns: the solution and half its sum of squared residuals. If the solution is worse than the
     start, or not finite, the start and its value are returned.
     """
@@ -233,8 +234,8 @@ def limit_residuals(
 _RADIANS = math.pi / 180
 """Radians in a degree."""
 SAME = 1e-4
-"""Two cameras count as one if they differ by less than this. It is relative for focal lengths, in
-radians for rotations, and in metres for positions.
+"""Two cameras count as one if all their numbers differ by less than this. The numbers are the
+logarithm of the focal length, K divided by the focal length, and cam_from_world in metres.
 """
 
 
@@ -412,7 +413,7 @@ def betas_of(origin: Origin, state: FitState) -> Float[Array, " s"]:
 def pose_of(origin: Origin, state: FitState) -> BodyPose:
     """Returns the pose of a state, or a batch of poses. It is differentiable everywhere.
 
-    Joints that are not free have their rotations in the origin.
+    Joints that are not free keep the rotations of the origin.
     """
     rotations = origin.pose.rotations
     rotations = rotations.at[..., np.asarray(origin.joints, int), :].add(
@@ -429,7 +430,7 @@ def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitSt
     """Returns the state that stands for a shape and a pose, or for a batch of poses. Joints that
     are not free are ignored.
 
-    The state has no cameras and no clothing.
+    The state has no cameras, no clothing and no places of landmarks.
     """
     joints, start = np.asarray(origin.joints, int), origin.pose
     conjugate = quaternion.from_axis_angle(-start.rotations[..., 0, :])
@@ -520,8 +521,8 @@ def camera_numbers(
 
 
 def _numbered(rows: Float[np.ndarray, "n d"], same: float) -> Int[np.ndarray, " n"]:
-    """Returns a number for each row, (n,), from 0. Rows that differ by less than `same` in all
-    columns have the same number.
+    """Returns a number for each row, (n,), from 0. A row gets the number of an earlier row if it
+    differs by less than `same` in all columns from the first row with this number.
     """
     numbers, known = np.zeros(len(rows), np.int32), np.empty((0, rows.shape[1]))
     for i, row in enumerate(rows):

@@ -1,14 +1,15 @@
 """Finds exchanges that keypoints reveal: exchanged sides, cameras or hands.
 
-Correct views of one frame agree: the rays of a landmark meet. Exchanges that people and detectors
-often make are undone on trial. The exchange after which the views agree clearly better is kept, and
-the search goes on, until no exchange is clear. Exchanged cameras are reported first, then exchanged
-sides by view:
+Correct views of one frame agree: the rays of a landmark meet. The search tries to undo exchanges
+that people and detectors often make. The best trial counts as a found exchange if the views agree
+clearly better in it, and the search goes on with corrected keypoints. It ends when no trial is
+clearly better. Kinds of exchanges are:
 
     sides     left and right of the keypoints of one view; needs two views, and either of the two
               may be the wrong one
-    cameras   of two views, which looks the same as exchanged photos; needs three views
-    hands     left and right keypoints of the hands alone, in one view
+    cameras   the cameras of two views; exchanged photos look the same; needs three views
+    hands     left and right keypoints of the hands alone, in one view; found without trials, by
+              the distances from the wrists
 
 If left and right are exchanged in all views, the views agree too, and nothing is found.
 
@@ -42,17 +43,18 @@ class _Clear:
 
     least_gain: float = 0.1
     """An exchange is clear if it adds more than the share least_gain + chance / sqrt(n) of the
-    agreement that n keypoints could reach.
+    largest possible agreement of n keypoints. These are the exchanged keypoints of landmarks that
+    at least two views see.
     """
     chance: float = 0.8
-    """See `least_gain`. This term allows for what an exchange gains by chance. In correct views, 17
-    keypoints with 20 % of outliers and three times the expected noise gain up to 0.26, and 67
-    keypoints gain nothing.
+    """See `least_gain`. This term allows for what an exchange gains by chance. In correct views
+    with 20 % of outliers and three times the expected noise, an exchange of 17 keypoints gains up
+    to 0.26 of the largest possible agreement, and an exchange of 67 keypoints gains nothing.
     """
     many: int = 5
     """In frames with at least this many views, an exchange is tried only if it improves the
-    agreement with the points as they are. This suffices, because the other views outvote the
-    exchanged ones.
+    agreement with the points that were triangulated before the exchange. This suffices, because the
+    other views outvote the exchanged ones.
     """
     alike: float = 0.9
     """Another exchange is an alternative if it gains more than this share of what the best one
@@ -103,8 +105,8 @@ def find_swaps(
     views: Int[np.ndarray, "m c"],
     names: tuple[str, ...],
 ) -> tuple[Swap, ...]:
-    """Returns exchanged cameras, the clearest first, and then exchanged sides by view. Sides are
-    found in frames with at least two views, cameras in frames with at least three.
+    """Returns exchanged cameras in the order in which they were found, and then exchanged sides by
+    view. Sides are found in frames with at least two views, cameras in frames with at least three.
 
     Args:
         observations: keypoints, a batch of m frames.
@@ -325,8 +327,8 @@ class _Search:
     def is_clear(self, trial: _Trial, of: Bool[np.ndarray, " k"]) -> bool:
         """Returns whether an exchange of the keypoints `of` gains enough.
 
-        The gain is compared with the largest possible agreement: the sum of the confidences of all
-        keypoints that another view sees, too.
+        The gain is compared with the largest possible agreement of the exchanged views: the sum of
+        the confidences of their keypoints, of landmarks that at least two views see.
         """
         seen = (self.confidences > 0) & of
         shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
@@ -356,8 +358,8 @@ class _Search:
         return found
 
     def exchanges(self) -> list[_Trial]:
-        """Returns the clear exchanges of two cameras. Each pair of cameras is tried in all of its
-        frames together, and in each of them alone.
+        """Returns the clear exchanges of two cameras. If `pairs` has two cameras in some frame,
+        they are tried in all of their frames together, and in each of these frames alone.
         """
         # pairs of cameras that look exchanged in some frame are tried in all of their frames
         suspected = {self._pair(*at) for at in np.argwhere(self.pairs).tolist()}

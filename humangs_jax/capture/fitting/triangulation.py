@@ -2,9 +2,9 @@
 person.
 
 A pixel is a ray. The point with the least weighted sum of squared distances to the rays is the
-solution of 3 x 3 equations. Weights of focal length over distance turn metres into pixels (Hartley
-and Zisserman, Multiple View Geometry, 12.2). The robust solution begins with the pair of views that
-most views agree with.
+solution of 3 x 3 equations. Each distance is multiplied by the focal length over the distance from
+the camera, which turns metres into pixels (Hartley and Zisserman, Multiple View Geometry, 12.2).
+The robust solution of a point begins with the pair of views whose point the views agree with most.
 
 If two views show the same person, the triangulated landmarks project to the person's landmarks in
 other cameras, within a few hundredths of the person's size. Landmarks of two different people do
@@ -171,8 +171,8 @@ class _SameWay:
     """Limits that decide whether people in two successive frames are one person."""
 
     farthest: float = 1.0
-    """Largest distance between a person's positions in two successive frames, metres. It is used if
-    several views show the person.
+    """Largest distance between a person's position in a frame and the last known position, metres.
+    It is used if several views show the person.
     """
     near: float = 0.5
     """Largest movement of a person in one camera's photos, as a share of the person's size in the
@@ -469,10 +469,9 @@ def _moved_in_photos(
     before: Sequence[Seen], first: Match, now: Sequence[Seen], second: Match
 ) -> float:
     """Returns how far a person would have moved if two matches were the same person, as a share of
-    the person's size. It is the largest movement in the photos of the cameras that show both
-    matches.
-
-    It is infinite if no camera shows both, or if the size in a photo changed too much.
+    the person's size. It is the largest movement in the photos of any camera that shows both
+    matches. It is infinite if no camera shows both, or if the size changed too much in the photos
+    of a camera.
     """
     moved = []
     for v, w in itertools.product(range(len(before)), range(len(now))):

@@ -48,8 +48,8 @@ not count.
 _NOISE_RANGE = (0.5, 8.0)
 """Smallest and largest noise that a fit can find, as multiples of the expected noise."""
 PLACE_STD = 0.02
-"""Standard deviation, along each axis, of the difference between where a detector sees a landmark
-on the body and where it is expected, metres.
+"""Standard deviation, along each axis, of the offset from the place on the body where a landmark is
+expected to the place where a detector sees it, metres.
 """
 _WORLD_STD = 0.15
 """Standard deviation of a detector's 3D landmarks, as a share of the person's size. The size is the
@@ -193,7 +193,7 @@ def found_noise(lengths: Array | np.ndarray, expected: Array | np.ndarray | np.f
 
     lengths: lengths of the errors, NaN where an error is missing. If all are missing, the expected
     noise is returned. All arguments and the result have the same unit. If `lengths` is a numpy
-    array, the result is one, too.
+    array, the result is a value of numpy, else of JAX.
     """
     xp: Any = jnp
     if isinstance(lengths, np.ndarray):
@@ -245,7 +245,7 @@ def body_errors(
 
 
 _TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")
-"""Kinds of landmarks that hardly depend on the pose."""
+"""Kinds of landmarks of trunk and head. Arms and legs do not move them."""
 
 
 def trunk_weights(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
@@ -358,8 +358,8 @@ def frame_residuals(
     """Returns all residuals of one frame by kind. Half the sum of their squares is the negative log
     posterior, up to a constant.
 
-    scale: robust scale of keypoints, in standard deviations. targets: triangulated landmarks, or
-    None.
+    scale: robust scale of keypoints, depths and targets, in standard deviations. targets:
+    triangulated landmarks, or None.
     """
     betas, pose = betas_of(problem.origin, state), pose_of(problem.origin, state)
     landmarks, _ = pose_landmarks(problem.model_of(state), betas, pose)

@@ -1,19 +1,19 @@
 """Silhouettes as evidence: compares the silhouette of a posed body with the silhouette of a mask.
 
 A body's silhouette consists of mesh edges between a face that looks at the camera and one that
-looks away (Sander et al. 2000, "Silhouette clipping"). Of these, only edges count that have no
-other part of the body outside of them in the image. Points on these edges are differentiable
-functions of the pose. A mask's silhouette is where its coverage crosses one half. Both are found on
-the host and held fixed while a solver moves the body.
+looks away (Sander et al. 2000, "Silhouette clipping"). An edge counts only if the image shows no
+body just outside of it. Points on these edges are differentiable functions of the pose. A mask's
+silhouette is where its coverage crosses one half. Edges and matches are found before the solver
+runs, and stay the same while the solver moves the body.
 
 Points are matched as in edge trackers (Harris and Stennett 1990, "RAPiD"). Each point of the body's
 silhouette looks along its normal for the nearest end of the mask. Each point of the mask's
 silhouette looks for the nearest point of the body's silhouette that faces the same way.
 
 Both kinds of match give an equation n . x = n . q, where x is the point of the body in the image, q
-the point of the mask and n the normal. So x may slide along the mask's silhouette. People wear
-clothes and hair. So points of the body outside of the mask can have a larger robust scale than
-points inside.
+the point of the mask, and n the normal at the point that looks for its match. So x may slide along
+the mask's silhouette. People wear clothes and hair. So points of the body outside of the mask can
+have a larger robust scale than points inside.
 """
 
 import dataclasses
@@ -46,7 +46,9 @@ class _Edges:
     it, pixels.
     """
     nearest: float = 0.05
-    """Edges of faces with a smaller depth than this do not belong to the silhouette, metres."""
+    """The edges of a face do not belong to the silhouette if a vertex of the face has at most this
+    depth, metres.
+    """
     border: float = 1.0
     """Points within this distance of the image border do not belong to the silhouette, pixels.
     There the image ends, and not the person.
@@ -178,8 +180,8 @@ def mask_boundary(
     """Returns `count` points at which the coverage of a mask crosses one half. If there is no such
     place, there are no points.
 
-    Contours along the image border are left out. hidden: pixels where something may stand in front
-    of the person, (h, w). Contours through these pixels are left out, too.
+    Parts of contours at the image border are left out. hidden: pixels where something may stand in
+    front of the person, (h, w). Parts of contours in these pixels are left out, too.
     """
     from skimage.filters import gaussian
     from skimage.measure import find_contours
@@ -274,8 +276,8 @@ def match(
     count: int,
     hidden: Bool[np.ndarray, "h w"] | None = None,
 ) -> Matches:
-    """Matches the silhouettes of a body and of a mask. Returns at most 2 `count` equations, padded
-    with rows of weight 0.
+    """Matches the silhouettes of a body and of a mask. Returns 2 `count` rows: at most so many
+    equations, and rows of weight 0 that fill the arrays.
 
     Args:
         body: silhouette of the body.
@@ -409,7 +411,8 @@ def boundary_points(
     body: BodyModel, boundaries: Sequence[Boundary], count: int, coefficients: int
 ) -> SurfacePoints:
     """Returns the points of v silhouettes of the body, (v, count, ...), as points on its surface
-    that can be posed. They are padded with points that no equation uses.
+    that can be posed. They are padded with points that no equation uses. coefficients: number of
+    shape coefficients.
     """
     ends, shares = (
         np.stack([padded(getattr(each, name), count) for each in boundaries])
