@@ -85,7 +85,7 @@ class FitRecord:
 
 
 def _write_fit_record(path: str | Path, record: FitRecord) -> None:
-    """Writes fit.npz. If writing fails, no file appears."""
+    """Writes fit.npz. If writing fails, an old file at the path stays as it was."""
     kind = record.keypoints.set
     arrays = {
         "set": np.asarray(kind.name),
@@ -102,7 +102,7 @@ def _write_fit_record(path: str | Path, record: FitRecord) -> None:
 def read_fit_record(path: str | Path) -> FitRecord:
     """Reads fit.npz.
 
-    Raises: CaptureError, which names file and key.
+    Raises: CaptureError, which names the file, and the key if one is missing or has wrong values.
     """
     path = Path(path)
     with reading(path, "fit.npz", CaptureError):

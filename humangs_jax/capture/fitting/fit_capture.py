@@ -360,7 +360,8 @@ def fit_photos(
     fixed_cameras: bool = False,
 ) -> FittedCapture:
     """Returns the capture with the fitted shape and poses of the person in photos. Cameras are
-    corrected first if their rotation is wrong according to the keypoints.
+    corrected first if their rotation is wrong according to the keypoints. Pixels that something in
+    front of the person covers become unknown, see `with_hidden_parts`.
 
     Args:
         photos: photos with cameras.

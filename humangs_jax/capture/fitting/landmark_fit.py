@@ -264,7 +264,7 @@ def _rigid_starts(
 
 
 def _cube_rotations() -> Float[np.ndarray, "24 3 3"]:
-    """Returns the 24 rotations that map the axes to each other, in either direction."""
+    """Returns the 24 rotations that map a cube to itself, (24, 3, 3)."""
     signed = (
         np.eye(3)[list(order)] * np.asarray(signs)[:, None]
         for order in itertools.permutations(range(3))
@@ -460,12 +460,12 @@ def smooth_motion(
 
     Frames that show fewer than `FEW` landmarks are first interpolated between their neighbours.
     Then there are four solves, each from the result of the one before. They expect 64, 16, 4 and 1
-    times `smoothness`. The first ones pull weakly, and bring frames together that one view hardly
-    determines.
+    times `smoothness`. The first ones pull weakly, and bring those frames together that one view
+    hardly determines.
 
-    A solve is accepted if no frame follows its keypoints worse than in the fit, except for noise.
-    The last accepted solve is the result. If no solve is accepted, the result is the interpolated
-    fit if that is acceptable, else the fit.
+    A solve is accepted if each frame agrees with its keypoints as well as in the fit, except for
+    noise. The last accepted solve is the result. If no solve is accepted, the result is the
+    interpolated fit if that is acceptable, else the fit.
 
     "Except for noise" means that the robust cost of a frame may exceed the fit's by p. Here p is
     the number of the frame's unknowns, or of its observed coordinates if these are fewer. The true

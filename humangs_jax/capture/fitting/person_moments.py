@@ -207,9 +207,9 @@ class Explanation:
 
 
 def explain(seen: PersonViews) -> Explanation:
-    """Returns cameras that explain all photos, or all except one, by one person in one pose.
+    """Returns cameras with which one person in one pose explains all photos, or all except one.
 
-    If there are no such cameras, or if all photos are from nearly the same direction, the
+    If there are no such cameras, or if several photos are all from nearly the same direction, the
     explanation has no trial. Each photo then counts as a moment.
     """
     every = tuple(range(len(seen.photos)))

@@ -72,12 +72,12 @@ class Swap:
     kind: Literal["sides", "cameras", "hands"]
     """What is exchanged."""
     views: tuple[str, ...]
-    """Names of the views that are exchanged. If cameras are exchanged, these are their views in the
-    first frame.
+    """Names of the views that are exchanged. If cameras are exchanged in several frames, these are
+    their views in the first of these frames.
     """
     instead: tuple[str, ...] = ()
-    """Alternatives that explain the disagreement as well. They are names of views, or for cameras
-    pairs of names ("a and b").
+    """Alternatives that explain the disagreement about as well. They are names of views, or for
+    cameras pairs of names ("a and b").
     """
     frames: int = 1
     """Number of frames in which the cameras are exchanged."""

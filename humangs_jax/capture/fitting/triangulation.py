@@ -154,8 +154,8 @@ class _SamePerson:
     multiplies the distance (see `agree`) by less than this number.
     """
     rather: float = 0.8
-    """If a view does not agree without an exchange, this number is used in place of `clearly`. With
-    the exchange it has to agree.
+    """If a view does not agree without an exchange, this number is used in place of `clearly`, and
+    the view has to agree after the exchange.
     """
     seen: float = 0.3
     """A landmark is used if it has at least this visibility."""
