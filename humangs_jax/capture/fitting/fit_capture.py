@@ -309,7 +309,8 @@ def _quantile(values: Float[np.ndarray, "..."], share: float) -> float:
 def calls_of_fit(body: BodyModel, kind: KeypointSet, views: int) -> Iterator[Call]:
     """Yields the compiled functions that `fit_photos` and its report call for photos of one moment,
     each with arguments of the right shapes. The shapes depend on the body, the set `kind` and the
-    number of views.
+    number of views. The function inside of `landmark_model` is left out, because the generator
+    itself runs it.
     """
     model = landmark_model(without_expression(body), kind.names, kind.places, kind.certainty)
     k, one = len(kind.names), (1, views)
