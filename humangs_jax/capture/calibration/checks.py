@@ -34,14 +34,14 @@ USUAL_DISTANCE = 2.5
 brings the cameras nearest to this distance is chosen.
 """
 NEARLY_PARALLEL = np.sin(np.radians(2.0)) ** 2
-"""If all optical axes lie within about 2 degrees of each other, there is no reliable point where
-they meet. The smallest eigenvalue of the mean of I - a a^T over the axes a is then below this
-number.
+"""If the optical axes differ from their mean direction by less than about 2 degrees (root mean
+square), there is no reliable point where they meet. The smallest eigenvalue of the mean of I - a
+a^T over the axes a is then below this number.
 """
 MISS = 0.5
-"""Largest root mean square distance of the optical axes from the point where they meet, divided by
-the point's median depth. It is large because some cameras look at the person's feet and others at
-the face.
+"""Optical axes count as meeting in a point if the root mean square of their distances from it,
+divided by the point's median depth, is less than this. The number is large because some cameras
+look at the person's feet and others at the face.
 """
 TILT_LIMIT = 45.0
 """There is a warning if the angle between the mean upward direction of the photos and +y exceeds
@@ -52,8 +52,9 @@ OFF_CENTER = 0.25
 away from its middle. The intrinsics may then belong to an image of another size.
 """
 COINCIDENT = 1e-3
-"""Cameras count as standing in one place if the point where their axes meet is very near: its
-median depth is less than this share of the largest distance of a camera from the world's origin.
+"""Cameras count as standing in one place if the point where their axes meet is very near to them:
+if its median depth is less than this share of the largest distance of a camera from the world's
+origin.
 """
 
 

@@ -1,14 +1,14 @@
 """Chooses the frames of a video of one person that become photos. They are sharp, and show the
-person from all sides.
+person from different sides.
 
-The frames that show something are cut into windows of equal length. Each window offers its sharpest
-frame.
+The frames that show something are cut into windows of time, at most 64 of about equal length. Each
+window offers its sharpest frame.
 
 If the person was found in these frames and turns, the circle of directions is cut into equal parts.
 Each part gives its best frame: a sharp one, in the usual pose, and near the middle of the part.
 
-Otherwise frames are chosen one after the other. Each is the frame that differs most from all frames
-chosen before, until no frame differs enough.
+Otherwise frames are chosen one after the other, beginning with a sharp one. The next one is the
+frame that differs most from all frames chosen before, until no frame differs enough.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ from humangs_jax.core.array_types import Float, Int, UInt
 from humangs_jax.io.reading import InvalidFileError
 
 PHOTOS = 8
-"""Largest number of frames that `choose_frames` takes from a video."""
+"""Largest number of photos of a video that are chosen by their looks, with `choose_frames`."""
 LONGER_SIDE = 480
 """Longer side to which frames are shrunk before their sharpness is measured, pixels. Blur that
 cannot be seen at this size does no harm.
@@ -31,7 +31,7 @@ _NOTHING_SHOWN = 3.0
 frame of one color has only noise, which is smaller.
 """
 NOTHING_NEW = 0.05
-"""Frames are chosen until the best remaining frame has less novelty than this. Novelty is the root
+"""`choose_frames` ends when all remaining frames have less novelty than this. Novelty is the root
 mean square difference between the frame's thumbnail and the most similar chosen thumbnail, times
 the frame's worth. Thumbnails have a standard deviation of at most 1.
 """
@@ -41,7 +41,8 @@ def looked_at(
     frames: Iterable[UInt[np.ndarray, "h w"]],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n p"]]:
     """Returns the sharpness, (n,), and the thumbnail, (n, p), of each grey frame. A thumbnail has
-    mean 0, and variance 1 or less. If a frame shows nothing, its sharpness and its thumbnail are 0.
+    mean 0, and variance 1 or less. If a frame shows nothing, or has a side of less than 3 pixels,
+    its sharpness and its thumbnail are 0.
 
     Sharpness is the mean square of the Laplacian, divided by the variance of the frame, so that
     exposure does not change it.
@@ -68,8 +69,8 @@ def looked_at(
 def offered_frames(
     sharpness: Float[np.ndarray, " n"],
 ) -> tuple[Int[np.ndarray, " o"], Float[np.ndarray, " o"]]:
-    """Returns the index of the sharpest frame of each window, ascending, (o,), and the worth of
-    each of these frames, (o,), in (0, 1].
+    """Returns the index of the sharpest frame of each window of time, ascending, (o,), and the
+    worth of each of these frames, (o,), in (0, 1]. There are at most 64 windows.
 
     The worth is the frame's sharpness divided by the median sharpness of all returned frames, but 1
     at most.
@@ -90,8 +91,8 @@ def offered_frames(
 def choose_frames(
     sharpness: Float[np.ndarray, " n"], thumbnails: Float[np.ndarray, "n p"], most: int
 ) -> list[int]:
-    """Returns the indices of at most `most` frames that look different, ascending. It is used if
-    the person's directions are not known, or do not differ.
+    """Returns the indices of at most `most` frames that look different, ascending. It serves videos
+    in which the person's directions are not known, or hardly differ.
 
     sharpness and thumbnails: see `looked_at`.
     Raises: InvalidFileError if no frame shows anything.
@@ -113,8 +114,8 @@ FRAMES = 16
 The others help poses and refinement.
 """
 USUAL = 0.15
-"""A frame's worth is halved if its pose differs by this share of the person's size from the usual
-pose. See `unusual`.
+"""A frame's worth is halved if its pose differs from the usual pose by this share of the person's
+size. See `unusual`.
 """
 WORTHLESS = 0.1
 """Smallest factor by which a frame's worth is multiplied because of an unusual pose."""
@@ -142,8 +143,9 @@ def unusual(
     directions: Float[np.ndarray, " n"],
     seen: Float[np.ndarray, "n k"],
 ) -> Float[np.ndarray, " n"]:
-    """Returns how much the pose of each frame differs from the median pose of all frames, (n,). It
-    is the mean distance of the landmarks, weighted by `seen`, as a share of the person's size.
+    """Returns how much the pose of each frame differs from the median pose of all frames, (n,).
+    This is the mean distance between the landmarks of both poses, weighted by `seen`, as a share of
+    the person's size. Poses are turned to face the camera before.
 
     world: landmarks in the camera's axes, (n, k, 3). directions: see `directions_of`. seen: weights
     of the landmarks, (n, k).
@@ -166,9 +168,9 @@ def unusual(
 def choose_by_direction(
     directions: Float[np.ndarray, " n"], worth: Float[np.ndarray, " n"], most: int
 ) -> list[int]:
-    """Returns the ascending indices of at most `most` frames, evenly spread over the directions in
-    which the person was filmed. The result is empty if these directions cover less than a quarter
-    turn.
+    """Returns the ascending indices of at most `most` frames, spread evenly over the directions
+    from which the person was filmed. The result is empty if these directions cover less than a
+    quarter turn.
 
     Arguments: directions: direction of each frame, (n,), radians. worth: worth of each frame, (n,).
     Frames of worth 0 are not taken.

@@ -1,8 +1,9 @@
 """Imports photos and the calibration that another tool made of their cameras (`import_cameras`).
 The result is a capture folder without body.
 
-docs/cameras.md describes the formats and their conventions. Photos are copied as they are, or
-undistorted if the lens needs it. capture.json names body.npz, which `humangs fit` makes later.
+docs/cameras.md describes the formats and their conventions. Photos are copied unchanged if
+possible. Otherwise they are turned upright, undistorted and padded as needed. capture.json names
+body.npz, which `humangs fit` makes later.
 """
 
 import dataclasses
@@ -150,24 +151,24 @@ def import_cameras(
     Args:
         source: file or folder in any format of docs/cameras.md. The format is found from the
             content.
-        images: folder of the photos, or of a video of each camera (CAMERA.mp4).
+        images: folder with the photos, or with a video of each camera (CAMERA.mp4).
         out: the capture folder.
-        masks: folder of the photos' masks, or of a video of masks of each camera, with the names of
-            the photos or videos. None: the masks that the calibration names, if any.
+        masks: folder with a mask of each photo, or with a video of masks of each camera. They have
+            the names of the photos, or of the videos. None: the masks that the calibration names,
+            if any.
         others: folder of masks of other people and of things in front of the person. The masks have
             the photos' names. A photo in which nothing covers the person needs no mask.
         scale: metres per unit of the source. None: the unit of the format, or metres. If the
-            cameras would then stand too near to a person or too far away, another unit is chosen
-            that fits.
+            cameras would then stand too near to a person or too far away, another unit that fits
+            is chosen, if there is one.
         up: the axis of the source's world that points up, such as "+y" or "-z". None: as the format
             says.
         pixel_centers: position of the first pixel's centre in the source. "integer" means (0, 0),
             and "half" means (0.5, 0.5). None: as the format says.
-        every: step between the frames of videos.
+        every: step between the frames of a video, or between the moments of several videos.
         frames: largest number of frames of each video. None: all.
         overwrite: whether a capture at `out` is replaced as a whole.
-        also: contents of JSON files, by their name, that are written to the folder together with
-            the capture.
+        also: further JSON files that are written to the folder: the content of each by its name.
 
     Returns: what was imported, and how.
 
@@ -211,10 +212,10 @@ def import_cameras(
 def photo_size_of(images: Path, source: Path, name: str) -> tuple[int, int]:
     """Returns width and height of the photo that the source calls `name`, pixels.
 
-    If there is no such photo, it returns the size of any photo. This does no harm, because a camera
-    without a photo is left out later.
+    If there is no such photo, or if it cannot be read, returns the size of the first photo in the
+    folder. An import leaves out a camera without a photo later.
 
-    Raises: CaptureError if the folder has no photos.
+    Raises: CaptureError if the folder has no photos, or if the first one cannot be read.
     """
     try:
         return photo_size(photo_of(images, name, source))
@@ -237,8 +238,9 @@ def import_calibration(
     pixel_centers: str | None = None,
     also: Mapping[str, object] | None = None,
 ) -> ImportReport:
-    """Writes a capture folder of photos and a calibration that is in memory. The other arguments
-    and the result are as in `import_cameras`. A capture at `out` is replaced.
+    """Writes a capture folder of photos and a calibration that is in memory. images: folder with
+    the photos. The other arguments and the result are as in `import_cameras`. A capture at `out` is
+    replaced.
     """
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
     about_unit = None
@@ -426,7 +428,7 @@ def _write(
 ) -> list[str]:
     """Writes photos, masks, masks of unknown pixels, and capture.json.
 
-    Arguments: in_front: for a photo, its mask of other people and of things in front.
+    Arguments: in_front: the mask of other people and of things in front, by photo.
     Returns: the names of the photos in which the person is cut off, see `is_cut_off`.
     """
     (folder / "images").mkdir(parents=True)
@@ -498,8 +500,8 @@ def _rewrite(
     undistorted to a pinhole camera, and padded to the canvas. Added pixels are white in the photo
     and 0 in the mask.
 
-    If `transparent` is set, alpha channels count. A photo with a mask file then keeps its alpha
-    channel in addition. Otherwise alpha channels are dropped.
+    If `transparent` is False, alpha channels are dropped. If it is True, a photo with a mask file
+    keeps its alpha channel, too.
     Returns: the paths for capture.json, and the mask as it was written, or None if there is none.
     """
     # upright, and as a pinhole sees them

@@ -1,5 +1,5 @@
 """Loads cameras of other tools, with their lenses, for scenes of Gaussians (`load_cameras`). The
-cameras keep the axes of their world, unless the y axis has to point up.
+cameras keep the axes of their world, unless `y_up` is set.
 """
 
 import dataclasses
@@ -35,8 +35,8 @@ class SceneCameras(Mapping[str, Camera]):
     a name is repeated, the second camera gets " (2)" after its name, the third " (3)", and so on.
     """
     points: Float[np.ndarray, "n 3"]
-    """Points that the calibration found, (n, 3), in the unit of the cameras. n = 0 if there are no
-    points.
+    """Points that the calibration found, (n, 3), in the unit and the axes of the cameras. n = 0 if
+    there are no points.
     """
     colors: Float[np.ndarray, "n 3"]
     """Colors of the points, (n, 3), RGB in [0, 1]. Grey if the calibration has no colors."""
@@ -75,9 +75,11 @@ def load_cameras(
         images: Folder of the photos, for formats that do not state the photos' sizes.
         lenses: Whether the cameras keep the lens distortion of the file, also of fisheyes, as the
             photos show it. False: the cameras are pinholes, for photos that are undistorted. A
-            fisheye then raises an error.
-        y_up: Whether the world is turned so that y is up. False: the axes of the file are kept, as
-            for Gaussians of other programs.
+            lens that `humangs import cameras` cannot undistort, such as a fisheye, then raises an
+            error.
+        y_up: Whether the world is turned so that the format's up axis becomes y. False: the axes
+            of the file are kept. Gaussians that other programs fitted to these cameras have these
+            axes.
         scale: Metres per unit of the file.
 
     Returns:
@@ -110,7 +112,8 @@ def load_cameras(
 
 
 def _camera(each: CalibratedCamera, source: Path, folder: Path | None, lenses: bool) -> Camera:
-    """Returns a camera of the calibration. If the file has no size, it takes the size of the photo.
+    """Returns a camera of the calibration. If the file does not state the size of the camera's
+    images, the size of the photo is used.
 
     Raises: CaptureError if the size is not known, or if `Camera` refuses the values.
     """

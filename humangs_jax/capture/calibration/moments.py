@@ -1,8 +1,9 @@
-"""Finds the frames of several videos that show one moment. It uses times, because rates differ and
-phones drop frames.
+"""Finds the frames of several videos that show one moment. They are found by time, because rates
+differ and phones drop frames.
 
-All videos have to begin at the same moment. The slowest video determines the moments. Each other
-camera gives the frame that is nearest in time, or no frame if it has a gap there.
+All videos have to begin at the same moment, except for a delay of 0.1 to 3 seconds that their times
+show. The video with the lowest frame rate determines the moments. Each other camera gives the frame
+that is nearest in time, or no frame if it has a gap there.
 """
 
 import itertools
@@ -33,7 +34,7 @@ frame, seconds.
 
 
 class Moments(NamedTuple):
-    """The frames of several cameras that show each of m moments."""
+    """The frames of several cameras at m moments."""
 
     times: Float[np.ndarray, " m"]
     """Times of the moments, (m,), seconds from the start of the videos."""
@@ -50,7 +51,7 @@ class Moments(NamedTuple):
 
 
 def find_moments(times: Mapping[str, Float[np.ndarray, " _n"]]) -> Moments:
-    """Returns the moments that several cameras show.
+    """Returns the moments that several cameras show, and the frame of each camera at each moment.
 
     Arguments: times: for each camera the times of its n frames, (n,), seconds. NaN where a time is
     not known.
@@ -83,9 +84,10 @@ def _clock(
 ) -> Float[np.ndarray, " n"]:
     """Returns the time of each frame, (n,), seconds from the start of the videos.
 
-    The first frame of a video is at 0. If the video begins 0.1 to 3 seconds after `first`, which is
-    the first time in any video, its first frame is that much later. step: the video's time between
-    frames. None: the video's times are not known, and its frames are `slowest` seconds apart.
+    The first frame of a video is at 0. If the video begins 0.1 to 3 seconds after `first`, the
+    earliest time in all videos, its first frame is that much later. step: the video's time between
+    frames, seconds. None: the times in `times` are not used, and frames are `slowest` seconds
+    apart.
     """
     if step is None:
         return np.arange(len(times)) * slowest
@@ -100,8 +102,9 @@ def _all_moments(
     clocks: Mapping[str, Float[np.ndarray, " _n"]], steps: Mapping[str, float]
 ) -> Float[np.ndarray, " m"]:
     """Returns the times of the moments, (m,), seconds. The moments are the times at which the
-    slowest camera has frames. Further moments fill the time before its first frame, gaps between
-    its frames, and the time after its last frame.
+    slowest camera has frames. Of several such cameras, the one with the most frames counts. Further
+    moments fill the time before its first frame, gaps between its frames, and the time after its
+    last frame.
 
     clocks: times of each camera's frames, seconds. steps: time between each camera's frames,
     seconds.
@@ -122,8 +125,9 @@ def _all_moments(
 def nearest(times: Float[np.ndarray, " n"], moments: Float[np.ndarray, " m"]) -> list[int | None]:
     """Returns for each moment the index of the camera's nearest frame.
 
-    It is None if this frame is too far away in time, or if it is nearer to another moment. Times of
-    frames and moments are in seconds.
+    It is None if this frame is farther away in time than `NEAR` allows, or if it is nearer to
+    another moment. times: times of the camera's frames, (n,), seconds. moments: times of the
+    moments, (m,), seconds.
     """
     step = float(np.median(np.diff(times))) if len(times) > 1 else _USUAL_STEP
     found = np.searchsorted((times[1:] + times[:-1]) / 2, moments)
@@ -170,9 +174,8 @@ def _warnings(
 ) -> tuple[str, ...]:
     """Returns warnings about cameras that lack frames.
 
-    A camera gets a line if it has no frame at some moment before its video ends. It gets another
-    line if its video ends two or more moments before the last moment. Clocks and moments are in
-    seconds.
+    A camera gets a line if it has no frame at some moment before its last frame. It gets another
+    line if it has no frame at two or more moments after that. Clocks and moments are in seconds.
     """
     found = []
     for camera, numbers in frames.items():

@@ -1,8 +1,6 @@
-"""Finds the pixels of photos in which the person may be hidden or was not photographed. Some of
-these pixels show other people or things in front of the person. The rest were added by the import,
-beyond what the camera has seen.
-
-A capture calls both kinds unknown (docs/capture_format.md).
+"""Finds the unknown pixels of photos (docs/capture_format.md). There are two kinds. Some pixels
+show other people, or things in front of the person. The import adds the others, where the camera
+has seen nothing.
 """
 
 from collections.abc import Sequence
@@ -29,7 +27,7 @@ from humangs_jax.io.images import PHOTO_SUFFIXES, orientation, read_grey
 
 
 def find_others(folder: Path | None, images: Path, photos: Sequence[Path]) -> dict[Path, Path]:
-    """Returns for each photo its mask of others (other people, or things in front of the person).
+    """Returns the mask of others (other people, or things in front of the person) of each photo.
     Photos without such a mask are not in the result. If `folder` is None, the result is empty.
 
     Raises: CaptureError if no picture in the folder is named like a photo.
@@ -55,8 +53,8 @@ def others_as_shown(
     """Returns for each photo which pixels show others in front of the person, (h, w), oriented as
     the photo is shown. None for a photo without a mask of others.
 
-    Raises: CaptureError if no picture in the folder is named like a photo, or if a mask has another
-    size than its photo.
+    Raises: CaptureError if no picture in the folder is named like a photo, if a file cannot be
+    read, or if a mask has another size than its photo.
     """
     found = find_others(folder, images, photos)
     return [
@@ -72,7 +70,7 @@ def others_imported(
     mask file is turned, undistorted and padded in the same way as the photo. canvas: width and
     height of the imported photo, pixels.
 
-    Raises: CaptureError if the mask has another size than the photo.
+    Raises: CaptureError if a file cannot be read, or if the mask has another size than the photo.
     """
     stored = photo_size(photo.image)
     shown = stored if read_checked(orientation, photo.image) < 5 else stored[::-1]
@@ -83,19 +81,18 @@ def others_imported(
 def not_photographed(
     size: tuple[int, int], camera: CalibratedCamera, canvas: tuple[int, int]
 ) -> Bool[np.ndarray, "h w"]:
-    """Returns which pixels of an imported photo the camera has not seen, (h, w). Undistortion shows
-    some of them, beyond the border of the original photo. Padding to the common size adds the
-    others.
+    """Returns which pixels of an imported photo the camera has not seen, (h, w). Undistortion adds
+    pixels beyond the border of the original photo. Padding to the common size adds more.
 
-    Arguments: size: width and height of the upright photo. canvas: width and height of the imported
-    photo.
+    Arguments: size: width and height of the upright photo, pixels. canvas: width and height of the
+    imported photo, pixels.
     """
     width, height = size
     return _as_imported(np.ones((height, width), np.float32), camera, canvas) < MASK_THRESHOLD
 
 
 def is_cut_off(person: Bool[np.ndarray, "h w"], unseen: Bool[np.ndarray, "h w"]) -> bool:
-    """Returns whether the person comes within three pixels of the unseen area. If so, more of the
+    """Returns whether the person comes within three pixels of the unseen area. If so, parts of the
     person may lie in that area.
     """
     # three pixels: a mask that ends so near to what the camera has not seen is cut off there

@@ -60,7 +60,7 @@ class Photo:
     frame: int
     """Number of its frame, from 0."""
     key: str
-    """Path relative to the folder of photos, with slashes and without suffix."""
+    """Path of the photo relative to the folder of photos, with slashes and without suffix."""
 
 
 MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "silhouettes")
@@ -77,9 +77,9 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
     """Returns the calibration without the cameras that have no photo, and a line about these
     cameras. The line is None if every camera has a photo.
 
-    Raises: CaptureError if no camera has a photo. If the calibration has a camera for each image,
-    it is also raised if an image is missing and the folder has a photo that no camera names,
-    because the names do not match then.
+    Raises: CaptureError if no camera has a photo. A calibration with a camera for each image also
+    raises it if an image is missing and the folder has a photo that no camera names: the names
+    probably do not match.
     """
     if calibration.per_image:
         there = [_photo_at(images, camera.name) is not None for camera in calibration.cameras]
@@ -149,7 +149,7 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
 
 def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibration) -> list[Unused]:
     """Returns the files in the folder of photos that an import does not use, each with the reason.
-    The folders in `NO_PHOTOS` are ignored.
+    Subfolders with a name in `NO_PHOTOS` are not searched.
     """
     used = {
         file.resolve() for photo in photos for file in (photo.image, photo.mask) if file is not None
@@ -170,7 +170,7 @@ def _named_masks(calibration: Calibration, images: Path) -> dict[int, Path]:
     the calibration's folder, in the folder of photos, and in the parent of that folder. If no mask
     exists, the result is empty.
 
-    Raises: CaptureError if some masks exist and others are missing.
+    Raises: CaptureError if some cameras have a mask that exists and others have none.
     """
     found: dict[int, Path] = {}
     for i, camera in enumerate(calibration.cameras):
@@ -195,8 +195,8 @@ def photo_of(folder: Path, name: str, file: Path) -> Path:
     """Returns the photo that a calibration file names. The name is a path. It may lack its suffix,
     have another suffix, or begin with folders above `folder`.
 
-    Raises: CaptureError if there is no such photo, or if it is a link to something outside of the
-    folder, see `io.reading.inside`.
+    Raises: CaptureError if there is no such photo, or if the photo is a link to a file outside of
+    the folder, see `io.reading.inside`.
     """
     photo = _photo_at(folder, name)
     if photo is None:
@@ -218,9 +218,9 @@ def _photo_at(folder: Path, name: str) -> Path | None:
 
 
 def _any_suffix(path: Path) -> Path | None:
-    """Returns the path if it is a photo that exists. If not, it returns an existing file with
-    another photo suffix, which replaces the path's suffix or is appended to it. None if there is no
-    such file.
+    """Returns the path if it is a photo that exists. Otherwise returns the path of an existing file
+    whose name is the given name with a photo suffix appended, or with another photo suffix in
+    place of its own. None if there is no such file.
     """
     stems, candidates = [path.name], []
     if is_photo(path):
@@ -233,16 +233,16 @@ def _any_suffix(path: Path) -> Path | None:
 
 
 def photo_size(path: Path) -> tuple[int, int]:
-    """Returns width and height in pixels. Only the head of the file is read.
+    """Returns the width and height of a stored photo, pixels. The EXIF orientation is not applied.
 
-    Raises: CaptureError if the file is not an image.
+    Raises: CaptureError if the file cannot be read as an image.
     """
     return read_checked(image_size, path)
 
 
 def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
-    """Returns a function that finds the mask of a photo, see `masks_named_like`. It raises
-    CaptureError if there is none.
+    """Returns a function that finds the mask of a photo, see `masks_named_like`. The function
+    raises CaptureError if there is no mask.
     """
     find = masks_named_like(masks, images)
 
@@ -261,13 +261,14 @@ def _masks_of(masks: Path, images: Path) -> Callable[[Path], Path]:
 
 
 def masks_named_like(masks: Path, images: Path) -> Callable[[Path], Path | None]:
-    """Returns a function that finds the mask of a photo of `images`, at the same path in the folder
-    of masks. The function returns None if there is no such mask.
+    """Returns a function that finds the mask of a photo. The photo lies in the folder `images`, and
+    its mask at the same path in the folder `masks`. The function returns None if there is no such
+    mask.
 
     The mask has the photo's name, perhaps with another suffix, with one more suffix (COLMAP) or
-    with a word for masks (RealityScan's IMG.jpg.mask.png, Metashape's IMG_mask.png). AvatarReX has
-    the mask in mask/pha beside the photo. Photos and masks may lie in one folder. The photo itself
-    is never returned as its mask.
+    with a word for masks (RealityScan's IMG.jpg.mask.png, Metashape's IMG_mask.png). The mask may
+    also lie in a subfolder mask/pha of that place (AvatarReX). Photos and masks may lie in one
+    folder. The photo itself is never returned as its mask.
     """
     # each folder is listed once: names with a word for masks, by the photo they are of
     listed: dict[Path, dict[str, Path]] = {}
@@ -298,7 +299,7 @@ def masks_named_like(masks: Path, images: Path) -> Callable[[Path], Path | None]
 
 
 def _frames_of(calibration: Calibration, images: Path) -> list[dict[str, Path]]:
-    """Returns for each camera a mapping from names of frames to its photos.
+    """Returns for each camera a mapping from the name of a frame to the camera's photo of it.
 
     There are three layouts: CAMERA/FRAME.jpg, FRAME/CAMERA.jpg and CAMERA.jpg. All cameras use the
     first of them in which any camera has photos.
@@ -352,9 +353,11 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
 # --------------------------------------------------------------------------------------------------
 
 MIRRORED = {2: 1, 4: 3, 5: 6, 7: 8}
-"""For each EXIF flag that mirrors, the flag with the same turn but without mirroring."""
+"""For each EXIF flag that mirrors, the flag that only turns. The first flag asks for the turn of
+the second, followed by mirroring left to right.
+"""
 MIRROR = 2
-"""The EXIF flag that mirrors and does not turn."""
+"""The EXIF flag that mirrors left to right and does not turn."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -372,8 +375,9 @@ class Turn:
     size: tuple[int, int]
     """Width and height of the turned photo, pixels."""
     certain: bool
-    """Whether it is known which photo was calibrated, the stored or the turned one. It is not known
-    if the photo has a flag other than 1, both have the same size, and the format does not say.
+    """Whether it is known which pixels were calibrated, the stored or the turned ones. It is not
+    known if three things hold: the photo has a flag other than 1, the stored and the turned photo
+    have the same size, and the format does not say.
     """
     mirrored: bool
     """Whether pixels are mirrored back. This is so if the flag mirrors and the calibration is of
@@ -397,9 +401,9 @@ class Turn:
 def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn, ...]:
     """Returns the turn of each photo.
 
-    Raises: CaptureError if a photo has another size than its calibrated camera, or a mask has
-    another size than its photo. It is also raised if a camera was calibrated for the pixels as
-    stored, and the flags of its photos ask for different turns.
+    Raises: CaptureError if neither the stored nor the turned photo has the size of its calibrated
+    camera, or if a mask has another size than its photo. It is also raised if a camera was
+    calibrated for the pixels as stored, and the flags of its photos ask for different turns.
     """
     turns = tuple(
         _find_turn(calibration.cameras[photo.camera], photo, calibration.upright)
@@ -444,13 +448,13 @@ def mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, 
     """Returns the EXIF flag by which a mask is turned.
 
     If the mask's own flag brings it to the size of the turned photo, this flag is returned. If the
-    mask has no flag, and the size of the stored photo, the photo's flag is returned. If the stored
-    and the turned photo have the same size, a mask without a flag counts as turned already, because
-    most tools that make masks obey the photo's flag.
+    mask has no flag and is as large as the stored photo, the photo's flag is returned. If the
+    stored and the turned photo have the same size, a mask without a flag counts as turned already,
+    because most tools that make masks obey the photo's flag.
 
     flag: EXIF flag of the photo. stored and shown: width and height of the photo before and after
     it is turned, pixels.
-    Raises: CaptureError in all other cases.
+    Raises: CaptureError for any other mask.
     """
     own, size = read_checked(orientation, mask), photo_size(mask)
     size = size if own < 5 else size[::-1]
@@ -465,8 +469,8 @@ def mask_flag(mask: Path, flag: int, stored: tuple[int, int], shown: tuple[int, 
 
 
 def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h w"]:
-    """Reads the mask of a photo, turned as the photo is shown. masks: folder of masks. images:
-    folder of photos.
+    """Reads the mask of a photo, turned as the photo is shown, (h, w), 0 to 1. masks: folder of
+    masks. images: folder of photos. image: the photo.
 
     Raises: CaptureError if there is no mask, or if it has another size than the photo.
     """
@@ -533,9 +537,9 @@ def _quarter_turned(camera: CalibratedCamera) -> CalibratedCamera:
 def turn_notes(photos: Sequence[Photo], turns: Sequence[Turn]) -> tuple[list[str], list[str]]:
     """Returns notes and warnings about EXIF orientations.
 
-    A note counts the photos that were turned. A warning names photos whose size does not show
-    whether the calibration is of the stored or of the turned photo. Another names a photo that the
-    flag wants mirrored and that was only turned.
+    A note counts the photos that have to be turned. One warning is about photos whose size does not
+    show whether the calibration is of the stored or of the turned photo. Another warning names a
+    photo that is turned but not mirrored, although its flag asks for both.
     """
     flagged = [(photo, turn) for photo, turn in zip(photos, turns, strict=True) if turn.photo != 1]
     if not flagged:
@@ -606,8 +610,8 @@ def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
 
 
 def _mask_problem(person: Bool[np.ndarray, "h w"]) -> str | None:
-    """Returns a sentence about what is wrong with a mask, or None. person: whether each pixel shows
-    the person, (h, w).
+    """Returns a line about what is wrong with a mask, or None. person: whether each pixel shows the
+    person, (h, w).
     """
     if not person.any():
         return _EMPTY
@@ -629,7 +633,7 @@ def has_alpha(photo: Path) -> bool:
 
 
 def is_transparent(photo: Path) -> bool:
-    """Returns whether any pixel of a photo is transparent. It is False for an opaque alpha channel.
+    """Returns whether any pixel of a photo is transparent, fully or partly.
 
     Raises: CaptureError if the file cannot be read.
     """

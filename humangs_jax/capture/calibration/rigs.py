@@ -2,11 +2,11 @@
 EasyMocap, Panoptic, multical, TOML and Qualisys.
 
 In OpenCV's convention a world point X is at R X + T in the camera, and pixel centres are at whole
-numbers. There are two layouts. Each camera's values can be in a separate map, `{"cam00": {"K": ..,
-"R": .., "T": .., "imgSize": [W, H]}}`. Or the values of all cameras are in one map, with the
-camera's name at the end of each key: `K_01`, `dist_01`, `Rot_01` or `R_01` (matrix or rotation
-vector), `T_01`, and the list `names`. EasyMocap's intri.yml and extri.yml are like this
-(https://chingswy.github.io/easymocap-public-doc/database/1_camera.html).
+numbers. There are two layouts. In the first, each camera's values are in a separate map, `{"cam00":
+{"K": .., "R": .., "T": .., "imgSize": [W, H]}}`. In the second, the values of all cameras are in
+one map, with the camera's name at the end of each key: `K_01`, `dist_01`, `Rot_01` or `R_01`
+(matrix or rotation vector), `T_01`, and the list `names`. EasyMocap's intri.yml and extri.yml have
+the second layout (https://chingswy.github.io/easymocap-public-doc/database/1_camera.html).
 
 The YAML of OpenCV's FileStorage is not quite YAML: the header is `%YAML:1.0`, and flow maps have no
 space after a colon ({ x:1 }). Matrices are `!!opencv-matrix` with rows, cols, dt and data.
@@ -152,8 +152,9 @@ def _flat_cameras(
 def _renamed_camera(
     name: str, entry: Mapping[str, Any], keys: Mapping[str, str], file: Path, field: str
 ) -> CalibratedCamera:
-    """Reads a camera whose values have other keys than OpenCV's. keys: key of the entry -> OpenCV's
-    key. Values with other keys are ignored. file and field: place of the entry, for errors.
+    """Reads a camera whose values have other keys than OpenCV's. keys: OpenCV's key by the key of
+    the entry. Values with keys that are not in `keys` are ignored. file and field: place of the
+    entry, for errors.
     """
     theirs = {ours: key for key, ours in keys.items()} | {
         keys[key]: key for key in entry if key in keys
@@ -185,8 +186,8 @@ def _one_camera(name: str, values: Mapping[str, Any], where: Where) -> Calibrate
 
 
 def _lens(values: Mapping[str, Any], where: Where) -> dict[str, Any]:
-    """Returns the fields of `CalibratedCamera` that describe the lens. The fields of a fisheye lens
-    include an error, which is raised later by commands that need photos without distortion.
+    """Returns the fields of `CalibratedCamera` that describe the lens. For a fisheye lens they
+    include an error. Commands that need photos without distortion raise it later.
     """
     coefficients, at, refusal = None, "", None
     for key, value in values.items():
@@ -236,7 +237,7 @@ _MATRIX = "opencv-matrix"
 def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
     """Parses a FileStorage text and returns its values by key. Matrices are arrays (rows, columns).
 
-    Raises: CaptureError with the number of the line.
+    Raises: CaptureError, with the number of the line for a fault of the syntax.
     """
     with reading(file, "YAML file", CaptureError):
         if text.lstrip().startswith("{"):
@@ -453,7 +454,7 @@ def recognizes_toml(source: CalibrationFile) -> bool:
 
 
 def read_toml(source: CalibrationFile, format: CameraFormat) -> Calibration:
-    """Reads the cameras of a file. Cameras that are marked with `ignore` are left out.
+    """Reads the cameras of a file. Cameras with `ignore = true` are left out.
 
     Raises: CaptureError with the name of the key.
     """

@@ -291,9 +291,9 @@ _CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIA
 _FISHEYE_MODEL = "OPENCV_FISHEYE"
 """Value of `camera_model` for a fisheye lens."""
 _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
-"""Keys by which instant-ngp knows lenses that are not read."""
+"""Keys that mark a lens that is not read, in files of instant-ngp."""
 _MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_intrinsics")
-"""Keys of a whole matrix K, in a frame or in the file."""
+"""Keys of a complete matrix K, in a frame or in the file."""
 
 
 def recognizes_transforms(source: CalibrationFile) -> bool:
@@ -372,11 +372,11 @@ def _frame_camera(
 def _frame_intrinsics(
     values: Mapping[str, Any], size: tuple[int, int] | None, file: Path, prefix: str
 ) -> Float[np.ndarray, "3 3"]:
-    """Returns K, from a complete matrix or from focal lengths and a principal point. If the file
-    has one focal length, it holds for both axes. If the file has no principal point, it is the
-    middle of the image.
+    """Returns K, from a complete matrix or from focal lengths (or angles of view) and a principal
+    point. If the file has one focal length, it holds for both axes. If the file has no principal
+    point, it is the middle of the image.
 
-    Raises: CaptureError if the file has neither a matrix nor a focal length.
+    Raises: CaptureError if the file has no matrix, no focal length and no angle of view.
     """
     for key in _MATRICES:
         if key in values and "fl_x" not in values:
@@ -399,10 +399,10 @@ def _frame_intrinsics(
 
 
 def _frame_lens(values: Mapping[str, Any], file: Path, prefix: str) -> dict[str, Any]:
-    """Returns the fields of `CalibratedCamera` that describe the lens. The fields of a fisheye lens
-    include an error, which is raised later by commands that need photos without distortion.
+    """Returns the fields of `CalibratedCamera` that describe the lens. For a fisheye lens they
+    include an error. Commands that need photos without distortion raise it later.
 
-    Raises: CaptureError if the lens is not supported.
+    Raises: CaptureError for a lens that cannot be read.
     """
     model, refusal = values.get("camera_model", "OPENCV"), None
     if model not in _CAMERA_MODELS:
@@ -482,9 +482,10 @@ def _find_moments(
     """Returns the number of each image's moment, counted from 0 in the order of time, and the
     number of cameras.
 
-    Raises: CaptureError with the name of the key. It is raised if only some images have the key, if
-    a value is not a time, if two images have the same camera name and the same time, or if one of
-    several cameras has several images and the file has no times.
+    Raises: CaptureError if only some images have a time or only some have a camera name, if a time
+    or a camera name is neither a number nor text, if some times are numbers and others text, if two
+    images have the same camera name and the same time, or if the file has no times and one of
+    several cameras has several images.
     """
     # which moment and which camera an image is of, by the first of these keys that is there
     of_time = (

@@ -1,18 +1,19 @@
-"""Takes photos out of videos with ffmpeg (imageio-ffmpeg). Synchronised videos of several cameras
-give a folder of frames for each camera. One video of one camera gives its best frames.
+"""Takes photos out of videos with ffmpeg (imageio-ffmpeg). `photos_of_videos` writes a folder of
+frames for each calibrated camera:
 
     CAMERA.mp4 (.m4v, .mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0,
                                                  every, 2 every ...
 
-The videos of several cameras all have to begin at the same moment. Where their rates differ, or one
-lacks frames, the frames of one moment are found by time (`moments`), and files have the numbers of
-moments. Videos of masks have the same names.
+The videos of several cameras have to begin at the same moment. The frames of several videos that
+show one moment are found by time (`moments`), because rates differ and videos lack frames. They get
+the same number, and `every` counts moments instead of frames. A video of masks has the same name as
+the video of its photos.
 
 What a video says about itself is obeyed. Pixels that are not square are scaled to square ones.
-Colors of high dynamic range or of wide primaries are converted to sRGB. Other videos keep their
-values.
+Colors of high dynamic range or of wide primaries are converted to sRGB. Other colors are not
+converted.
 
-`frame_choice` chooses the frames of a single video that become photos.
+`write_frames` writes chosen frames of a single video. `frame_choice` chooses them.
 """
 
 import contextlib
@@ -35,11 +36,14 @@ from humangs_jax.io.images import image_in
 from humangs_jax.io.reading import InvalidFileError, check_limit, limits, open_file, reading
 
 _LONGEST_SECONDS = 3600
-"""Longest run of one ffmpeg command, seconds. It is then stopped."""
+"""Longest time that one ffmpeg command may take, seconds. A command that takes longer is
+stopped.
+"""
 
 
 def find_videos(folder: Path) -> dict[str, Path]:
-    """Returns the videos of a folder by the name of their camera.
+    """Returns the videos of a folder by the name of their camera, which is the file name without
+    suffix. Subfolders are not searched.
 
     Raises: CaptureError for two videos of one camera.
     """
@@ -92,9 +96,9 @@ class VideoPhotos(NamedTuple):
 def photos_of_videos(
     images: Path, masks: Path | None, place: Path, every: int = 1, most: int | None = None
 ) -> Generator[VideoPhotos]:
-    """Yields folders of photos and masks. If a folder holds videos, their frames are written to a
-    temporary folder beside `place`, which is removed at the end. Folders of photos are yielded
-    unchanged.
+    """Yields folders of photos and masks. If a folder holds videos, a temporary folder with their
+    frames is yielded instead. It lies beside `place`, and is removed at the end. Folders of photos
+    are yielded unchanged.
 
     Phones store photos and the clips of Live Photos in one folder. If a folder holds both, the
     photos count, unless `every` or `most` is given.
@@ -107,7 +111,9 @@ def photos_of_videos(
             is 0.
         most: largest number of photos of a camera. None: all.
     Raises: CaptureError if `every` or `most` is given and there is no video, if `masks` is given
-    and a camera has only a video of photos or only one of masks, or if a video cannot be read.
+    and a camera has only a video of photos or only one of masks, if two videos have the same
+    camera, or if a video cannot be read. See `named_after` for errors that are raised inside the
+    block.
     """
     # videos of photos, and those of masks, where there are any
     asked = every != 1 or most is not None
@@ -168,11 +174,11 @@ def _meant_videos(folder: Path, asked: bool) -> dict[str, Path]:
 
 @contextlib.contextmanager
 def named_after(temporary: Path, folder: Path) -> Generator[None]:
-    """Context manager that corrects the path in errors. If a ValueError is raised inside and its
-    message names the temporary folder, the message gets the path of `folder`. The temporary folder
-    no longer exists when the user reads the message.
+    """Replaces the path of the temporary folder in error messages by that of `folder`, because the
+    temporary folder no longer exists when the user reads the message. This is a context manager.
 
-    Raises: CaptureError with the replaced path.
+    Raises: CaptureError with the new message, if a ValueError that names the temporary folder is
+    raised inside.
     """
     try:
         yield
@@ -187,8 +193,8 @@ def _moments(
     videos: Mapping[str, Path], every: int, most: int | None
 ) -> tuple[Moments | None, float | None]:
     """Returns the moments of several videos, and how many seconds at the start of each video were
-    read. The moments are None for a single video, or if only the first frames are taken. The
-    seconds are None if whole videos were read.
+    read. Both are None for a single video, and if only the first frame of each video is taken. The
+    seconds are also None if whole videos were read.
     """
     if len(videos) < 2 or most == 1:
         return None, None
@@ -204,11 +210,11 @@ def _moments(
 def _mask_frames(
     path: Path, camera: str, moments: Moments, seconds: float | None
 ) -> list[int | None]:
-    """Returns for each moment the index of the frame in a video of masks. None if the moment has no
-    photo or no mask.
+    """Returns for each moment the index of the frame in a video of masks. None if the camera has no
+    photo or no mask of the moment.
 
-    If the videos of masks and of photos have the same number of frames, or if the masks' times are
-    not known, a mask has the index of its photo. Otherwise masks are found by their times.
+    If the videos of masks and of photos have the same number of frames, or if a time of the masks
+    is not known, a mask has the index of its photo. Otherwise masks are found by their times.
     """
     times = frame_times(path, seconds)
     if len(times) == moments.counts[camera] or not np.isfinite(times).all():
@@ -254,14 +260,16 @@ def split_video(
     number of pixels in the written frames.
 
     Args:
+        path: the video.
+        folder: the new folder.
         every: step between frames.
         most: largest number of frames. None: all.
         before: number of pixels in frames of other videos. They count towards the limit
             `video_pixels`.
-        chosen: index of the frame for each file, ascending, in place of `every` and `most`. None in
-            this list: the file is not written.
-        mask_of: the video of photos, if `path` is a video of its masks. Masks are scaled to the
-            pixel shape of that video, and their values are not converted as colors.
+        chosen: index of the frame for each file, ascending. If given, `every` and `most` are
+            ignored. None in this list: the file is not written.
+        mask_of: the video of photos, if `path` is a video of their masks. The values of masks are
+            not converted as colors. Their pixels are made square, see `_shown_as_mask`.
     Raises: CaptureError with the name of the video.
     """
     with reading(path, "video", CaptureError):
@@ -300,8 +308,8 @@ def _write_chosen(path: Path, folder: Path, chosen: Sequence[int | None], shown:
 def _expression(numbers: Sequence[int]) -> str:
     """Returns the ffmpeg expression that selects the frames with these numbers.
 
-    Raises: InvalidFileError if the numbers consist of more than 2000 arithmetic progressions, which
-    is too long for a command line.
+    Raises: InvalidFileError if the numbers consist of more than 2000 arithmetic progressions,
+    because the expression would be too long for a command line.
     """
     terms = []
     for first, step, last in progressions(numbers):
@@ -335,8 +343,9 @@ def _frame_size(path: Path, shown: _Shown) -> tuple[int, int]:
 _STREAM = re.compile(r"^ *Stream #0:\d+.*?: Video: (.*)$", re.MULTILINE)
 """Regular expression of the line that ffmpeg prints about the video stream."""
 COLORS = re.compile(r"\b\w+\((?:\w+, )?([\w-]+)/([\w-]+)/([\w-]+)[,)]")
-"""Regular expression of matrix, primaries and transfer curve in that line. They follow the pixel
-format: yuv420p10le(tv, bt2020nc/bt2020/arib-std-b67, progressive).
+"""Regular expression of matrix, primaries and transfer curve in the line that ffmpeg prints about
+the video stream. They follow the pixel format: yuv420p10le(tv, bt2020nc/bt2020/arib-std-b67,
+progressive).
 """
 _PIXEL_SHAPE = re.compile(r"\[SAR (\d+):(\d+) ")
 """Regular expression of the sample aspect ratio, a pixel's width to its height."""
@@ -363,8 +372,8 @@ _TABLE = "colors.cube"
 def _shown(path: Path) -> _Shown:
     """Returns how the frames of a video have to be converted, from what ffmpeg prints about it.
 
-    Raises: OSError if the file cannot be read. InvalidFileError if a pixel is longer than
-    `_WIDEST_PIXEL` times its other side.
+    Raises: OSError if the file cannot be read. InvalidFileError if it is no regular file or too
+    large, or if a pixel's longer side is more than `_WIDEST_PIXEL` times its shorter side.
     """
     open_file(path).close()
     # without an output ffmpeg fails, after it has printed what is there
@@ -410,8 +419,9 @@ def _shown_as_mask(path: Path, photos: Path) -> _Shown:
     """Returns how the frames of a video of masks have to be converted. Their values are not
     converted as colors.
 
-    If the video of masks states no pixel shape, and its stored frames are as large as those in the
-    video of photos, it is scaled to the size that the photos have with square pixels.
+    Usually pixels get square by the shape that the video of masks states. If it states none or
+    square pixels, the video of photos states others, and the stored frames of both have the same
+    size, masks are scaled to the size that the photos have with square pixels.
     """
     own, theirs = _shown(path), _shown(photos)
     as_stored = _Shown()
@@ -442,7 +452,7 @@ def _check_pixels(pixels: int, count: int, width: int, height: int) -> None:
 
 def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
     """Writes frames of a video as frame_00000017.png, ... into a new folder. chosen: numbers of the
-    frames, from 0 and ascending.
+    frames, counted from 0, ascending.
 
     Raises: CaptureError with the name of the video.
     """
@@ -456,8 +466,8 @@ def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
 
 
 def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"]]:
-    """Yields all frames of a video, one after the other, in grey, (h, w). longer_side: largest
-    longer side, pixels. Larger frames are shrunk.
+    """Yields all frames of a video, one after the other, in grey, (h, w). Frames with a longer side
+    of more than `longer_side` pixels are shrunk to this size.
 
     Raises: CaptureError with the name of the video.
     """
@@ -468,8 +478,8 @@ def color_frames(
     path: Path, longer_side: int, chosen: Sequence[int] | None
 ) -> Iterator[UInt[np.ndarray, "h w 3"]]:
     """Yields frames of a video in the stored colors, (h, w, 3). Frames with a longer side of more
-    than `longer_side` pixels are shrunk to this size. chosen: numbers of the frames, from 0 and
-    ascending. None: all.
+    than `longer_side` pixels are shrunk to this size. chosen: numbers of the frames, counted from
+    0, ascending. None: all.
 
     Raises: CaptureError with the name of the video.
     """
