@@ -92,8 +92,8 @@ class FaceAndHands:
     def face(
         self, photo: Float[np.ndarray, "h w 3"], body: Float[np.ndarray, "33 2"]
     ) -> Float[np.ndarray, "51"] | None:
-        """Returns the scores of `SHAPE_NAMES` for a person's face, (51,), or None if no face is
-        seen, or the face is too small.
+        """Returns the scores of `SHAPE_NAMES` for a person's face, (51,). None if no face is seen,
+        or if its region is smaller than `SMALLEST`.
 
         photo: values in [0, 1]. body: BlazePose's landmarks of the person, (33, 2), pixels.
         """
@@ -118,7 +118,7 @@ class FaceAndHands:
         visibility: Float[np.ndarray, " 33"],
     ) -> tuple[Hand | None, Hand | None]:
         """Returns the left and the right hand of a person. None stands for a hand that is not
-        found, or that has a hidden wrist.
+        found, or whose wrist has a visibility below 0.5.
 
         photo: values in [0, 1]. body and visibility: BlazePose's landmarks of the person, (33, 2),
         pixels, and their visibilities, (33,).
@@ -173,8 +173,8 @@ def hand_columns(
     The columns are x and y in pixels, the presence, and x, y and z in metres. The rows of a hand
     that was not found are 0. None if neither was found.
 
-    body: BlazePose's landmarks in space, (33, 3), metres. Each hand is moved so that its wrist lies
-    at the wrist of the body.
+    body: BlazePose's landmarks in space, (33, 3), metres. In space, each hand is moved so that its
+    wrist lies at the wrist of the body.
     """
     if hands == (None, None):
         return None
@@ -238,8 +238,8 @@ def _palm_region(points: Float[np.ndarray, "21 2"]) -> Crop:
 
 
 def _around(points: Float[np.ndarray, "n 2"], angle: float, enlarged: float) -> Crop:
-    """Returns the smallest square with a given angle (radians) that contains points, (n, 2),
-    pixels, with its side multiplied by `enlarged`.
+    """Returns a square around points, (n, 2), pixels. It is the smallest square with the given
+    angle (radians) that contains the points, but with its side multiplied by `enlarged`.
     """
     turned = Crop(np.zeros(2), 1.0, angle)
     own = points @ turned.turn

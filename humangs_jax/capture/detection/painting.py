@@ -16,12 +16,13 @@ def painted_over(
     photo: Float[np.ndarray, "h w 3"], covered: Bool[np.ndarray, "h w"], margin: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Returns the photo with covered pixels replaced by the colors around them, and which pixels
-    were replaced, (h, w). `margin` makes the replaced area a little larger than the covered one.
+    were replaced, (h, w). The replaced area is a little larger than the covered area, because
+    pixels just outside may still show the person.
 
     A plain color would have an outline, which the detector takes for the outline of a person.
 
     Arguments: margin: how far the replaced area reaches beyond the covered pixels, as a share of
-    the photo's longer side. The pixels just outside may still show the person.
+    the photo's longer side.
     """
     height, width = photo.shape[:2]
     # the detector sees no more than 512 pixels

@@ -1,5 +1,5 @@
-"""Finds all people in a photo with BlazePose (https://arxiv.org/abs/2006.10204), even small people,
-and whichever way up the photo is.
+"""Finds all people in a photo with BlazePose (https://arxiv.org/abs/2006.10204). It also finds
+small people, and people in photos that are not upright.
 
 The result for each person is 33 landmarks in the image, 33 landmarks in metres, and a mask.
 
@@ -15,9 +15,9 @@ Pixels are mediapipe's: (x, y), with the centre of the first pixel at 0. `apps.d
 pixel for our convention.
 
 The detector finds people who are at least a third as large as its window. So it looks at the whole
-photo and at windows of half the photo's longer side, which overlap by half. If nobody large is
-found there, it also looks at windows of a quarter. Detections in several windows count as one
-person if hips and size agree.
+photo and at windows of half the photo's longer side. If nobody large is found there, it also looks
+at windows of a quarter of the longer side. Neighbouring windows overlap by half. Detections in
+several windows count as one person if hips and size agree.
 
 If people stand close together, the detector finds only some of them. So the people who were found
 are painted over with the colors around them, and the detector looks again, until it finds nobody
@@ -271,8 +271,9 @@ def bilinear(
 def refined(
     points: Float[np.ndarray, "n 2"], heatmaps: Float[np.ndarray, "m m n"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Returns points, (n, 2), in [0, 1]. Each is moved to the centroid of its heatmap in a window
-    around the point. A point stays if its heatmap has no peak in this window.
+    """Returns points, (n, 2), on the scale on which the heatmap reaches from 0 to 1. Each point is
+    moved to the centroid of its heatmap in a window around the point. A point stays if its heatmap
+    has no peak in this window, or if it lies outside of the heatmap.
     """
     size, half, moved = len(heatmaps), WINDOW // 2, points.copy()
     for i, (column, row) in enumerate(np.trunc(points * size).astype(int)):
@@ -429,17 +430,17 @@ class _SearchConfig:
     """The smaller windows are used only if nobody's crop has at least this share of the photo's
     longer side.
 
-    Windows of half the longer side find people from a sixth of that side on, and their crops are a
-    fifth of it. So a person who is found only in smaller windows has at most a quarter of the
-    pixels of a large person, and is not the main person of the photo.
+    Windows of half the longer side find people who are at least a sixth as large as the longer
+    side, with crops of a fifth of it. So a person who is found only in smaller windows has at most
+    a quarter of the pixels of a large person, and is not the main person of the photo.
     """
     smallest: float = 0.06
     """Smallest side of a crop, as a share of the photo's longer side. Smaller detections are people
     in the background, or nobody.
     """
     most_crops: int = 16
-    """Largest number of detections in one search that the landmark network looks at. The best ones
-    come first.
+    """Largest number of detections in one search that the landmark network looks at. Only those
+    with the best scores are kept.
     """
     same_hips: float = 0.15
     """Two detections can be one person if their hips are nearer than this share of the larger
@@ -531,8 +532,8 @@ def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[L
 def _hidden_people(
     networks: Networks, photo: Float[np.ndarray, "h w 3"], found: list[Landmarks], margin: float
 ) -> list[Landmarks]:
-    """Returns the people that the detector finds when the people in `found` are painted over. The
-    new people's masks are 0 where the masks of the people in `found` are 1.
+    """Returns the further people that are found when the people in `found` are painted over. Their
+    masks are 0 where the masks of the people in `found` are 1.
     """
     height, width = photo.shape[:2]
     painted, covered = _painted_over(photo, found, margin)
@@ -550,8 +551,8 @@ def _hidden_people(
 def _painted_over(
     photo: Float[np.ndarray, "h w 3"], found: list[Landmarks], margin: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Returns a photo in which people are replaced by the colors around them, and which pixels were
-    replaced, (h, w).
+    """Returns a photo in which the people in `found` are replaced by the colors around them, and
+    which pixels were replaced, (h, w). margin: as in `painted_over`.
     """
     height, width = photo.shape[:2]
     covered = np.zeros((height, width), bool)
@@ -613,7 +614,7 @@ def _settled(
 ) -> tuple[Landmarks, float]:
     """Looks at a person several times with the landmark network. Returns the landmarks of the last
     look, and the drift: how far the next crop would be from the last one in position and size, as a
-    share of the crop's side.
+    share of the crop's side. The drift is infinite after a single look.
 
     Each look gives the crop of the next one. This ends when the crop hardly moves, when the
     presence is low, or after `SEARCH.most_looks` looks. There are at least two looks if the
@@ -674,8 +675,9 @@ def _starts(size: int, side: float) -> Float[np.ndarray, " n"]:
 
 
 def distinct(detections: list[Detection], longest: int) -> list[Detection]:
-    """Returns the best detection of each person. Detections smaller than `SEARCH.smallest` are left
-    out. detections: ordered, the best first. longest: longer side of the photo, pixels.
+    """Returns the best detection of each person. Detections with a crop smaller than
+    `SEARCH.smallest` are left out. detections: ordered, the best first. longest: longer side of the
+    photo, pixels.
     """
     kept: list[Detection] = []
     for detection in detections:

@@ -1,8 +1,8 @@
 """Moves the edges of the detector's masks to the edges of the photo.
 
 The masks have 256 pixels a side. They are sharpened by a guided filter (He, Sun, Tang, Guided image
-filtering, 2013). Within each of its windows the mask is an affine function of the photo's colors.
-The functions are fitted to a reduced photo (Fast guided filter, 2015).
+filtering, 2013). In each window of the filter, the mask is an affine function of the photo's
+colors. The functions are fitted to a reduced photo (Fast guided filter, 2015).
 """
 
 import numpy as np
@@ -59,8 +59,8 @@ def sharpened(
 
 
 def filter_margin(pixel: float) -> int:
-    """Returns the width of the margin around the mask in which `sharpened` also reads the photo,
-    pixels of the photo. pixel: see `sharpened`.
+    """Returns the width of a margin, pixels of the photo. `sharpened` reads the photo where the
+    mask is above 0, and in this margin around it. pixel: see `sharpened`.
     """
     return int(np.ceil(2 * _RADIUS * pixel))
 
@@ -68,9 +68,9 @@ def filter_margin(pixel: float) -> int:
 def _affine(
     guide: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], radius: int
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """Returns slopes, (h, w, 3), and offsets, (h, w), such that the mask is about slopes * colors +
-    offset at each pixel. They are the means of the coefficients of all windows that contain the
-    pixel. radius: half side of the windows, pixels.
+    """Returns slopes, (h, w, 3), and offsets, (h, w). At each pixel, the mask is about the sum of
+    slopes * colors, plus the offset. Slopes and offsets are the means of the coefficients of all
+    windows that contain the pixel. radius: half side of the windows, pixels.
     """
     side = 2 * radius + 1
 

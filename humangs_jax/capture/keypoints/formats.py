@@ -1,5 +1,5 @@
-"""Reads files of keypoints: ours, OpenPose's, EasyMocap's, COCO's (also AlphaPose's and
-COCO-WholeBody's) and MMPose's.
+"""Reads files of keypoints: our own, and those of OpenPose, EasyMocap, COCO (also AlphaPose and
+COCO-WholeBody) and MMPose.
 
 Only our files have the centre of the first pixel at (0.5, 0.5). There are two kinds of our files.
 `save_keypoints` writes the keypoints of one person: an npz of points (v, k, 2), confidences (v, k),
@@ -66,8 +66,8 @@ def recognizes_own(source: KeypointFile) -> bool:
 
 
 def read_own(source: KeypointFile, format: SourceFormat) -> Detections:
-    """Returns the keypoints in one of our files, of one person or of all people. If a person is not
-    in an image, the confidences there are 0.
+    """Returns the people in one of our files. An npz file has one person. If a person is not in an
+    image, the confidences there are 0.
 
     Raises: CaptureError if the file is not valid.
     """
@@ -86,8 +86,8 @@ def read_own(source: KeypointFile, format: SourceFormat) -> Detections:
 
 
 def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
-    """Writes keypoints of one person in our own format (.npz). The file has points, confidences,
-    the name of the set, and the names of the views. It has no 3D landmarks.
+    """Writes the keypoints of one person in our own format (.npz). The file has points,
+    confidences, the name of the set, and the names of the views. It has no 3D landmarks.
 
     names: one name for each view, as in the capture.
     Raises: ValueError if the path does not end in .npz, or if there is not one name per view.
@@ -351,9 +351,9 @@ def _openpose_person(person: Any, file: Path, field: str, own: bool) -> Float[np
 def _parts(
     person: dict[str, Any], counts: dict[str, int], file: Path, field: str
 ) -> Float[np.ndarray, "k 3"]:
-    """Returns the points of all parts of a person, one after the other, (k, 3). The points of a
-    part are 0 if its key is missing, null or an empty list, because the part was not detected.
-    counts: number of points of each part, by its key.
+    """Returns the points of all parts of a person, one after the other, (k, 3). If the key of a
+    part is missing, null or an empty list, the part was not detected, and its points are 0. counts:
+    number of points of each part, by its key.
     """
     points = []
     for key, count in counts.items():
@@ -377,6 +377,7 @@ def read_easymocap(source: KeypointFile, format: SourceFormat) -> Detections:
     """Returns the people of one image, ordered by their personID. An ID counts if it is a whole
     number from 0 to 63 and no earlier person has it. If an entry has no ID, its index in the list
     takes the place of the ID. People whose ID does not count get the lowest numbers that are free.
+    A number that nobody has stands for a person whose points are all 0.
 
     Raises: CaptureError if the file is not valid.
     """
@@ -510,8 +511,8 @@ def _image_label(value: Any, file: Path, field: str) -> str | int:
 
 
 def _whole_body(entries: list[Any]) -> bool:
-    """Returns whether any person has a part of COCO-WholeBody in addition to the body. If so,
-    people without a part get its points with confidence 0.
+    """Returns whether any person has a part of COCO-WholeBody in addition to the body. If so, the
+    points of parts that a person lacks are 0.
     """
     return any(
         isinstance(entry, dict) and len(_COCO_PARTS.keys() & entry.keys()) > 1 for entry in entries
@@ -534,7 +535,7 @@ def _by_visibility(
     confidence is 1 for a visible point, 0.5 for a hidden one, and 0 for one without annotation.
     person: x, y and visibility, (k, 3).
 
-    COCO-WholeBody also has fractions as visibilities, and any value above 0 means that the point is
+    COCO-WholeBody also has fractions as visibilities. Any fraction above 0 means that the point is
     reliable.
     Raises: CaptureError for values outside of 0 to 2.
     """

@@ -78,12 +78,12 @@ class KeypointSet:
     image.
     """
     places: tuple[LandmarkDefinition, ...] = ()
-    """Places of the points that need not lie where `body.landmarks` has them: the detector is known
-    to see them elsewhere, or a fit may find that it does.
+    """Places of the points that a fit may move. Each starts at its offset from a landmark of
+    `body.landmarks`. The offset is 0 if it is not known where the detector sees the point.
     """
     certainty: tuple[float, ...] = ()
-    """Certainty of each point as a fit has found it, (k,). It is the noise of all points, divided
-    by the noise of this one. If it is empty, `usual_certainty` is used.
+    """Certainty of each point as a fit has found it, (k,): the noise of all points, divided by the
+    noise of this one. If the tuple is empty, `usual_certainty` is used.
     """
 
     @property
@@ -182,7 +182,7 @@ OPENPOSE_60 = _keypoint_set(
     "openpose60",
     (*_BODY_25[:8], *_BODY_25[9:19], *hand_names("left"), *hand_names("right")),
 )
-"""The 18 points of OpenPose's COCO model with both hands."""
+"""The 18 points of OpenPose's COCO model, and its 21 points of the left and of the right hand."""
 
 OPENPOSE_67B = _keypoint_set(
     "openpose_b67",
@@ -357,8 +357,8 @@ class KeypointFile:
     image or video.
     """
     alone: bool
-    """Whether no other file is read. If so, the frames of a video are named by their number. If
-    not, they are named name/number.
+    """Whether no other file is read with this one. If so, the frames of a video are named by their
+    number. If not, they are named name/number.
     """
 
     @functools.cached_property

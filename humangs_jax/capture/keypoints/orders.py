@@ -72,8 +72,8 @@ class _Known:
 
     shorter: float = 1.15
     """An order is clear only if every other order makes the mean length of the bones larger by at
-    least this factor. This holds for 99 % of single people in random poses, seen from anywhere,
-    with errors of 1 % of their height.
+    least this factor. This holds for 99 % of single people in random poses that are seen from
+    anywhere, if the points have errors of 1 % of the person's height.
     """
     longest: float = 0.36
     """An order is clear only if the mean length of its bones is at most this, as a share of the

@@ -45,17 +45,17 @@ class _Plausible:
     coordinates are shares of the image, and are refused.
     """
     largest_pixel: float = 1e6
-    """Larger coordinates are replaced by this one, pixels. They have no meaning, and could become
-    inf in float32.
+    """Coordinates of a larger magnitude are limited to this, pixels. They have no meaning, and
+    could become inf in float32.
     """
     outside: float = 0.5
     """Largest distance of a point from its image, as a share of the image's size. Detectors
     extrapolate a little beyond the image, but points farther out have no meaning.
     """
     overshoot: float = 1.1
-    """Up to this score, scores are on the scale [0, 1]. Heat maps exceed 1 a little (1.02 is
-    common) and can be below 0. If a file has larger scores, such as the maxima of SimCC heads
-    (RTMPose, RTMW, DWPose), all of its scores are divided by the largest.
+    """If the largest score is at most this, scores are on the scale [0, 1]. Heat maps exceed 1 a
+    little (1.02 is common) and can be below 0. If there are larger scores, such as the maxima of
+    SimCC heads (RTMPose, RTMW, DWPose), all scores are divided by the largest.
     """
     largest_score: float = 20.0
     """Largest number that can be a score."""
@@ -143,7 +143,8 @@ def read_keypoints(
         names: names of the capture's views. Images of the file are matched by name, or by the
             number in the name if the file has only numbers. Images that match no view are ignored.
         width, height: size of the capture's photos, pixels. The keypoints have to be in photos of
-        this size, or in photos of several sizes that were padded to it when they were imported.
+            this size, or in photos of several sizes that were padded to this size when they were
+            imported.
         person: number of the person to take if several people are seen, from 0 in the order of the
             file. None: the only person.
 
@@ -212,7 +213,7 @@ def _read(
 
 def _largest_score(detections: Detections) -> float:
     """Returns the score that becomes confidence 1. It is 1 if scores are on the scale [0, 1], else
-    the largest score of the file.
+    the largest of all scores.
     """
     scores = np.concatenate([each[:, 2] for image in detections.images for each in image.people])
     largest = float(scores[np.isfinite(scores)].max(initial=0.0))
@@ -228,8 +229,8 @@ def _chosen_people(
     person: int | None,
 ) -> list[int | None]:
     """Returns the index of the chosen person in each view. None if the view does not show this
-    person. If `person` is given, it is the index. If it is None, the person with the largest sum of
-    confidences of trunk and limbs is chosen, and all others have to be ghosts.
+    person. If `person` is given, it is the index. If `person` is None, the person with the largest
+    sum of confidences of trunk and limbs is chosen, and all others have to be ghosts.
 
     Raises: CaptureError if `person` is None and a view shows several people, or if `person` is
     given and no view has that many people.
@@ -302,8 +303,9 @@ def _images_of_views(
 ) -> list[DetectedImage | None]:
     """Returns the image of each view, or None for a view without an image in the file.
 
-    Raises: CaptureError if an image of a view has another size than the photos, if no image matches
-    a view, or if it is not clear which image matches a view.
+    Raises: CaptureError if an image of a view has another size than the photos (unless an import
+    can have padded the images to the size of the photos), if no image matches a view, or if it is
+    not clear which image matches a view.
     """
     try:
         views = match_views([image.image for image in detections.images], names)
@@ -387,15 +389,16 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
 
     Views have names like "front" or "000012". If these would be ambiguous, the names are like
     "images_cam0_000012", with folders joined by _. Images of keypoint files have names like
-    "front.jpg", "cam0/000012.png" and "cam0_000000000012" (OpenPose counts a video's frames in
-    twelve digits). Or they are only numbers (COCO's image ids, the frames of a video).
+    "front.jpg", "cam0/000012.png" and "cam0_000000000012" (OpenPose writes the number of a video's
+    frame with twelve digits). Or they are only numbers (COCO's image ids, the frames of a video).
 
     Frames of a video may be counted from 0 and its photos from 1 (ffmpeg), or the reverse. If there
     are as many frames as photos, without gaps, they are matched in order, for each video
     separately.
 
-    Images that are only numbers are matched in order, whatever the first number is, if there is one
-    for every view, and if neither these numbers nor the last numbers in the views' names have gaps.
+    An image that is only a number matches the view with this last number in its name. But if there
+    is such an image for every view, and neither the images nor the last numbers of the views have
+    gaps, they are matched in order, whatever the first numbers are.
 
     Raises: ValueError if two images match one view, or if a number matches two views.
     """
@@ -426,9 +429,9 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
 
 
 def _shift_of_numbers(images: Sequence[str | int], names: Sequence[str]) -> int:
-    """Returns what has to be added to images that are only numbers to get the numbers in the views'
-    names. It is 0, unless there is one such image for every view, and neither images nor names have
-    gaps in their numbers.
+    """Returns the number that has to be added to images that are only numbers, so that they equal
+    the last numbers in the views' names. It is 0, unless there is one such image for every view,
+    and neither images nor names have gaps in their numbers.
     """
     numbers = sorted({image for image in images if isinstance(image, int)})
     of_names = sorted(number for number in map(_last_number, names) if number is not None)
@@ -443,9 +446,9 @@ def _recounted_videos(
     names: Sequence[str],
     find: Callable[[str | int], list[int]],
 ) -> dict[str | int, list[int]]:
-    """Returns, by name of the image, the views of video frames that are counted from 0 if the
-    photos are counted from 1, or the reverse. Other images are left out. found: the views of each
-    image without such a correction.
+    """Returns the views of video frames whose numbers differ from those of the photos by one, by
+    name of the image. Frames are counted from 0 and photos from 1, or the reverse. Other images are
+    left out. found: the views of each image without this correction.
     """
     videos: dict[str, list[tuple[int, str]]] = {}
     for image in found:
@@ -474,8 +477,8 @@ def _recounted_videos(
 
 
 def _finder(names: Sequence[str]) -> Callable[[str | int], list[int]]:
-    """Returns a function that finds the views of an image from its name or number. For a name it
-    returns one view or none. For a number it may return several.
+    """Returns a function that takes the name or number of an image and returns the indices of its
+    views. For a name it returns one view or none. For a number it may return several.
     """
     exact = {name: [i] for i, name in enumerate(names)}
     plain, ends, numbers = (collections.defaultdict(list) for _ in range(3))
