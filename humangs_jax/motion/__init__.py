@@ -2,9 +2,10 @@
 
 `load_motion` reads any format of the table `data.formats.MOTIONS`. A motion in memory
 (`body.motion.Motion`) has axis-angles in radians; lengths are in metres, and y is up. It has
-SMPL-X's 55 joints, except from files of this package for other bodies. `arrays` reads files of
-arrays by key, `clips` reads skeletons of other programs, which `skeleton` converts to our joints,
-and `face_files` reads faces. `rules` has the tables that all readers and the page share.
+SMPL-X's 55 joints. Only motions of other bodies, in files of this package, have other joints.
+`arrays` reads files of arrays by key. `clips` reads skeletons of other programs, and `skeleton`
+converts them to our joints. `face_files` reads faces. `rules` has the tables that all readers and
+the page share.
 """
 
 import logging
@@ -59,7 +60,7 @@ class Reading(NamedTuple):
     """The arguments of `load_motion` that readers need."""
 
     fps: float | None = None
-    """Frames per second that replace the rate in the file; None: the file's rate."""
+    """Frames per second, in place of the rate in the file. None: the file's rate."""
     person: int | None = None
     """Number of the person, in a file of several."""
     clip: str | None = None
@@ -82,7 +83,7 @@ class Poses(NamedTuple):
     fixed: bool = False
     """Whether `up` is certain. The poses are then not examined, see `rules.up_axis`."""
     also: tuple[str, ...] = ()
-    """Other axes that are up in some files of the format, see `rules.up_axis`."""
+    """Further axes that are up in some files of the format, see `rules.up_axis`."""
     frames: np.ndarray | None = None
     """Numbers of the frames, (m,); gaps between them are filled. None: they are consecutive."""
     note: str = ""
@@ -108,10 +109,11 @@ def load_motion(
         up: axis that points up in the file's world ("y", "-y", "z" and so on). The motion is
             turned so that y points up. "auto": the axis that is usual in the format, unless people
             stand along another axis (`rules.up_axis`). A warning then names that axis.
-        fps: frames per second that replace the rate in the file.
+        fps: frames per second, in place of the rate in the file.
         rest_joints: joints of the body that will move, in T-pose, metres, such as
             `avatar.rest_joints`. Skeletons of other programs are converted to this body. A motion
-            with another number of joints is refused. None: the shipped body.
+            with another number of joints raises an error. None: skeletons are converted to the
+            shipped body, and the number of joints is not checked.
         person: the number of the person, in a file of several people.
         clip: the name or number of the animation, in a GLB file of several. None: the first.
 
@@ -207,13 +209,15 @@ def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array
 
 
 def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motion, str]:
-    """Fills frames in which nobody was seen, by interpolation between the frames around them.
+    """Fills frames in which nobody was seen, by interpolation between the frames around them. The
+    motion stays as it is if the steps between numbers of frames are not multiples of the smallest
+    step.
 
     frames: number of each frame of the motion, (m,). Returns: the motion, and a note about filled
     frames, "" if none was filled.
 
-    Raises: MotionError if the numbers of the frames do not increase; InvalidFileError for more
-    frames than the limit.
+    Raises: MotionError if the numbers of the frames do not increase or are not finite;
+    InvalidFileError for more frames than the limit.
     """
     steps = np.diff(np.asarray(frames, float))
     if not len(steps):

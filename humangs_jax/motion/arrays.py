@@ -3,7 +3,7 @@
 The names (keys) decide the format; the table in `data.formats` has the keys of each. Poses have 55
 joints in SMPL-X (165 numbers), 52 in SMPL-H (156), and 24 in SMPL (72), of which the last two are
 whole hands. The body alone is 22 joints (66 numbers). Rotations are axis-angles, or matrices, which
-have three times as many numbers. Rotations that a file does not have (fingers, eyes) are 0.
+have three times as many numbers. Rotations that are not in a file (fingers, eyes) are 0.
 """
 
 from pathlib import Path
@@ -101,11 +101,11 @@ _EXPRESSIONS = ("expressions", "expression", "expressionParameters", "expr")
 def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
     """Returns the expressions of a person, or None if the file has none.
 
-    count: number of frames. If expressions in a file of another program do not fit the frames, a
-    note is added and None is returned.
+    count: number of frames. If expressions in a file of another program do not fit the frames or
+    are too large, a note is added and None is returned.
 
     Raises: InvalidFileError if expressions in a file of this package do not fit the frames or are
-    too large; MotionError if they are no numbers.
+    too large; MotionError if expressions of any file are no numbers.
     """
     ours = form.kind == "ours"
     key = "expressions" if ours else file.first(_EXPRESSIONS)
@@ -133,9 +133,10 @@ def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
 
 
 def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
-    """Returns the person with this number, or the only person.
+    """Returns the person with this number. If no number is given, returns the only person.
 
-    Raises: MotionError, which lists the people, if the number is missing or fits no person.
+    Raises: MotionError, which lists the people, if nobody has this number, or if there is no number
+    and more than one person.
     """
     names = [person.name for person in people]
     if number is None and len(people) == 1:
@@ -160,7 +161,7 @@ def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
 
 
 def _frames(person: Person) -> int:
-    """Returns the number of frames that show the person; 0 if the format is unknown."""
+    """Returns the number of frames that show the person. It is 0 if the format is unknown."""
     form = format_of(person.values)
     if form:
         return max(len(np.atleast_1d(as_array(person.values[key]))) for key in form.keys)
@@ -217,8 +218,8 @@ def _part(
     values: np.ndarray,
     flat: Float[np.ndarray, "m columns"],
 ) -> _Rotations:
-    """Returns the rotations of one part of the body, (m, joints, 3). If the file gives hands as
-    coefficients of a hand model, their rotations are 0, and a note is added.
+    """Returns the rotations of one part of the body, (m, joints, 3). If a hand has fewer than 45
+    numbers, which are coefficients of a hand model, its rotations are 0, and a note is added.
 
     place: name of the part in `PLACES`. values: the array under the key. flat: the same array with
     one row for each frame.
@@ -315,10 +316,10 @@ def _axis_angles(
 def _placed(
     file: "_MotionFile", form: ArrayKeys, rotations: _Rotations
 ) -> Float[np.ndarray, "m 3"]:
-    """Returns the translations (m, 3), metres.
+    """Returns the translations of the body, (m, 3), metres.
 
     If the file has cameras, translations and the root's rotations are converted from the axes of
-    the camera to the world. The root's rotations are changed in place.
+    the camera to the world. The root's rotations in `rotations` are changed in place.
 
     Raises: MotionError if the positions are missing or wrong.
     """
@@ -422,15 +423,15 @@ class _MotionFile(ArrayFile):
         return next((key for key in keys if key in self.values), keys[0])
 
     def of_camera(self, moves: tuple[str, ...]) -> bool:
-        """Says whether the file's positions are in the coordinates of a camera. moves: keys of
-        positions, of which the first that the file has is used.
+        """Says whether the file's positions are in the coordinates of a camera. moves: keys that
+        positions may have. The first one that the file has counts.
         """
         key = self.first(moves)
         return key in CAMERA_MOVES and key in self.values
 
     def rate(self, form: ArrayKeys) -> float:
-        """Returns the frames per second that the user gave. If there are none, returns the rate of
-        the file, or else the default of the format.
+        """Returns the frames per second that the user gave. If the user gave none, returns the rate
+        of the file, or else the default of the format.
 
         Raises: MotionError if there is none of these, or if the file's rate is not positive.
         """
@@ -537,10 +538,11 @@ def _of_frames(
 def _carried(
     places: Float[np.ndarray, "m s 3"], parents: tuple[int, ...]
 ) -> Float[np.ndarray, "m s 3 3"]:
-    """Returns rotations of the bones relative to the first frame, for a file with points alone.
+    """Returns the rotations of the joints from the first frame to each frame, (m, s, 3, 3), for a
+    file with points alone.
 
-    They are the smallest rotations that move the bones from their directions in the first frame,
-    applied from the root down.
+    A joint turns as the joint above it. Then it gets the smallest turns that make its bones point
+    as in the frame, one bone after the other.
     """
     turns = np.tile(np.eye(3), (*places.shape[:2], 1, 1))
     for i, p in enumerate(parents):

@@ -3,13 +3,13 @@
 A BVH file (https://research.cs.wisc.edu/graphics/Courses/cs-838-1999/Jeff/BVH.html) has a tree of
 joints with offsets and channels, then the numbers of each frame. Rotations are degrees about the
 axes of the channels, in their order: R = R_first R_second R_third. Position channels replace the
-offset, or in files of MakeHuman are added to it. In the rest pose all rotations are 0. A joint's
-name may have spaces: it ends with its line or before a brace.
+offset. In files of MakeHuman they are added to it. In the rest pose all rotations are 0. A joint's
+name may have spaces: the name ends with its line or before a brace.
 
 Of a GLB file (https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations), one animation
 is read, for the joints of the skin. The rest pose is the one in which the skin was bound to the
-mesh (inverse bind matrices), or the pose of the nodes if there is no skin. Splines are taken at
-their keys and interpolated linearly.
+mesh (inverse bind matrices). Without these matrices it is the pose of the nodes. Splines are taken
+at their keys and interpolated linearly.
 """
 
 import re
@@ -184,7 +184,8 @@ def _posed(
 ) -> tuple[Float[np.ndarray, "m s 3 3"], Float[np.ndarray, "m s 3"]]:
     """Returns rotations (m, s, 3, 3) and places (m, s, 3) of the joints in the world.
 
-    numbers: a row for each frame, with the channels of all joints one after the other.
+    parents, offsets, channels: as `_tree` returns them. numbers: a row for each frame, with the
+    channels of all joints one after the other.
     """
     frames = len(numbers)
     turns, moves = np.empty((frames, len(parents), 3, 3)), np.empty((frames, len(parents), 3))
@@ -218,9 +219,8 @@ def _posed(
 
 
 def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
-    """Returns the moving skeleton of a GLB file, with its face, or poses with a face alone.
-
-    Poses are returned if the animation moves a face and turns no joint.
+    """Returns the moving skeleton of a GLB file, with its face. If the animation moves a face and
+    turns no node, returns poses of a standing person with this face.
 
     Raises: OSError; InvalidFileError, and what damaged numbers raise.
     """
@@ -263,9 +263,9 @@ _SHOWN = 12
 
 
 def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[str, Any], str]:
-    """Returns an animation, and a note about the others.
+    """Returns an animation, and a note if it is the first of several and was not asked for.
 
-    clip: the name or number of the animation. None: the first.
+    clip: the name of the animation (case does not matter), or its number from 0. None: the first.
 
     Raises: InvalidFileError if there is no such animation.
     """
@@ -286,8 +286,8 @@ def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[st
 
 
 def _humanoid(content: dict[str, Any]) -> dict[int, str]:
-    """Returns the humanoid bone that a node is, by the number of the node. Only VRM and VRMA files
-    name these bones, and the nodes may have other names. Empty for other files.
+    """Returns the names of humanoid bones, by the number of the node. Only VRM and VRMA files have
+    them, and the nodes may have other names. Empty for other files.
     """
     extensions = content.get("extensions")
     if not isinstance(extensions, dict):
@@ -313,9 +313,9 @@ def _joints(
 ) -> tuple[list[int], dict[int, Float[np.ndarray, "4 4"]]]:
     """Returns the nodes that are joints, and the matrices of the joints when the skin was bound.
 
-    If there are skins, the joints belong to the skin with most joints. Otherwise all nodes are
-    joints. The matrices (4, 4) are by node. The dict is empty if the skin has no matrices, or if it
-    lists a joint twice.
+    The joints are those of the skin with most joints. If no skin has joints, all nodes are joints.
+    The matrices (4, 4) are by node. The dict is empty if the skin has no matrices, or if it lists a
+    joint twice.
 
     Raises: InvalidFileError for a joint that is no node, or for numbers that are not finite.
     """
@@ -389,9 +389,9 @@ def _times(tracks: Tracks) -> tuple[Float[np.ndarray, " m"], float | int]:
 
 
 def _rotations(matrices: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Returns the rotations in matrices of rotation, scale and position.
+    """Returns the rotations, (..., 3, 3), of matrices that rotate, scale and move.
 
-    Raises: InvalidFileError if a matrix mirrors or has no size.
+    Raises: InvalidFileError if a matrix mirrors or scales to zero.
     """
     linear = matrices[..., :3, :3]
     lengths = np.linalg.norm(linear, axis=-2, keepdims=True)

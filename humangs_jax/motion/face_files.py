@@ -44,9 +44,11 @@ from humangs_jax.motion.rules import NO_RATE, frame_times
 _ARMS_DOWN = 1.15
 """Angle by which the arms hang down, radians, for a person with a face and no motion."""
 _FEWEST = 5
-"""Least number of ARKit's shapes in a table or an object of a face."""
+"""Least number of ARKit's shapes in a table, or in the scores of a frame."""
 _MOST_COLUMNS = 1000
-"""Largest number of names in a file."""
+"""Largest number of columns of a table, of expressions, of meshes with weights, or of values in
+which scores are looked for.
+"""
 _DEEPEST = 5
 """Largest depth at which the scores of a frame may lie inside of objects and lists."""
 
@@ -176,8 +178,8 @@ def _standing(
 
 
 def has_scores(path: Path) -> bool:
-    """Returns whether a JSON file has scores of a face, of which at least one is a number.
-    `read_scores` refuses the file if others are no numbers.
+    """Returns whether a JSON file has scores of a face. At least one of them has to be a number.
+    `read_scores` raises an error if others are no numbers.
 
     Raises: FileNotFoundError; FileError if it is not JSON.
     """
@@ -232,8 +234,8 @@ def _scores_of(frame: Any, depth: int) -> dict[str, Any]:
     are no scores.
 
     The scores may be an object of numbers by name or a list of categories, at most `_DEEPEST`
-    levels down. At least one value must be a number, because other files have texts or lists under
-    these names.
+    levels down. At least `_FEWEST` shapes must have a value. At least one value must be a number,
+    because other files have texts or lists under these names.
     """
     if depth > _DEEPEST:
         return {}
@@ -283,8 +285,9 @@ def animated_face(
 ) -> tuple[FaceTrack | None, str]:
     """Returns the expressions of a GLB or VRMA file's animation as ARKit's shapes, and a note.
 
-    The note lists shapes that are not ARKit's, "" if there are none. The face is None if the
-    animation has no expressions, or none that is known. times: of the frames, (m,), seconds.
+    The note lists expressions that are neither ARKit's shapes nor presets, "" if there are none.
+    The face is None if the animation has no expressions, or none that is known. times: times of the
+    frames, (m,), seconds.
 
     Raises: InvalidFileError if the animation's numbers are wrong.
     """
@@ -401,7 +404,9 @@ def _target_names(mesh: Mapping[str, Any], count: int) -> list[str]:
 def face_alone(
     content: dict[str, Any], binary: bytes, animation: Mapping[str, Any], note: str
 ) -> Poses | None:
-    """Reads an animation that moves a face and turns no node; None for any other animation."""
+    """Reads an animation that moves a face and turns no node. Returns None for any other animation,
+    and for tracks that `frame_times` cannot bring to one rate.
+    """
     if any(channel["target"]["path"] == "rotation" for channel in animation["channels"]):
         return None
     inputs = [

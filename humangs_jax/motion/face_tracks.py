@@ -1,4 +1,4 @@
-"""Expressions over time, and the conversion of files' names of expressions to ARKit's shapes."""
+"""Holds expressions over time, and converts the names of expressions in files to ARKit's shapes."""
 
 import dataclasses
 import re
@@ -75,7 +75,8 @@ class FaceTrack:
 def arkit_name(name: str) -> str | None:
     """Returns the name of ARKit's shape that a name in a file means; None for another name.
 
-    Case does not matter: "Blend.EyeBlink_L" is "eyeBlinkLeft".
+    A beginning before ".", ":" or "|" is ignored, "_L" and "_R" at the end stand for the sides, and
+    only letters count, without case: "Blend.EyeBlink_L" is "eyeBlinkLeft".
     """
     plain = re.split(r"[.:|]", name)[-1]
     plain = re.sub(r"_l$", "left", re.sub(r"_r$", "right", plain.lower()))
@@ -106,8 +107,8 @@ def of_preset(name: str) -> dict[str, float] | None:
 def as_arkit(track: FaceTrack) -> tuple[FaceTrack | None, tuple[str, ...]]:
     """Converts a track to ARKit's shapes.
 
-    Returns: the track, or None if none of its names is known; and the names that are neither shapes
-    of ARKit nor presets.
+    Returns: the converted track, (m, 52), or None if none of the names is known; and the names that
+    are neither shapes of ARKit nor presets.
     """
     values = np.zeros((len(track.values), len(ARKIT)))
     unknown = []
@@ -136,8 +137,8 @@ def checked_track(
 ) -> tuple[tuple[str, ...], Float[np.ndarray, "m e"]]:
     """Returns the names and the float32 values of a track.
 
-    Raises: InvalidFileError if there is not one row for each frame, or if a number is not finite or
-    is larger than FARTHEST.
+    Raises: InvalidFileError if there is not one row for each frame and one column for each name, or
+    if a number is not finite or is larger than FARTHEST in magnitude.
     """
     values = np.asarray(track.values, np.float64)
     if values.shape != (frames, len(track.names)):

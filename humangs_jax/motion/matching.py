@@ -1,8 +1,9 @@
 """Finds our joints in a file's skeleton: by known names, or else by the tree of the joints.
 
-In the tree, two limbs with similar bones below one joint are the legs, and two others above it are
-the arms. What hangs between the arms ends in the head. A knee or elbow is where the two longest
-consecutive bones of a limb meet. Names or places tell left from right.
+In the tree, two limbs with similar bones that hang on one joint are the legs, and two other limbs
+further up the trunk are the arms. The chain that hangs between the arms ends in the head. A knee or
+elbow is where the two longest consecutive bones of a limb meet. Names or places tell left from
+right.
 """
 
 import re
@@ -84,9 +85,9 @@ def matched(
 def _plain(names: Sequence[str]) -> list[str]:
     """Simplifies names to lower-case letters and digits: "Model:Bip01_L_Thigh" is "lthigh".
 
-    Words that say nothing about the joint are removed, and a beginning that all names share. A name
-    that begins with two underscores becomes "": MakeHuman puts such a joint, which never turns,
-    above the joint of the same name.
+    Words that say nothing about the joint are removed. A beginning that all names share is removed
+    if there are at least `FEW` names. A name that begins with two underscores becomes "": MakeHuman
+    puts such a joint, which never turns, above the joint of the same name.
     """
     plain = [re.sub(r"^.*[:|]", "", name).lower() for name in names]
     plain = [re.sub(r"(finger\d)-(?=\d)", rf"\1{FINGER_JOINT}", name) for name in plain]
@@ -101,7 +102,9 @@ def _plain(names: Sequence[str]) -> list[str]:
 
 
 def _named(plain: Sequence[str]) -> dict[str, int]:
-    """Finds our joints by known names. Each joint of the file is taken once, by the first match."""
+    """Returns the index of the file's joint for each of our joints that has a known name. Each
+    joint of the file is taken once, by the first match.
+    """
     source: dict[str, int] = {}
 
     def find(ours: str, theirs: Sequence[str]) -> None:
@@ -169,7 +172,8 @@ def _limbs(
     """Finds the joints of arms, legs and pelvis by the tree. Returns None if the tree does not look
     like a person.
 
-    lengths: of the bone above each joint. posed: places in the first frame, (s, 3).
+    plain: simplified names. lengths: length of the bone above each joint, (s,). posed: places in
+    the first frame, (s, 3).
     """
     children: list[list[int]] = [[] for _ in parents]
     for i, p in enumerate(parents):
@@ -216,11 +220,12 @@ def _limbs(
 
 
 def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
-    """Returns three joints of a limb, where its two main bones begin, meet and end, and the next
-    joint if there is one.
+    """Returns the three joints of a limb where its two main bones begin, meet and end, and then the
+    next joint if there is one.
 
     The main bones are consecutive. Among all pairs of consecutive bones they are the pair whose
-    shorter bone is longest. None: the limb has fewer than two bones, or they have no length.
+    shorter bone is longest. Returns None if the limb has fewer than two bones, or if the first main
+    bone has no length.
     """
     bones = lengths[path[1:]]
     if len(bones) < 2:
@@ -240,7 +245,9 @@ def _sided(
     chest: int,
     arms: _Pair,
 ) -> dict[str, int]:
-    """Returns the joints of limbs by our names; names or places tell left from right."""
+    """Returns the joints of the pelvis and the limbs, by our names. Names or places tell left from
+    right.
+    """
     up = unit(posed[chest] - posed[pelvis])
     toes = [posed[leg[3]] - posed[leg[2]] for leg in legs if len(leg) > 3]
     forward = np.sum(toes, axis=0) if toes else np.array([0.0, 0, 1])

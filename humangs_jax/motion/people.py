@@ -2,7 +2,7 @@
 
 Estimators store people in different ways: in dicts by number, in a list for each frame, along the
 first axis of arrays, in a file for each person, or in a file for each frame. Some store the poses
-of a person in several coordinate systems; those of the world are preferred.
+of a person in several coordinate systems. Poses in the world's axes are preferred.
 """
 
 import re
@@ -40,11 +40,11 @@ _FRAMES = ("frame_ids", "frames", "frame", "frame_id")
 _FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
 """Sub-folders that may hold the files of a motion; "" is the folder itself."""
 _OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
-"""Suffixes of files that each have the motion of a person, in a folder. Files with other suffixes
-each have one frame.
+"""In a folder, each file with one of these suffixes has the motion of one person. Each file with
+another suffix has one frame.
 """
 _DEEPEST = 6
-"""Number of levels of lists and maps in which people are looked for."""
+"""Largest number of levels of lists and maps above the values of a person."""
 SHOWN = 12
 """Largest number of keys or people that an error lists."""
 
@@ -96,7 +96,9 @@ def read_people(path: Path) -> list[Person]:
 
 
 def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
-    """Reads the content of a file, and the keys whose values are pickled objects."""
+    """Returns the content of a file, and the keys whose values are not read because they are
+    pickled objects.
+    """
     if file.suffix.lower() == ".json":
         return read_json(file), ()
     with open_file(file) as opened:
@@ -114,7 +116,8 @@ def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Returns the files of a motion in a folder, in the order of the numbers in their names.
+    """Returns the files of a motion in a folder, in the order of the numbers in their names. They
+    have one suffix. camera.npy is left out.
 
     Raises: InvalidFileError if there are none.
     """
@@ -141,7 +144,9 @@ def _numbers(file: Path) -> list[str]:
 
 
 def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
-    """Returns the people in the content of a file, which may be a list of people for each frame."""
+    """Returns the people in the content of a file. The content may have a list of people for each
+    frame.
+    """
     frames = _listed_frames(content)
     if frames is not None:
         return _stacked([(f"frame {i}", each) for i, each in enumerate(frames)])
@@ -154,7 +159,7 @@ def _people(content: Any, pickled: tuple[str, ...] = ()) -> list[Person]:
 def _found(content: Any, name: str, depth: int) -> list[Person]:
     """Returns the people in some content.
 
-    name: given to a person who has none in the file. depth: number of levels above the content.
+    name: name of a person who has no name in the file. depth: number of levels above the content.
     Raises: InvalidFileError for more people than the limit.
     """
     content = objects(content)
@@ -201,7 +206,7 @@ def _split(values: Mapping[str, Any], form: ArrayKeys, name: str) -> list[Person
     """Returns the people in some values. There are several if the arrays have a first axis of
     people.
 
-    form: the format of the values. name: of the person if there is one.
+    form: the format of the values. name: name of the person, if there is only one.
     """
     place, poses = next(iter(form.poses.items()))
     if poses not in values or not _of_several(values[poses], place, form):
@@ -346,8 +351,10 @@ def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
 
 
 def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
-    """Returns the people of a motion, each with the values of all frames.
+    """Returns the people of a motion, each with the values of all frames that show the person.
+
     frames: for each frame, its name and its people.
+    Raises: InvalidFileError if a person lacks a value that the person has in the first frame.
     """
     people: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
     for i, (_, found) in enumerate(frames):

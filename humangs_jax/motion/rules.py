@@ -1,4 +1,4 @@
-"""Tables that the readers of motions share, and the choice of the axis that is up in a motion.
+"""Holds tables that the readers of motions share, and chooses the axis that is up in a motion.
 
 The tables hold names of joints and limits of decisions. The page reads motions too, and gets all
 its tables from `page_rules` when it is assembled (viewer/page.py).
@@ -36,17 +36,17 @@ COLUMNS = {
     72: "SMPL",
     BODY_NUMBERS: "the body",
 }
-"""Number of numbers in a pose -> the body model that has this many."""
+"""For each known number of columns of a pose, the body model that has it."""
 MILLIMETRES = 1000.0
 ORTHONORMAL = 0.05
-"""Largest difference of R R^T from the identity at which a matrix in a file is a rotation."""
+"""A matrix in a file counts as a rotation if R R^T differs by less than this from the identity."""
 FAR = 25.0
-"""People that a camera sees at a larger distance than this, metres, are there because the focal
-length was assumed (4D-Humans and others).
+"""If the median distance of a person from the camera is larger than this, metres, the program that
+wrote the file has assumed a focal length (4D-Humans and others).
 """
 ASSUMED_FOCAL = 5000 / 256
-"""The focal length that these programs assume, divided by the longer side of the photo. A lens of a
-focal length as long as this side is usual.
+"""The focal length that these programs assume, divided by the longer side of the photo. Usual
+lenses have a ratio of about 1.
 """
 NEARER = "{} is of a focal length that was assumed: people are taken to be {:.3g} times nearer"
 NO_RATE = "the file says no frames per second: taken for {:g}"
@@ -65,10 +65,10 @@ _ORDINALS = ("first", "second", "third", "fourth", "fifth")
 
 
 def _finger(finger: str, i: int) -> tuple[str, ...]:
-    """Returns the known names of joint i of a finger, counted from 1 at the palm.
+    """Returns the known names of joint i of a finger. Joints are counted from 1 at the palm.
 
     In the names of Biped, fingers have numbers, counted from 0 at the thumb. Rokoko and MakeHuman
-    count them from 1.
+    count fingers from 1.
     """
     number = _FINGERS.index(finger)
     words = {"pinky": (finger, "little"), "middle": (finger, "mid")}.get(finger, (finger,))
@@ -194,7 +194,9 @@ UNDER = (
 )
 """Pairs of joints. The second joint of a pair must hang below the first."""
 LIKE = 0.15
-"""Largest difference between bones of two limbs of a pair, as a share of the longest bone."""
+"""Largest difference between the bones of two limbs that are a pair, as a share of the longest of
+these bones.
+"""
 SIDES = ("left", "right")
 _CHAINS = (
     ("pelvis", "spine1", "spine2", "spine3", "neck", "head"),
@@ -208,9 +210,10 @@ _CHAINS = (
         )
     ),
 )
-"""Chains of joints: a bone goes from a joint to the next joint of its chain that the file has.
+"""Chains of joints. A bone goes from a joint to the next joint of its chain that the file has.
 
-For a joint in several chains the last one counts. Other joints move as their parents do.
+For a joint in several chains the last chain counts. A joint without a bone turns as the file's
+joint does. A joint that the file lacks moves as its parent does.
 """
 NEXT = {name: chain[i + 1 :] for chain in _CHAINS for i, name in enumerate(chain)}
 NEEDED = (
@@ -236,9 +239,9 @@ STANDING = -0.5
 this.
 """
 BETTER_TILT = np.radians(10)
-"""In some files the hips hang on other joints than the pelvis. These joints give the rotation of
-the pelvis if they agree better with the trunk. Their mean angle to the trunk has to be smaller than
-that of the pelvis's joint by more than this, radians.
+"""In some files the hips hang on joints other than the pelvis. These joints give the rotation of
+the pelvis if they agree better with the trunk: their mean angle to the trunk has to be smaller than
+the pelvis's mean angle by more than this, radians.
 """
 LARGEST_BEND = np.radians(60)
 """Largest mean angle between pelvis and lowest spine over the frames, radians. If the angle is
@@ -248,22 +251,24 @@ RATE_ROUNDING = 1e-4
 """Relative error of a frame rate. Some BVH files give the time of a frame in only four digits."""
 
 SHORT_STEPS = 0.1
-"""A higher rate than the mean rate of the keys of a GLB file is taken if at least this share of the
-steps between keys is shorter than a frame at the mean rate.
+"""If at least this share of the steps between keys of a GLB file is shorter than a frame at the
+mean rate of the keys, a higher rate is taken. See `frame_times`.
 """
 FRAMES_A_KEY = 16
-"""Largest number of frames for each key, where keys are not evenly spaced."""
+"""Largest factor by which this higher rate exceeds the mean rate of the keys."""
 
 FLOOR_BAND = 0.05
-"""The lowest joint is on the floor if it is within this distance of its usual height, metres."""
+"""The lowest joint is at its usual height if it is within this distance of the median height of the
+lowest joint, metres.
+"""
 STILL = (0.1, 0.3)
 """Two limits of the speed of a joint that rests on the floor. The first is in metres per second.
 The second is a share of the mean speed of all joints. The larger limit counts.
 """
 ON_THE_FLOOR = 0.5
-"""An axis has a floor below if the lowest joint rests there in at least this share of the frames.
-Between two axes, only the one with the larger share has a floor, if the other share is below this
-number and at most half as large.
+"""An axis clearly has a floor below if two things hold. The lowest joint rests there in at least
+this share of the frames. The share of the other axis is below this number and at most half as
+large.
 """
 TREADMILL = 0.8
 """If nothing rests on a floor along either axis, the unusual axis has a floor if the lowest joint
@@ -274,7 +279,7 @@ MOST_FRAMES = 1000
 HANDS = tuple(
     i for i, name in enumerate(JOINT_NAMES) if any(x in name for x in ("elbow", "wrist", *FINGERS))
 )
-"""Indices of the joints that carry a person who is upside down."""
+"""Indices of the joints on which an upside-down person may stand."""
 
 
 # Frames of animations
@@ -284,13 +289,14 @@ HANDS = tuple(
 def frame_times(keys: Sequence[Float[np.ndarray, " _"]]) -> tuple[np.ndarray, float] | None:
     """Returns evenly spaced times of frames (m,), seconds, and their rate in frames per second.
 
-    The rate is that of the track with most keys. Optimizers leave out keys that lie on a line
-    between others, and animators set few keys. So if at least the share `SHORT_STEPS` of the steps
-    between keys is shorter than a frame at that rate, the rate becomes that of the short steps, but
-    at most `FRAMES_A_KEY` times as high.
+    The rate is the mean rate of the track with most keys. Optimizers leave out keys that lie on a
+    line between others, and animators set few keys. So if at least the share `SHORT_STEPS` of the
+    steps between keys is shorter than a frame at that rate, the rate becomes that of the short
+    steps, but at most `FRAMES_A_KEY` times as high.
 
-    keys: increasing times of the keys of each track, seconds. Returns None if tracks have very
-    different lengths.
+    keys: increasing times of the keys of each track, seconds. Returns None if the frames at the
+    mean rate are more than four times as many as the keys, because tracks have very different
+    lengths.
     """
     first, last = min(each[0] for each in keys), max(each[-1] for each in keys)
     dense = max(keys, key=len)
@@ -334,14 +340,16 @@ def up_axis(
     """Returns the axis that is up, and a note about it, or "" if there is nothing to note.
 
     The axis is the usual one of the format, with two exceptions. In the first, the person stands
-    along another axis and there is a floor below: the lowest joint stays at one height and rests
-    there. Lying, crawling and upside-down people also stand along other axes, but rest on no floor
-    below. In the second, the person stands along an axis in `also`, no clear floor below the usual
-    axis contradicts this, and the person is not upside down on the hands.
+    along another axis, and only this axis has a floor below: the lowest joint stays at one height
+    and rests there. The trunks of people who lie, crawl or are upside down also point along another
+    axis, but these people rest on no floor below it. In the second, the person stands along an axis
+    in `also`, no clear floor below the usual axis contradicts this, and the person is not upside
+    down on the hands.
 
-    points: joints in space, metres, in the frames of `sampled_frames`. stands: the axis along which
-    the person stands on average; None: there is none. usual: the axis of the format. fps: frames
-    per second of the motion. also: axes that are up in some files of the format.
+    points: joints in space, (n, k, 3), metres, in the frames of `sampled_frames`. stands: the axis
+    along which the person stands on average; None: there is none. usual: the axis of the format.
+    fps: frames per second of the motion. also: further axes that are up in some files of the
+    format.
     """
     if stands is None or stands == usual:
         return usual, ""
@@ -369,9 +377,9 @@ def _floors(
     """Returns the shares of frames in which the lowest joint is on a floor, for the usual axis and
     for another axis.
 
-    The joint has to rest at its usual height. If it rarely rests for both axes, as on a treadmill,
-    it only has to be at this height. A share of the other axis that is below TREADMILL then becomes
-    0. points: as in `up_axis`.
+    The lowest joint has to rest at its usual height. If it rarely rests for both axes, as on a
+    treadmill, it only has to be at this height. A share of the other axis that is below `TREADMILL`
+    then becomes 0. points: as in `up_axis`. axes: the usual and the other axis.
     """
     moves = np.linalg.norm(points[1::2] - points[::2], axis=-1) * fps
     limit = max(STILL[0], STILL[1] * float(moves.mean()))
@@ -393,7 +401,10 @@ def joint_places(
     rotations: Float[np.ndarray, "m j 3"],
     translations: Float[np.ndarray, "m 3"],
 ) -> Float[np.ndarray, "m j 3"]:
-    """Returns the joints in space (m, j, 3) of a moving body of SMPL-X's joints, metres."""
+    """Returns the places of the joints of a body in motion, (m, j, 3), metres. The body has
+    SMPL-X's joints. joints: joints at rest, (j, 3), metres. rotations: axis-angles, (m, j, 3),
+    radians. translations: (m, 3), metres.
+    """
     turns = Rotation.from_rotvec(rotations.reshape(-1, 3)).as_matrix()
     turns = turns.reshape(*rotations.shape, 3)
     bones = np.broadcast_to(bones_of(joints, PARENTS), rotations.shape)

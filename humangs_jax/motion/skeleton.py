@@ -1,17 +1,18 @@
 """Converts moving skeletons of other programs, from BVH and glTF files, to our joints.
 
-Bones point where the file's bones point. Every joint of ours has a rotation A_j from our rest frame
-to the file's. It turns our bone into the file's bone of the rest pose, and is the smallest such
-turn after that of the parent. With D_j(t) the rotation of the file's joint j from its rest pose to
-frame t, in the world, ours is
+Bones point where the file's bones point. Every joint of ours has a rotation A_j from our rest pose
+to the file's rest pose. A_j is the rotation A of the parent, followed by the smallest turn that
+makes our bone point as the file's bone does. D_j(t) is the rotation of the file's joint j from its
+rest pose to frame t, in the world. Then the rotation of our joint in the world, G_j, and relative
+to the parent, R_j, are
 
     G_j(t) = C_j(t) D_j(t) A_j,    R_j = G_parent(j)^T G_j.
 
 C_j(t) is the smallest turn that makes the bone point where the file's bone points in the frame. It
 is the identity if the file's child hangs on the joint itself, but some files have further joints in
-between. The pelvis has no bone. Its direction is that of the line between the hips, and the trunk
-shows how far it turns about this line. This is needed because some files turn the pelvis's joint by
-any rotation, and turn the joints that carry hips and spine back.
+between. The pelvis has no bone. It turns so that the line between the hips points as in the file,
+and the trunk shows how far it turns about this line. This is needed because some files turn the
+pelvis's joint by any rotation, and turn the joints that carry hips and spine back.
 
 Twists about a bone are relative to the file's rest pose. If nobody can stand in that pose, the
 smallest turn says nothing about twists. (In LaFAN's files all offsets lie along one axis, and the
@@ -60,7 +61,7 @@ class Clip:
     fps: float
     """Frames per second."""
     up: str | None = None
-    """The axis that the format declares as up; None: found from the rest pose."""
+    """The axis that is up in the format. None: it is found from the rest pose and the motion."""
     note: str = ""
     """Lines for the user about the file."""
     face: FaceTrack | None = None
@@ -75,8 +76,8 @@ def bytes_of_clip(frames: int, joints: int) -> int:
 
 
 def whole_rate(fps: float) -> float:
-    """Returns frames per second, rounded to a whole number if they differ from it only by the
-    rounding in files.
+    """Returns a rate in frames per second. It is rounded to a whole number if it differs from this
+    number by less than the share `rules.RATE_ROUNDING`.
 
     A BVH file has 0.0083333 seconds per frame for 120 frames per second.
     """
@@ -96,9 +97,9 @@ def shipped_joints() -> Float[np.ndarray, "j 3"]:
 def retargeted(
     clip: Clip, joints: Float[np.ndarray, "j 3"], up: str = "auto"
 ) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], str]:
-    """Returns the motion of a body of SMPL-X's joints that moves as a clip.
+    """Returns the motion that makes a body with SMPL-X's joints move like a clip.
 
-    joints: of the body in T-pose, (55, 3), metres. up: as in `load_motion`.
+    joints: joints of the body in T-pose, (55, 3), metres. up: as in `load_motion`.
 
     Returns: rotations (m, j, 3), axis-angle, radians; translations (m, 3), metres; and a note about
     the axis that is up, or "".
@@ -189,8 +190,8 @@ def _body_turns(
 ) -> list[Float[np.ndarray, "m 3 3"]]:
     """Returns the rotations G_j (m, 3, 3) of our joints in the world, see the head of this module.
 
-    turns, places: of the clip's joints, turned upright. by_motion: whether twists about bones are
-    found from the motion, because nobody can stand in the rest pose.
+    turns, places: rotations and places of the clip's joints, with y up. by_motion: whether twists
+    about bones are found from the motion, because nobody can stand in the rest pose.
     """
     frames_of, world = [], []
     for j, (name, parent) in enumerate(zip(JOINT_NAMES, PARENTS, strict=True)):
@@ -237,10 +238,11 @@ def _pelvis_turns(
 ) -> Float[np.ndarray, "m 3 3"]:
     """Returns the rotations of the pelvis from the rest pose to the frames, (m, 3, 3).
 
-    They are the rotations of the pelvis's joint. If the hips hang on other joints and these agree
-    better with the trunk, the mean rotation of these joints is used. A pelvis that bends far from
-    the trunk is turned after the lowest joint of the spine. In all cases the line between the hips
-    points as in the file.
+    They are usually the rotations of the pelvis's joint. If the hips hang on other joints that
+    agree better with the trunk, the mean rotation of these joints is used. If the hips hang on the
+    pelvis, and it bends far from the trunk, it is turned about the line between the hips so that it
+    follows the lowest joint of the spine. In all cases the line between the hips points as in the
+    file.
     """
     pelvis, left, right = (source[name] for name in ("pelvis", "left_hip", "right_hip"))
     rest_line, line = clip.rest[left] - clip.rest[right], places[:, left] - places[:, right]
@@ -335,9 +337,8 @@ def _leg_length(places: Float[np.ndarray, "s 3"], index: _Source) -> float:
 
 
 def _feet(source: _Source) -> list[list[str]]:
-    """Returns the names of joints that may touch the floor and that the file has.
-
-    One list for each kind (ankle, foot), with its left and its right joint. Names are ours.
+    """Returns our names of the joints of the file that may touch the floor. There is one list for
+    each kind (ankle, foot), with its left and its right joint.
     """
     present = [[name for name in kind if name in source] for kind in rules.FEET]
     return [found for found in present if found]
@@ -363,8 +364,9 @@ def _steps(
 
     The floor is where the feet are lowest over all frames.
 
-    soles: the height of each joint of the feet when the foot stands, by our names. None: for both
-    ankles, the lowest height of any ankle over all frames, and the same for the toes.
+    soles: the height of each joint of the feet when the foot stands, by our names. If it is None,
+    the lowest height of any ankle over all frames is taken for both ankles, and the lowest height
+    of any toe for both feet.
     """
     if soles is None:
         lowest = [

@@ -1,9 +1,9 @@
-"""Reads motions in a single array, by its number of columns, and rotations of six numbers from MDM.
+"""Reads motions that are a single array without keys, and rotations of six numbers (MDM).
 
-A row of Motion-X has 322 numbers (https://github.com/IDEA-Research/Motion-X): root 3, body 63,
-hands 90, jaw 3, expression 50, shape of the face 100, translation 3, shape 10. Six numbers are the
-first two rows of a rotation matrix, before they are made orthonormal (Zhou et al., arXiv
-1812.07035).
+The shape of the array decides what its numbers are. A row of Motion-X has 322 numbers
+(https://github.com/IDEA-Research/Motion-X): root 3, body 63, hands 90, jaw 3, expression 50, shape
+of the face 100, translation 3, shape 10. The six numbers of a rotation are the first two rows of
+its matrix, before they are made orthonormal (Zhou et al., arXiv 1812.07035).
 """
 
 from collections.abc import Mapping
@@ -30,9 +30,9 @@ _RENDER = (
     "make rotations of them, as MDM's `python -m visualize.render_mesh` does (*_smpl_params.npy)"
 )
 _FEATURES = {263: "HumanML3D", 251: "KIT-ML"}
-"""Number of columns of feature vectors -> the data set that has them."""
+"""For each known number of columns of feature vectors, the data set that has it."""
 _JOINTS = {22: "HumanML3D's new_joints", 21: "KIT-ML's new_joints"}
-"""Number of joints in space -> the data set that has them."""
+"""For each known number of joints in space, the files that have it."""
 
 
 def values_of(array: np.ndarray) -> dict[str, np.ndarray]:
@@ -79,11 +79,11 @@ def hint_for(values: Mapping[Any, Any]) -> str:
 
 
 def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[str, Any]:
-    """Returns values in which rotations of six numbers are replaced by matrices (m, j, 3, 3), and
-    frames come first.
+    """Returns the values with matrices, (m, j, 3, 3), in place of rotations of six numbers, and
+    with frames as the first axis of the positions.
 
-    rotations: key of an array (j, 6, m) or (m, j, 6). moves: key of the positions, which become (m,
-    3).
+    rotations: key of an array (j, 6, m) or (m, j, 6). moves: key of the positions. If the rotations
+    are (j, 6, m), the positions have to be (3, m), and become (m, 3).
 
     Raises: InvalidFileError, which names the key, if the rotations have another shape or are no
     real numbers.

@@ -145,7 +145,7 @@ def unusual(
 ) -> Float[np.ndarray, " n"]:
     """Returns how much the pose of each frame differs from the median pose of all frames, (n,).
     This is the mean distance between the landmarks of both poses, weighted by `seen`, as a share of
-    the person's size. Poses are turned to face the camera before.
+    the person's size. All poses are first turned to face the camera.
 
     world: landmarks in the camera's axes, (n, k, 3). directions: see `directions_of`. seen: weights
     of the landmarks, (n, k).

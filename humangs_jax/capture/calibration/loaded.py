@@ -67,8 +67,8 @@ def load_cameras(
     y_up: bool = False,
     scale: float = 1.0,
 ) -> SceneCameras:
-    """Returns the cameras of a calibration, with their lenses. It may come from COLMAP, nerfstudio,
-    OpenCV or another tool in docs/cameras.md.
+    """Returns the cameras of a calibration, with their lenses. The calibration may come from
+    COLMAP, nerfstudio, OpenCV or another tool in docs/cameras.md.
 
     Args:
         path: File or folder. The format is found from its content.

@@ -77,9 +77,9 @@ def with_photos(calibration: Calibration, images: Path) -> tuple[Calibration, st
     """Returns the calibration without the cameras that have no photo, and a line about these
     cameras. The line is None if every camera has a photo.
 
-    Raises: CaptureError if no camera has a photo. A calibration with a camera for each image also
-    raises it if an image is missing and the folder has a photo that no camera names: the names
-    probably do not match.
+    Raises: CaptureError if no camera has a photo. If the calibration has a camera for each image,
+    the error is also raised if an image is missing and the folder has a photo that no camera names:
+    the names probably do not match.
     """
     if calibration.per_image:
         there = [_photo_at(images, camera.name) is not None for camera in calibration.cameras]

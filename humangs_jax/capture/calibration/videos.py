@@ -419,9 +419,9 @@ def _shown_as_mask(path: Path, photos: Path) -> _Shown:
     """Returns how the frames of a video of masks have to be converted. Their values are not
     converted as colors.
 
-    Usually pixels get square by the shape that the video of masks states. If it states none or
-    square pixels, the video of photos states others, and the stored frames of both have the same
-    size, masks are scaled to the size that the photos have with square pixels.
+    Pixels are made square by the shape that the video of masks states. There is one exception: it
+    states square pixels or no shape, the video of photos states another shape, and the stored
+    frames of both have the same size. Then masks are scaled to the size that the photos get.
     """
     own, theirs = _shown(path), _shown(photos)
     as_stored = _Shown()

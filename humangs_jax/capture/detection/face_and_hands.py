@@ -81,7 +81,7 @@ class Hand(NamedTuple):
 class FaceAndHands:
     """Runs mediapipe's networks for face landmarks, scores of face shapes, and hand landmarks.
 
-    Raises: ImportError if LiteRT is missing. It says what to install.
+    Raises: ImportError, which says what to install, if LiteRT is missing.
     """
 
     def __init__(self) -> None:

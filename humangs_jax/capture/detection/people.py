@@ -16,8 +16,8 @@ pixel for our convention.
 
 The detector finds people who are at least a third as large as its window. So it looks at the whole
 photo and at windows of half the photo's longer side. If nobody large is found there, it also looks
-at windows of a quarter of the longer side. Neighbouring windows overlap by half. Detections in
-several windows count as one person if hips and size agree.
+at windows of a quarter of the longer side. Neighbouring windows overlap by half or more. Detections
+in several windows count as one person if hips and size agree.
 
 If people stand close together, the detector finds only some of them. So the people who were found
 are painted over with the colors around them, and the detector looks again, until it finds nobody
@@ -148,8 +148,9 @@ def available() -> bool:
 
 def load_networks(folder: str, names: Sequence[str]) -> list[Any]:
     """Loads networks from a folder of `assets`, and returns a LiteRT interpreter for each name.
+    names: file names of the networks.
 
-    Raises: ImportError if LiteRT is missing. It says what to install.
+    Raises: ImportError, which says what to install, if LiteRT is missing.
     """
     try:
         with _silent():
@@ -187,7 +188,7 @@ def outputs_of(network: Any, values: Float[np.ndarray, "..."]) -> dict[str, np.n
 class Networks:
     """The two networks of BlazePose.
 
-    Raises: ImportError if LiteRT is missing. It says what to install.
+    Raises: ImportError, which says what to install, if LiteRT is missing.
     """
 
     def __init__(self) -> None:

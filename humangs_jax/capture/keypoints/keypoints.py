@@ -1,5 +1,5 @@
-"""Keypoints in memory: the keypoints of a capture's views, the keypoints in a file, and the sets of
-points that detectors are trained on.
+"""Holds keypoints in memory: those of a capture's views, those in a file, and the sets of points
+that detectors are trained on.
 
 The names of points are, with `side` left or right (the person's own):
 
@@ -173,7 +173,7 @@ HALPE_136 = _keypoint_set(
 """
 
 OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
-"""The points of OpenPose's BODY_25, and of its left and right hand.
+"""The 25 points of OpenPose's BODY_25, and its 21 points of the left and of the right hand.
 
 OpenPose's 70 points of the face are not in this set, and are ignored.
 """
@@ -188,7 +188,7 @@ OPENPOSE_67B = _keypoint_set(
     "openpose_b67",
     (*_COCO, "upper_neck", "head_top", *_FEET, *hand_names("left"), *hand_names("right")),
 )
-"""The points of OpenPose's BODY_25B, and of its left and right hand.
+"""The 25 points of OpenPose's BODY_25B, and its 21 points of the left and of the right hand.
 
 Files do not state whether they have BODY_25 or BODY_25B, see `orders`.
 """
