@@ -1,5 +1,5 @@
-"""Compares an image with a photo in which the person has moved by pixels. Also has the rule by
-which photos decide whether something new is better.
+"""Compares an image with a photo that shows the person a few pixels beside where the image does.
+Several photos also decide whether a change is better, see `photos_agree`.
 
 A body whose pose is off by centimetres draws everything a few pixels beside where the photo shows
 it. Pixel by pixel, detail at the wrong place is a larger error than no detail, so that PSNR prefers
@@ -13,7 +13,7 @@ Squares and variances are means over the channels. The variance leaves out diffe
 brightness between a window and the photo.
 
 The same moves, made smooth, bring a photo to where the image shows the person (`smooth_moves`,
-`moved_photo`). Images are on the host. They have colors and alpha side by side.
+`moved_photo`). Images are numpy arrays. Their four channels are red, green, blue and alpha.
 """
 
 from collections.abc import Iterable
@@ -27,25 +27,27 @@ from humangs_jax.losses.losses import LARGEST_PSNR
 REACH = 0.02
 """Largest move, as a share of the person's height in the photo. It is 3.5 cm for a grown-up."""
 WINDOW = 0.08
-"""Side of a window, as a share of the person's height. It is about the size of a hand. Smaller
-windows adapt to too much.
+"""Side of a window, as a share of the person's height. It is about the size of a hand. Moves of
+smaller windows also follow differences that are no moves.
 """
 RELUCTANCE = 2e-4
-"""The longest move is made only if it lowers the variance in the window by this much. Shorter moves
-need less. So windows without detail stay.
+"""The longest move is made only if it lowers the variance in the window by more than this. Shorter
+moves need less. So windows without detail stay where they are.
 """
 SMOOTHNESS = 0.04
-"""Standard deviation of the weights that make moves smooth, as a share of the person's height."""
+"""Standard deviation of the weights with which neighbouring moves are averaged, as a share of the
+person's height.
+"""
 LARGEST = 128
-"""Largest height of a person in a comparison, pixels. Larger people are reduced by whole factors,
-for speed.
+"""Largest height of a person in a comparison, pixels. Images of larger people are reduced by whole
+factors, for speed.
 """
 NOBODY = 1e-3
 """Weight of pixels that do not show the person, for smooth moves."""
 ASKED = 3
-"""Largest number of photos that are compared. Two that agree are enough."""
+"""Largest number of photos that vote in `photos_agree`. Two that agree are enough."""
 CLEAR = 1.0
-"""A single photo is enough if its gain exceeds the needed gain by this, decibels."""
+"""A single photo is enough if its gain exceeds the needed gain by at least this, decibels."""
 
 
 def _aligned_errors(
@@ -85,16 +87,16 @@ def aligned_psnr(
     photo: Float[np.ndarray, "h w 4"],
     counted: Bool[np.ndarray, "h w"] | None = None,
 ) -> float:
-    """Returns the PSNR of colors and alpha against a photo and its mask, after moves of windows,
-    dB.
+    """Returns the PSNR of an image against a photo, dB. The windows of the image are moved first,
+    see the head of this module.
 
     Args:
         image: colors on white, and alpha.
         photo: colors on white, and the mask.
-        counted: the pixels whose errors count, all if None; moves look at all pixels.
+        counted: the pixels whose errors count. None: all pixels. Moves look at all pixels.
 
     Returns:
-        decibels; 100 where no pixel counts.
+        Decibels, over colors and alpha, at most 100. It is 100 if no pixel counts.
     """
     if counted is None:
         counted = np.ones(photo.shape[:2], bool)
@@ -117,8 +119,8 @@ def smooth_moves(
     """Returns the moves in pixels (y, x), (h, w, 2), that bring the person of the photo to where
     the image shows the person.
 
-    They are means of the moves around each pixel, weighted by distance and by whether a pixel shows
-    the person.
+    The move of a pixel is the mean of the moves of the windows around it. The weights fall with
+    the distance, and are small for pixels that do not show the person (`NOBODY`).
     """
     height = _person_height(photo[..., 3])
     factor = max(1, -(-height // LARGEST))
@@ -173,8 +175,8 @@ def _person_height(mask: Float[np.ndarray, "h w"]) -> int:
 
 
 def sizes(height: float) -> tuple[int, int]:
-    """Returns the largest move and the side of the windows, pixels. height: height of the person,
-    pixels.
+    """Returns the largest move (at least 1) and the side of the windows (at least 3), pixels.
+    height: height of the person, pixels.
     """
     return max(1, round(REACH * height)), max(3, round(WINDOW * height))
 
@@ -190,17 +192,18 @@ def reduced(image: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray,
 
 
 def photos_agree(gains: Iterable[float], least: float) -> bool:
-    """Returns whether something new should be kept. It should be if most of the photos gain at
-    least `least`.
+    """Returns whether a change should be kept. A photo accepts the change if it gains at least
+    `least`, otherwise it rejects the change. The result is True if more photos accept than reject.
 
-    A photo whose pose is off may lose by a change that is right. So if there are `ASKED` photos, it
-    takes two of them to reject the change. But no photo gains a lot by a change that is wrong. So a
-    single photo that gains `CLEAR` more than `least` is enough to accept it. The result is False if
-    as many photos reject the change as accept it, and if there are no gains.
+    At most `ASKED` photos vote. A photo whose pose is off may lose by a change that is right. So if
+    there are three photos, it takes two of them to reject the change. But no photo gains a lot by a
+    change that is wrong. So one photo that gains at least `least + CLEAR` is enough to accept it,
+    unless two photos before it have rejected it. The result is False if as many photos accept as
+    reject, and if there are no gains.
 
     Args:
-        gains: the new score minus the old score of one photo after the other, decibels. They are
-            read only until the result is certain.
+        gains: for each photo, its new score minus its old score, decibels. They are read one after
+            the other, until the result is certain.
         least: the gain that a photo needs, decibels. It is negative if the photo may lose.
     """
     yes = no = 0

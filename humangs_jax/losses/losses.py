@@ -31,8 +31,8 @@ FAR_SURFACE = 0.1
 
 @configuration
 class LossConfig:
-    """Weights of the terms of the loss. Each term is a mean over pixels or vertices, and over the
-    targets.
+    """Weights of the terms of the loss. Each term is a mean over the targets and their pixels, over
+    the vertices, or over the Gaussians.
 
     Squared errors make a semi-transparent foreground where the network is in doubt. The terms from
     `absolute` to `opaque` work against that. These terms, and the perceptual terms, are computed
@@ -83,7 +83,8 @@ def loss_terms(
     networks: LossNetworks,
 ) -> dict[str, Scalar]:
     """Returns the unweighted terms of the loss, scalars, by the name of their weight. The
-    renderings must be drawn on the backgrounds of `images`.
+    renderings must be drawn on the backgrounds of `images`. If `drawn` has no opacities, only terms
+    that compare colors are returned.
 
     depths: true z of the person, metres, see `surface_distance`. Raises: ValueError if a term has a
     weight but what it needs is missing.

@@ -103,6 +103,7 @@ def vgg(depths: tuple[int, ...], feature: tuple[int, ...], average: bool = False
     """Returns the slices of a VGG whose block b has `depths[b]` convolutions. In each block, the
     map after convolution `feature[b]`, counted from 1, is compared. Layers after the last compared
     map are left out.
+
     average: whether pools take means.
     """
     slices: list[tuple[Layer, ...]] = []
@@ -178,8 +179,8 @@ def smallest_side(slices: Slices) -> int:
 
 
 def _size_after(layer: Conv | Pool, size: Any) -> Any:
-    """Returns the size of the maps behind a convolution or a pool. size: size before it, an int or
-    an array of several sizes.
+    """Returns the size of the maps after a convolution or a pool. size: the size before it, an int
+    or an array of several sizes.
     """
     if isinstance(layer, Conv):
         margin = 2 * layer.padding
@@ -201,8 +202,8 @@ def feature_maps(
 
     size: height and width of the image without padding, if it was padded below and right so that
     images of several sizes share a program. The maps are then equal to the maps of the image
-    without padding, with zeros beyond them, and the returned sizes say where they end. None: the
-    image is not padded, and the returned sizes are None.
+    without padding, with zeros beyond these, and the returned sizes say where the zeros begin.
+    None: the image is not padded, and the returned sizes are None.
     Raises: ValueError for an image that is too small for the network.
     """
     height, width, _ = image.shape

@@ -75,12 +75,12 @@ class SceneConfig:
     """
     growth: Annotated[float, Range(1, 10)] = 1.2
     """Factor on the number of used slots at each relocation, up to the capacity. By the default,
-    5,000 Gaussians become 200,000 in 2,000 steps. Scenes gain from an early growth
-    (docs/benchmarks/quality.md). Kheradmand et al. have 1.05, and four times the steps.
+    5,000 Gaussians become 200,000 in 2,100 steps. Scenes gain from an early growth
+    (docs/benchmarks/quality.md). Kheradmand et al. use 1.05, and about four times as many steps.
     """
     relocate_until: Share = 0.85
     """Share of the steps after which no Gaussian is relocated any more."""
     splat: SplatConfig = SCENE_SPLAT
-    """How images are drawn. The sizes of the buffers are planned."""
+    """How images are drawn. The sizes of its buffers are ignored, because they are planned."""
     seed: Seed = 0
     """Seed of the order of photos, the noise and the relocations."""

@@ -1,8 +1,9 @@
 """Fits the Gaussians of a scene to posed photos by `fit_scene`, with Adam and the strategy of
 `scenes.mcmc`.
 
-A scene is an explicit state. Its steps and relocations are pure functions (`scenes.steps`). A step
-is compiled once for each kind of camera. This module has the loop around them.
+A scene is an explicit state. Its steps and relocations are pure functions (`scenes.steps`). This
+module has the loop around them. A step is compiled for each kind of camera, and again when the
+buffers get other sizes.
 """
 
 import os
@@ -42,13 +43,15 @@ from humangs_jax.scenes.steps import (
 )
 
 MARGIN = 2.0
-"""Size of the buffers when they are planned, relative to the number of pairs. It leaves room,
-because the number of pairs grows.
+"""Size of the buffers divided by what the Gaussians need when the buffers are planned. It leaves
+room, because the need grows.
 """
 CHECK_EVERY = 25
-"""Number of steps from one check to the next. A check finds out whether all pairs have fit."""
+"""Number of steps from one check of the buffers to the next. A check finds out whether all (splat,
+tile) pairs have fit.
+"""
 SAVE_SECONDS = 60.0
-"""Seconds between two checkpoints."""
+"""Least time between two checkpoints of a running fit, seconds."""
 MARK = "humangs_jax scene"
 """Text in a checkpoint by which it is recognised, because a checkpoint may have any name."""
 
@@ -84,18 +87,19 @@ def fit_scene(
     https://arxiv.org/abs/2404.09591).
 
     Args:
-        images: (h, w, 3) of each camera, RGB in [0, 1] or bytes, or paths of files; sizes may
-            differ.
+        images: one for each camera: an array (h, w, 3) of RGB numbers in [0, 1] or bytes, or the
+            path of a file. Sizes may differ.
         cameras: one for each image, in the same order, with or without lenses.
         points: points (n, 3) where Gaussians begin, as structure from motion finds them, or a pair
             (points, colors), or Gaussians. None or a pair without points: `SceneConfig.start`
             random points where most cameras look.
         config: None: `SceneConfig()`.
         background: the color behind the scene: three numbers in [0, 1], a CSS name or "#rrggbb".
-        checkpoint: a file that takes the state each minute, at the end and at Ctrl-C, and from
-            which the same call continues.
+        checkpoint: path of a file. The state is written there each minute, at the end and at
+            Ctrl-C. The same call continues from that state.
         progress: whether to show a bar.
-        watch: is called with the number of steps and the Gaussians after each relocation.
+        watch: a function that is called with the number of steps and the Gaussians after each
+            relocation.
 
     Returns:
         The Gaussians, the number of steps, seconds and the mean PSNR of the photos.
@@ -103,7 +107,7 @@ def fit_scene(
     Raises:
         ValueError: images that do not fit their cameras, are not in [0, 1] or are too small for
             SSIM; points that are not finite or not (n, 3), or more than the capacity; Gaussians
-            with deformations.
+            with deformations; a background whose name is no color.
         FileNotFoundError: a path of an image without a file.
         FileError: an image or a checkpoint that cannot be read, or a checkpoint of other photos,
             cameras, points, settings or another background.

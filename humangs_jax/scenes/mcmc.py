@@ -90,16 +90,17 @@ def mcmc_relocate(
     used: Bool[Array, " g"],
     count: Int[Array, ""] | int | None = None,
 ) -> Relocated:
-    """Moves dead Gaussians onto other Gaussians, which are drawn at random by opacity, and uses
-    more slots, up to `count`. The scene looks about the same afterwards. If all Gaussians are dead,
-    nothing changes.
+    """Moves dead Gaussians onto other Gaussians, and uses more slots, up to `count`. The other
+    Gaussians are drawn at random, in proportion to their opacity. The scene looks about the same
+    afterwards. If all Gaussians are dead, nothing changes.
 
     Args:
-        key: of `jax.random`.
-        parameters: of all slots, by `unconstrain`.
+        key: a key of `jax.random`.
+        parameters: the parameters of all slots, as `unconstrain` makes them.
         used: (g,) which slots are Gaussians.
-        count: number of slots that are used afterwards, at most all of them. None, or a smaller
-            number than now: the number does not change.
+        count: number of slots that are used afterwards. All slots are used if it is larger than
+            their number. If it is None, or smaller than the number of used slots, that number does
+            not change.
 
     Returns:
         Parameters, which slots are used, and which slots have changed.
@@ -152,8 +153,8 @@ def mcmc_noise(
     fades out where opacities rise above about 0.005.
 
     Args:
-        key: of `jax.random`.
-        parameters: of all slots.
+        key: a key of `jax.random`.
+        parameters: the parameters of all slots.
         used: (g,) which slots are Gaussians; others stay.
         rate: weight of the noise, 1 / metres. The paper's is 5e5 times the learning rate of the
             means.
@@ -182,7 +183,7 @@ def mcmc_penalty(
     of the used slots, each times its weight.
 
     Args:
-        parameters: of all slots.
+        parameters: the parameters of all slots.
         used: (g,) which slots are Gaussians.
         opacity: weight of the mean opacity; the paper's is 0.01.
         scale: weight of the mean scale; the paper's is 0.01.

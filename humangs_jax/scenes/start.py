@@ -45,7 +45,8 @@ def read_photos(images: Any, views: Sequence[Camera], config: SceneConfig) -> li
     """Returns the photos of `fit_scene`, (h, w, 3) each, as bytes or float32 in [0, 1].
 
     Raises: ValueError for another number or size than the cameras have, for values beyond [0, 1],
-    or for photos that are smaller than the window of SSIM.
+    or for photos smaller than the window of SSIM if SSIM is in the loss; FileNotFoundError or
+    FileError for a path that cannot be read.
     """
     if len(images) != len(views) or not views:
         raise ValueError(
@@ -99,7 +100,7 @@ def _points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the points and the colors of the first Gaussians, (n, 3) each.
 
-    Raises: ValueError for points that are not finite or not of shape (n, 3).
+    Raises: ValueError for points or colors that are not finite or not of shape (n, 3).
     """
     rng = np.random.default_rng(config.seed)
     if points is None or (isinstance(points, tuple) and len(points[0]) == 0):

@@ -62,22 +62,23 @@ class Packed:
     """An avatar and a motion, as the page holds them.
 
     Each array of `data` is little-endian and begins at a multiple of 4 bytes. `low`, `high` and
-    `step` are in the header.
+    `step` are in the header. In an array "from low to high", 0 stands for `low` and 65535 for
+    `high`.
 
     Gaussians: means uint16 (g, 3), from low to high, per axis, metres. scales uint16 (g, 3), log of
     metres, from low to high. quats int16 (g, 4), unit, wxyz, times 32767. opacities uint16 (g,),
-    [0, 1]. colors uint16 (g, 3), from low to high. harmonics uint16 (g, k, 3), from low to high;
-    only if the Gaussians have some. weights uint16 (g, 8), skinning weights, the largest first;
-    every row sums to 65535. weight_joints uint8 (g, 8), joints of the weights.
+    from 0 to 1. colors uint16 (g, 3), from low to high. harmonics uint16 (g, k, 3), from low to
+    high; only if the Gaussians have some. weights uint16 (g, 8), skinning weights, the largest
+    first; every row sums to 65535. weight_joints uint8 (g, 8), joints of the weights.
 
     Light, if the avatar has one: light_normals int8 (g, 3), times 127. light_shading uint16 (g,),
     from low to high.
 
-    Skeleton and motion: rest_joints float32 (j, 3), metres. rotations int16 (m, j, 3), axis-angle
-    divided by step, radians. translations float32 (m, 3), metres.
+    Skeleton, and motion if there is one: rest_joints float32 (j, 3), metres. rotations int16 (m, j,
+    3), axis-angle in radians, divided by step. translations float32 (m, 3), metres.
 
     Shape, if the body is known: shape_directions int16 (s, n, 3), how vertices move per unit of a
-    shape coefficient, divided by step, metres. shape_joints float32 (s, j, 3), how joints move,
+    shape coefficient, in metres, divided by step. shape_joints float32 (s, j, 3), how joints move,
     metres.
 
     Face, if the avatar has one with fewer than 255 expressions: face_..., see
@@ -204,8 +205,8 @@ def _fitted_shape(avatar: Avatar, body: BodyModel) -> Float[np.ndarray, " s"] | 
 
 
 def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any, Any]]:
-    """Returns the arrays of avatar and motion, besides the Gaussians, that have to be finite. They
-    are given by name, each with the range `FINITE`.
+    """Returns arrays of the avatar and the motion that have to be finite, by name, each with the
+    range `FINITE`. Arrays of the Gaussians and the light are not among them.
     """
     values = {
         name: (getattr(avatar, name), FINITE)
@@ -262,7 +263,8 @@ def _pack_shape(
 
     Gaussians are stored vertex by vertex and move with their vertex.
 
-    Raises: ValueError if the body does not explain the avatar's vertices.
+    Raises: ValueError if the body does not explain the avatar's vertices, or if the number of
+    Gaussians is no multiple of the number of vertices.
     """
     betas = _fitted_shape(avatar, body)
     vertices = len(avatar.rest_vertices)
@@ -318,9 +320,9 @@ def page_html(
 ) -> str:
     """Returns the page as text.
 
-    motion: None for the walk that comes with the package; there is no motion if the walk has
-    another number of joints than the avatar. The page's motion has at most 60 frames per second,
-    and the person stands on the floor. title, motion_name: names that the page shows.
+    motion: how the avatar moves. None: the walk that comes with the package, or no motion if the
+    avatar has another number of joints than that walk. The page's motion has at most 60 frames per
+    second, and the person stands on the floor. title, motion_name: names that the page shows.
 
     Raises: ValueError (one line) for an avatar or a motion that cannot be drawn, see `pack`.
     """
@@ -386,7 +388,7 @@ def show(avatar: Avatar, motion: Motion | None = None, height: int = 560) -> Not
     """Shows a moving avatar in a notebook.
 
     Make it the last expression of a cell, or call `display(hg.show(avatar))`. The page becomes part
-    of the notebook's file (about 1.2 MB).
+    of the notebook's file (about 1.2 MB for the demo person).
 
     Args:
         avatar: the avatar, of one person.

@@ -20,14 +20,16 @@ def pack_face(
     after the others.
 
     face_rows uint16 (g,): the row of `face_directions` that each Gaussian follows, 65535 for none.
-    face_directions int16 (e, rows, 3): how rows move with each expression, divided by step, metres.
-    face_eyes uint8 (g, 2): shares of both eyes, times 255. face_vertices uint16 (hidden,): the
-    nearest vertex of each hidden Gaussian, for sliders of shape. face_shown uint8 (hidden,): the
-    expression that shows a hidden Gaussian, or 255 for one that is seen between the lips. face_lips
-    float32 (4, 3): points of the lips, metres. face_lip_directions float32 (e, 4, 3): how these
-    points move, metres. face_turns float32 (e, 2, 3): axis-angle of both eyes, radians.
-    motion_faces int16 (m, e): coefficients divided by motion.face_step; only if the motion has
-    some. Here g counts the hidden Gaussians, too.
+    face_directions int16 (e, rows, 3): how rows move with each expression, in metres, divided by
+    face.step. face_eyes uint8 (g, 2): shares by which each Gaussian belongs to the left and the
+    right eye, times 255. face_vertices uint16 (hidden,): the nearest vertex of each hidden
+    Gaussian, for sliders of shape. face_shown uint8 (hidden,): the expression that shows a hidden
+    Gaussian, or 255 for one that is seen between the lips. face_lips float32 (4, 3): points of the
+    lips, metres. face_lip_directions float32 (e, 4, 3): how these points move with each expression,
+    metres. face_turns float32 (e, 2, 3): how both eyes turn with each expression, axis-angle,
+    radians. motion_faces int16 (m, e): the motion's coefficients of the expressions, divided by
+    motion.face_step; only if the motion has such coefficients. Here g counts the hidden Gaussians,
+    too.
     """
     face = avatar.face
     assert face is not None
