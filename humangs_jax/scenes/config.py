@@ -83,4 +83,4 @@ class SceneConfig:
     splat: SplatConfig = SCENE_SPLAT
     """How images are drawn. The sizes of its buffers are ignored, because they are planned."""
     seed: Seed = 0
-    """Seed of the order of photos, the noise and the relocations."""
+    """Seed of random points at the start, the order of photos, the noise and the relocations."""

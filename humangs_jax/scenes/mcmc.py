@@ -1,8 +1,8 @@
 """Moves a fixed number of Gaussians to where they are needed: 3D Gaussian Splatting as Markov Chain
 Monte Carlo.
 
-After Kheradmand et al. 2024 (https://arxiv.org/abs/2404.09591). A scene has slots, as many as it
-may ever have Gaussians, and `used` says which of them are Gaussians. These functions take the place
+After Kheradmand et al. 2024 (https://arxiv.org/abs/2404.09591). A scene has as many slots as it
+may ever have Gaussians, and `used` says which slots are Gaussians. These functions take the place
 of cloning, splitting and pruning:
 
 - `mcmc_relocate` moves Gaussians that have become transparent, and slots that are used from now on,

@@ -123,8 +123,8 @@ def _seen_points(
     views: Sequence[Camera], count: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
     """Returns `count` random points in a cube around the point at which the cameras look
-    (`_middle`). Half a side of the cube is `extent_of` the cameras. Points that more cameras see
-    are likelier.
+    (`_middle`). The cube reaches `extent_of(views)` to each side of that point. Points that more
+    cameras see are likelier.
 
     The chance of a point is in proportion to the fourth power of the number of cameras that see it.
     If the cameras stand around an object, most points lie near it and few between it and the

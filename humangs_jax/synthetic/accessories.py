@@ -1,7 +1,7 @@
 """Builds accessories and shoes: hoods, scarves, hats, glasses, bags, necklaces, shoes.
 
-Their surfaces are swept tubes, sheets, boxes and stacks of silhouettes. Each follows one joint or
-the nearest skin.
+Their surfaces are swept tubes, sheets, boxes and stacks of silhouettes. Each follows the head or
+the skin near it.
 """
 
 import functools
@@ -39,9 +39,10 @@ _SIDEWAYS, _UP, _FORWARD = np.eye(3)
 def build(
     rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float
 ) -> list[tuple[Surface, Material]]:
-    """Builds the surfaces of an accessory, each with its material.
+    """Builds the surfaces of glasses, a necklace, a scarf or headwear, each with its material.
 
-    ease: distance of the outermost layer of clothes from the trunk, metres.
+    garment: its kind says which of these is built. ease: distance of the outermost layer of clothes
+    from the trunk, metres.
     """
     kind, sizes, fabric = garment.kind, garment.sizes, garment.fabric
     hat = functools.partial(hair.scalp_shell, rng, anatomy, hat=True)
@@ -95,8 +96,8 @@ def _ribboned(fabric: Fabric, s: Spots) -> Points:
 
 
 _Ring = tuple[Float[np.ndarray, "ring 3"], Float[np.ndarray, "ring 3"]]
-"""`_RING` points at rest, metres, and as many horizontal unit vectors outwards. The ring begins in
-front and runs over the left side.
+"""`_RING` points at rest, metres, and for each point a horizontal unit vector outwards. The ring
+begins in front and runs over the left side.
 """
 
 
@@ -112,9 +113,10 @@ def _neck_ring(anatomy: Anatomy, lift: float) -> _Ring:
 def _ring(anatomy: Anatomy, near: Bool[np.ndarray, " n"], middle: float) -> _Ring:
     """Returns a smooth ring through the skin near chosen vertices.
 
-    Each point of the ring is a mean of the chosen vertices, with weights that fall with the
-    distance of their azimuths. Azimuths are about the vertical axis at x = 0, z = middle, in
-    template coordinates. near: whether a vertex is chosen, (n,).
+    Each point of the ring has an azimuth, and is a mean of the chosen vertices. The weight of a
+    vertex falls with the difference between its azimuth and that of the point. Azimuths are about
+    the vertical axis at x = 0, z = middle, in template coordinates. near: whether a vertex is
+    chosen, (n,).
     """
     x, _, z = anatomy.skin.template[near].T
     points, azimuths = anatomy.skin.vertices[near], np.arctan2(x, z - middle)

@@ -57,7 +57,7 @@ LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9,
 """Largest rotation angle of each joint in the prior, radians; jaw and eyes stay at rest."""
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
-"""Factors (3,) for a rotation vector. They exchange left and right."""
+"""Factors (3,) on a rotation vector, which mirror the rotation from left to right."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,8 +158,8 @@ class Foot:
     yaw: float = 0.0
     """Heading of the foot, radians about y."""
     pitch: float = 0.0
-    """Roll of the foot, radians. Positive: onto the toes, which stay flat on the ground. Negative:
-    onto the heel.
+    """Pitch of the foot, radians. Positive: the heel is raised, and the toes stay flat on the
+    ground. Negative: the toes are raised, and the heel stays on the ground.
     """
     lift: float = 0.0
     """Height of the whole foot above the ground, metres."""
@@ -193,7 +193,8 @@ def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
 def highest_pelvis(
     build: Build, turn: Matrix, x: float, z: float, feet: Feet, reach: float = 0.998
 ) -> float:
-    """Returns the greatest height of the pelvis at which both legs reach their feet, metres.
+    """Returns the greatest height of the pelvis at which both legs reach their feet, metres. A
+    foot that is too far away for any height counts as reached when the hip is as high as the ankle.
 
     turn: rotation of the pelvis. x, z: place of the pelvis. reach: largest distance from hip to
     ankle as a share of the leg's length. It is less than 1, because a straight leg leaves the
@@ -214,7 +215,8 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -
     The rotation of the pelvis stays. pelvis: position of the pelvis joint (3,), metres; the ground
     is at y = 0.
 
-    Returns: the larger distance of an ankle from its place, metres; 0 unless a leg cannot reach.
+    Returns: the larger distance of an ankle from its place, metres. It is 0, but for rounding, if
+    both legs can reach.
     """
     turn = rotation_matrix(rotations[Joint.PELVIS])
     missed = []
@@ -401,7 +403,9 @@ def measure(
     weights: np.ndarray,
     parents: tuple,
 ) -> Anatomy:
-    """Measures a shaped body. vertices, joints: of the body at rest, metres."""
+    """Measures a shaped body. vertices, joints: of this body at rest, metres. template, faces,
+    weights, parents: of the body model.
+    """
     template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
     vertices = np.asarray(vertices, np.float32)
     attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}

@@ -1,8 +1,9 @@
 """Bakes dressed people into textured meshes, writes these as scans, and stacks them into banks.
 
-A baked person needs a renderer without materials. Texels between charts repeat the nearest chart,
-so that bilinear lookups and smaller copies of the texture stay clean at seams. Folds that are
-painted into the normals become a second texture. Skinning is cut down to a few joints per vertex.
+A baked person can be drawn by a renderer that knows no materials. Texels between charts repeat the
+nearest chart, so that bilinear lookups and smaller copies of the texture stay clean at seams. Folds
+that are painted into the normals become a second texture. In a bank, each vertex follows only the
+few joints with the largest weights.
 
 A scan is a baked and lit mesh in a folder, like that of a scanner: scan.obj with material.mtl and
 material_0.png, scan.glb, and scan.json with seed, shape and pose. Lengths are in metres, y is up,
@@ -10,9 +11,8 @@ and texture coordinates have v up. A vertex is written once for each chart that 
 
 A bank holds the arrays of people, padded to equal shapes. It is made on the host once, and
 `on_the_fly_example` reads it on the device. All people of a bank are from ONE range of seeds (see
-`subject.SPLITS`), so
-that no key of a training bank makes a person of the test range. A person takes about 3 MB at 512
-texels a side.
+`subject.SPLITS`), so that no key of a training bank makes a person of the test range. A person
+takes about 3 MB at 512 texels a side.
 """
 
 import dataclasses
@@ -94,7 +94,7 @@ def bake_subject(
 
     texture_size: texels a side. samples: each texel is the mean of samples x samples points.
 
-    Raises: ValueError if the size is no multiple of the packing's `atlas.CELLS`.
+    Raises: ValueError if `texture_size` is no positive multiple of `atlas.CELLS`.
     """
     surface, pieces = subject.surface, subject.face_materials
     strongest = np.argmax(surface.weights[surface.faces[:, 0]], axis=1)
@@ -136,6 +136,9 @@ def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 204
 
     An existing scan in the folder is replaced. If writing fails, the folder stays as before.
     texture_size: texels a side.
+
+    Raises: ValueError if `texture_size` is no positive multiple of `atlas.CELLS`, or if the folder
+    has files but no scan; OSError.
     """
     import trimesh
     from PIL import Image
@@ -172,8 +175,8 @@ def export_scan(posed: PosedSubject, folder: str | Path, texture_size: int = 204
 
 
 def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "t t 3"]:
-    """Returns the texture (t, t, 3) of a posed subject, with its light. Everything is lit as its
-    outer side.
+    """Returns the texture (t, t, 3) of a posed subject, with its light. All faces are lit as if
+    they were seen from outside.
     """
     ids, weights = texels(baked.atlas)
     known = ids >= 0
@@ -228,8 +231,8 @@ class PeopleBank:
     with v DOWN.
     """
     face_pieces: UInt8[Array, "p f"]
-    """Index of the piece that each face belongs to, (p, f). A person has at most m pieces, each of
-    one material.
+    """Index of the piece that each face belongs to, (p, f). A person has at most m pieces. Each
+    piece has one material.
     """
     sheen: Float[Array, "p m"]
     """Strength of the soft highlight of each piece, (p, m), 0 to 1."""
@@ -284,8 +287,8 @@ def build_bank(
     shipped body themselves.
 
     Raises: ValueError if there are no seeds, if a seed lies in another range, if the body is not
-    the package's body, or if the size of the textures is no multiple of 128; OSError if a process
-    is killed.
+    the package's body, if the size of the textures is no multiple of 128, or if a person has too
+    many pieces or vertices; OSError if a process is killed.
     """
     seeds = list(seeds)
     if not seeds:
@@ -306,13 +309,18 @@ def build_bank(
 
 
 def save_bank(path: str | Path, bank: PeopleBank) -> None:
-    """Writes a bank as one .npz file. If writing fails, no file appears."""
+    """Writes a bank as one .npz file. If writing fails, the path stays as it was.
+
+    Raises: OSError.
+    """
     fields = {name: np.asarray(getattr(bank, name)) for name in (*_ARRAYS, *_STATIC)}
     write_npz(path, fields | {"format": np.asarray(_FORMAT), "version": np.asarray(_VERSION)})
 
 
 def load_bank(path: str | Path) -> PeopleBank:
-    """Reads a bank. Raises: FileNotFoundError; FileError if the file holds no bank."""
+    """Reads a bank. Raises: FileNotFoundError; FileError if the file holds no bank, a damaged bank
+    or a bank of another version of the format.
+    """
     with reading(path, "bank of people"):
         arrays, _ = read_npz(path)
         if str(arrays.get("format")) != _FORMAT:

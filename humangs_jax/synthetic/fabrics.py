@@ -201,8 +201,9 @@ _COLORS = (
     (("sneakers", "leggings", "coat", "puffer", "slim"), 0.4, ((0, 1), (0, 0.1), (0.06, 0.16))),
     (("sneakers", *_LEATHER_SHOES), 0.6, ((0.03, 0.12), (0.0, 0.5), (0.1, 0.7))),
 )
-"""Each row has kinds of garments, the probability that they have this dye, and the ranges of its
-hue, saturation and value. Rows are tried in order. If no row gives the dye, it is a random one.
+"""Each row has kinds of garments, the probability that they have the dye of this row, and the
+ranges of its hue, saturation and value. Rows are tried in order. If no row gives the dye, it is
+random.
 """
 _PATTERN_RULES = (
     (("jeans", "denim_jacket"), "denim", 1, ()),

@@ -71,7 +71,7 @@ class Haircut:
     fringe: str
     """Kind of fringe, one of _FRINGES."""
     side: float
-    """Side of the parting and the fringe, +1 or -1."""
+    """Side of the parting, +1 for left or -1 for right. The fringe is mirrored for -1."""
     thickness: float
     """Thickness of the hair on the scalp, metres."""
     bottom: float
@@ -143,7 +143,7 @@ _SKULL_RADIUS = 0.09
 _BRIM = 0.385
 """Height of the hairline at the forehead, above which hair is a dome, template coordinates."""
 _CHIN = 0.24
-"""Height of the chin, between the head and the neck with the shoulders, template coordinates."""
+"""Height of the chin, template coordinates. Above is the head, below are neck and shoulders."""
 _NAPE = 0.23
 """Height of the nape, below which hair begins to stand off the neck, template coordinates."""
 _SHOULDERS = 0.17
@@ -202,7 +202,7 @@ def style(
 ) -> list[Surface]:
     """Builds the surfaces of a haircut and a beard.
 
-    over: distance of the clothes below the hair from the skin, metres.
+    over: how far the clothes under the hair stand off the skin, metres.
     """
     kind, parts = haircut.cut, []
     # long hair falls as a tube, short hair is a shell of the scalp
@@ -235,7 +235,7 @@ def style(
 
 
 _Opening = Callable[[Field, Field], Field]
-"""A function of azimuths in (-pi, pi] and template heights, both (n,). It returns (n,) numbers that
+"""A function of azimuths in [-pi, pi) and template heights, both (n,). It returns (n,) numbers that
 are positive where hair or cloth is, and negative where the face is free.
 """
 
@@ -341,9 +341,10 @@ def falling_tube(
 ) -> Surface:
     """Builds long hair, a hood or a headscarf: the enlarged skull, from which a tube falls.
 
-    thickness: by which the skull is enlarged, metres. bottom: template height where the tube ends
-    at the back. opening: where the face is free. wave: height of waves, metres. ends: template
-    height where the tube ends in front. over: distance of the clothes below from the skin, metres.
+    thickness: metres by which the skull is enlarged. bottom: template height where the tube ends at
+    the back. opening: where the face is free. wave: height of waves, metres. ends: template height
+    where the tube ends in front. over: how far the clothes under the tube stand off the skin,
+    metres.
     """
     to_rest, center = _skull(anatomy)
     head, back = _silhouettes(anatomy)
@@ -385,11 +386,11 @@ def falling_tube(
 
 
 def _silhouettes(anatomy: Anatomy) -> tuple[Boundaries, Boundaries]:
-    """Returns the silhouettes of the head, and of neck, shoulders and back. Their centres are on
-    the vertical axis through the middle of the skull.
+    """Returns two stacks of silhouettes: of the head, and of neck, shoulders and back. All centres
+    are on the vertical axis through the middle of the skull.
 
-    The silhouettes of the head leave out the ears and the middle of the face. Downwards they get
-    narrower by at most 0.25 m per metre, like hair that hangs from the widest part of the head.
+    The silhouettes of the head leave out the ears and the middle of the face. Downwards their radii
+    shrink by at most 0.25 m per metre, like hair that hangs from the widest part of the head.
     """
     x, y, z = anatomy.skin.template.T
     side = np.abs(x)
@@ -415,8 +416,9 @@ def _silhouettes(anatomy: Anatomy) -> tuple[Boundaries, Boundaries]:
 
 
 def _ring_heights(top: float, bottom: float) -> Float[np.ndarray, " r"]:
-    """Returns the template heights of the rings of a tube that falls from a dome, from the top
-    down. The dome ends at the middle of the skull, the tube at the lower one of `bottom` and 0.3.
+    """Returns the template heights of the rings of a dome and of the tube that falls from it, from
+    the top down. The dome ends at the middle of the skull. The tube ends just above `bottom`, or
+    above 0.3 if `bottom` is higher.
     """
     dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))
     tube = np.arange(SKULL[1] - 0.02, min(bottom, 0.3), -0.022)
@@ -524,8 +526,8 @@ def eyeballs(anatomy: Anatomy) -> Surface:
 
 
 def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
-    """Returns a function that maps template heights of head and neck to heights of the person at
-    rest, and the middle of the person's skull (3,). Both are in metres.
+    """Returns a function and a point (3,), metres. The function maps template heights of head and
+    neck to heights of the person at rest. The point is the middle of the person's skull.
     """
     neck = anatomy.joints[Joint.NECK, 1]
     factor = (anatomy.skin.vertices[:, 1].max() - neck) / (_CROWN - _NECK_HEIGHT)
@@ -539,8 +541,8 @@ def _skull(anatomy: Anatomy) -> tuple[Callable[..., np.ndarray], Vector]:
 def _falling_weights(
     anatomy: Anatomy, vertices: Points, template_y: Field
 ) -> Float[np.ndarray, "n j"]:
-    """Returns the skinning weights (n, j) of something that falls from the head. At the top they
-    are the head's weights, further down the weights of the nearest skin.
+    """Returns the skinning weights (n, j) of something that falls from the head. At the top it
+    follows the head, further down the nearest skin.
 
     template_y: template heights of the vertices (n,).
     """

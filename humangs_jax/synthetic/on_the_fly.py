@@ -66,8 +66,8 @@ class OnTheFlyConfig:
     target_size: Side = 256
     """Side of the targets, pixels."""
     mixed_pose_share: Share = 0.3
-    """Probability that each input of an example shows one of the example's two poses at random.
-    Otherwise all inputs show the first pose. Targets always show one of the two at random.
+    """Share of the examples in which each input shows one of the example's two poses at random. In
+    all other examples the inputs show the first pose. Targets always show one of the two at random.
     """
     jitter: Spread = 0.7
     """How irregular the azimuths of the inputs are: each is off by up to half of this times the
@@ -132,7 +132,7 @@ def on_the_fly_example(
     config: OnTheFlyConfig = ON_THE_FLY,
     person: Int[Array, ""] | int | None = None,
 ) -> Example:
-    """Renders the input and target views of a person of the bank.
+    """Renders the input and target views of a person of the bank. `key` decides all random numbers.
 
     person: the index of the person in the bank. None: the key chooses.
 
@@ -525,7 +525,9 @@ def _described(person: int, appearance: int) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class EachPerson:
-    """Source that shows each person of a bank once, in order, for comparisons."""
+    """Source that shows each person of a bank once, in order, and then begins again. It is for
+    comparisons.
+    """
 
     bank: PeopleBank
     """The people."""
@@ -550,8 +552,8 @@ class EachPerson:
         return _described(person, self._appearance(seed, index))
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
-        """Returns an example of person `index` of the bank, see `Source`. seed and index decide the
-        appearance.
+        """Returns an example of a person of the bank, see `Source`. The person has the number
+        `index` modulo the number of people. seed and index decide the appearance.
         """
         person = index % self.bank.people
         key = subject_key(int(self.bank.seeds[person]), self._appearance(seed, index))

@@ -1,9 +1,10 @@
 """A pose prior: draws plausible poses of people who stand, stride, crouch or reach.
 
 Poses keep to the limits of the joints, and the person stands on the ground. A stance places the
-feet and the pelvis. For each arm many candidates are drawn, and one is kept: its wrist comes
-nearest to a goal, and its forearm and hand stay out of the trunk, the head, the legs and the other
-arm. Hands blend a few gestures. `anatomy` has the joints, their limits and the conventions.
+feet and the pelvis. For each arm many candidates are drawn, and the one with the least cost is
+kept. The cost is the distance of the wrist from a goal, plus penalties where forearm and hand come
+too near to trunk, head, legs or the other arm, or where the shoulder exceeds its limit. Hands blend
+a few gestures. `anatomy` has the joints, their limits and the conventions.
 """
 
 import dataclasses
@@ -304,9 +305,10 @@ def bend_arm(
     Trunk, head and legs must be set before the arm.
 
     goal: a name that `draw_goal` returns. side: 0 for left, 1 for right. other_arm: whether to keep
-    clear of the other arm, too. This arm must then be set before.
+    clear of the other arm, too. The other arm must then be set before.
 
-    Returns: the distance of forearm and hand from the body, metres; negative where they are inside.
+    Returns: the least distance of forearm and hand from what they keep clear of, metres. It is
+    negative if they are inside.
     """
     matrix, vector = kin.rotation_matrix, kin.rotation_vector
     collar, shoulder, elbow, wrist = ARMS[side]
@@ -356,8 +358,8 @@ def bend_arm(
 
 
 def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
-    """Returns the least distance of the forearms and hands from the body and from the other arm, in
-    metres. It is negative if a forearm or hand is inside.
+    """Returns the least distance of a forearm or hand from the body and from the other arm, metres.
+    It is negative if one of them is inside of these.
     """
     world, positions = kin.joint_positions(build, rotations)
     body, worst = _body_capsules(build, world, positions), np.inf
@@ -418,7 +420,9 @@ def _clearance(
 def _along(
     elbows: Float[np.ndarray, "*n 3"], wrists: Float[np.ndarray, "*n 3"]
 ) -> list[Float[np.ndarray, "*n 3"]]:
-    """Returns five points from elbow to knuckles, which must not touch the body."""
+    """Returns five points of each arm, from the elbow to beyond the knuckles. They must not touch
+    the body.
+    """
     tips = wrists + _HAND_LENGTH * (wrists - elbows)
     return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]
 
@@ -438,8 +442,8 @@ _GESTURES = {
     "hold": (0.11, (0.65, 0.7, 0.75, 0.8), 0.05, 0.6),
 }
 """Gestures by name. Each has four things: its odds; the curl of index, middle, ring and pinky,
-radians per knuckle; the angle between fingers, radians; and how far the thumb lies across the palm.
-This is 0 beside the palm, 1 across the palm, and negative if the thumb points away.
+radians per knuckle; the angle between fingers, radians; and the place of the thumb: 0 beside the
+palm, 1 across the palm, negative if it points away.
 """
 
 

@@ -46,7 +46,7 @@ _SPARE = 0.995
 the leg's length.
 """
 _TRIES = 12
-"""Largest number of goals that are tried for an arm until one is clear of the body."""
+"""Largest number of times that an arm is drawn until it is clear of the body."""
 
 
 _Heading = Callable[[float | np.ndarray], float | np.ndarray]
@@ -277,7 +277,8 @@ def _swing_arms(
 ) -> None:
     """Sets arms and hands in `rotations`: arms hang, and swing against the legs.
 
-    One hanging pose is drawn for all frames, and swings about the x axis.
+    For each arm one hanging pose is drawn. In all frames the arm has this pose, turned about the x
+    axis by the angle of the swing.
     """
     # arms hang beside straight legs
     stood = rotations[0].copy()

@@ -34,8 +34,9 @@ def people_of_split(
     for every step.
 
     people: number of people. size: side of the images, pixels. Textures are as fine as images of
-    this size need.
-    each_once: see `on_the_fly_people`.
+    this size need. each_once: see `on_the_fly_people`.
+
+    Raises: ValueError if the split has fewer people; KeyError if there is no such split.
     """
     texture = 1024
     if size <= 64:
@@ -84,8 +85,8 @@ def on_the_fly_people(
 
 
 def _bank(people: int, out: Path, body: BodyModel) -> PeopleBank:
-    """Returns the bank in out/people.npz. If there is no bank of the right seeds, one process makes
-    it.
+    """Returns the bank in out/people.npz. If that file is missing or has other seeds, the first
+    process of the run makes a bank and writes it there.
     """
     path, seeds, bank = out / "people.npz", SPLITS["train"][:people], None
     if jax.process_index() == 0:

@@ -1,8 +1,8 @@
 """Makes a synthetic person from a seed, and renders the person in a pose.
 
 `describe` makes only the description, which is a few numbers. It takes milliseconds, so that
-thousands of people can be counted without any geometry. `make_subject` builds mesh, materials and
-lights from the description, and the measures that the pose prior needs. Views are rasterized at
+thousands of people can be counted without any geometry. `make_subject` builds the mesh and the
+materials from the description, and the measures that the pose prior needs. Views are rasterized at
 twice their size, shaded at each sample, and averaged.
 
 A seed names a person. Each purpose, such as training or testing, has a range of seeds (`SPLITS`),
@@ -90,7 +90,8 @@ def split_of(seed: int) -> str:
 def seeds_of(split: str, first: int, count: int) -> range:
     """Returns `count` seeds of a split, from number `first` on.
 
-    Raises: ValueError if the split has no such seeds; KeyError if there is no such split.
+    Raises: ValueError if the split has no such seeds, or if `count` is less than 1; KeyError if
+    there is no such split.
     """
     people = SPLITS[split]
     if first < 0 or count < 1 or first + count > len(people):
@@ -213,8 +214,8 @@ class SyntheticSubject:
     build: Build
     """Joints and radii of the body, which the pose prior needs."""
     cover: Field
-    """How far each vertex of the skin lies inside of a hem, (n,), metres. Negative on bare skin and
-    on everything that is not skin.
+    """How far each vertex of the mesh lies inside of a hem if it is skin, (n,), metres. It is
+    negative on bare skin, and -1 on everything that is not skin.
     """
     person: Person
     """The description that the other fields were built from."""
@@ -247,8 +248,8 @@ _shape = jax.jit(shape_body)
 
 
 def check_body(body: BodyModel) -> None:
-    """Raises ValueError if a body is not the package's. The cuts and the paint of clothes are given
-    in coordinates of the package's body.
+    """Raises ValueError if a body does not have the name and the number of vertices of the
+    package's body. Cuts and paint of clothes are given in coordinates of the package's body.
     """
     if (body.name, len(body.template)) != BODY:
         raise ValueError(f"synthetic people need the shipped body '{BODY[0]}', got '{body.name}'")

@@ -30,9 +30,10 @@ def choice(rng: np.random.Generator, odds: Mapping[str, float | int]) -> str:
 
 
 class Ripples:
-    """A random smooth function of points: a sum of plane waves around a wavelength in metres.
+    """A random smooth function of points: a sum of plane waves whose wavelengths are near a given
+    one, in metres.
 
-    The amplitude is about 1.
+    The values have a standard deviation of 0.7.
     """
 
     def __init__(self, rng: np.random.Generator, wavelength: float, waves: int = 6):
@@ -56,9 +57,9 @@ def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) -> 
 class Folds:
     """A random function of points that describes creases of cloth.
 
-    It has ridges in a few directions, each direction in separate patches. All random numbers are
-    drawn when the object is made. wavelength: rough distance between ridges, metres. upright:
-    whether all ridges run roughly along y.
+    It has ridges in `directions` directions, each direction in patches at other places. All random
+    numbers are drawn when the object is made. wavelength: about twice the distance between ridges,
+    metres. upright: whether all ridges run roughly along y.
     """
 
     def __init__(
@@ -406,8 +407,8 @@ _GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
 _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
 """1 / cos(a - b) for each pair of the angles a and b of a silhouette, (ANGLES, ANGLES); infinite
-where the cosine is at most 0.1. With support(b), the largest extent of the points in direction b,
-the radius of a convex silhouette at a is the least support(b) / cos(a - b) over all b.
+where the cosine is at most 0.1. Let support(b) be the largest extent of the points in direction b.
+The radius of a convex silhouette at a is then the least support(b) / cos(a - b) over all b.
 """
 
 

@@ -3,9 +3,9 @@
 People that are written to files get cameras and light from a numpy generator. People made on the
 fly get them from random numbers on the device. Cameras are like those of the published protocol:
 around the person, near the horizon, with a vertical field of view of 60 degrees. The light is soft:
-sky, ground, three wide lights, occlusion and soft shadows. A point has the same color from wherever
-it is seen. Occlusion and the shadow of the key light are computed at vertices, in a voxel grid that
-holds the posed person.
+sky, ground, three wide lights, occlusion and soft shadows. Each side of a surface has the same
+color from wherever it is seen. Occlusion and the shadow of the key light are computed at vertices,
+in a voxel grid that holds the posed person.
 """
 
 import functools
@@ -460,7 +460,7 @@ def _nearest(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Arra
 def _trilinear(grid: Float[Array, "x y z"], at: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """Interpolates the grid's values (n,) at fractional indices `at` (n, 3).
 
-    Outside of the grid they are the values at its border, which is empty.
+    Outside of the grid they are the values at its border, which is empty if the person fits in.
     """
     base = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, jnp.asarray(GRID) - 2)
     t = jnp.clip(at - base, 0, 1)

@@ -149,7 +149,7 @@ def shaft(template: Points, height: float) -> Field:
 def straps(template: Points, low_front: float, low_back: float) -> Field:
     """Returns a field (n,) that is positive on two straps over the shoulders.
 
-    low_front, low_back: heights where they end.
+    low_front, low_back: heights where they end, in front and at the back.
     """
     x, y, z = template.T
     low = np.where(z > -0.01, low_front, low_back)
@@ -175,7 +175,8 @@ def sash(template: Points, shoulder: float, hip: float, half_width: float) -> Fi
 def necktie(template: Points, length: float, width: float) -> Field:
     """Returns a field (n,) that is positive on a tie: a strip down the chest with a knot on top.
 
-    The strip widens downwards and ends in a point. width: half of its largest width, metres.
+    The strip widens downwards and ends in a point at y = 0.1 - length. length: metres. width: half
+    of the strip's largest width, metres.
     """
     x, y, z = template.T
     top, bottom = 0.137 - 0.42 * z, 0.1 - length

@@ -78,8 +78,8 @@ def _random_text(rng: np.random.Generator) -> str:
 def written(cells: Bool[np.ndarray, "7 w"], x: Field, y: Field) -> Field:
     """Returns how much ink of a word is at each point (n,), 0 to 1. Edges are rounded.
 
-    cells: as `bitmap` returns them. x, y: points to the right of and above the lower left corner of
-    the word, in cells, (n,).
+    cells: as `bitmap` returns them. x, y: how far the points are to the right of the lower left
+    corner of the word, and above it, in cells, (n,).
     """
     padded = np.pad(cells.astype(np.float32), 1)
     column = np.clip(x + 0.5, 0, padded.shape[1] - 1.001)
@@ -95,7 +95,7 @@ def emblem(kind: str, x: Field, y: Field, points: int = 5) -> Field:
     """Returns how far points are inside of an emblem (n,), negative outside.
 
     The emblem has a radius of about 1 around x = y = 0. kind: one of EMBLEMS. points: number of
-    points of a star.
+    tips of a star.
     """
     r, a = np.sqrt(x * x + y * y), np.arctan2(x, y)
     if kind == "disc":

@@ -54,7 +54,7 @@ class Outfit:
     pieces: list[Piece]
     """The pieces of clothes that have been put on, innermost first."""
     cover: np.ndarray
-    """How far each body vertex is inside of a hem, (n,), metres; negative on bare skin."""
+    """How far each body vertex is inside of a hem, (n,), metres. It is negative on bare skin."""
     removed: np.ndarray
     """Whether clothes hide each body vertex, (n,)."""
     rng: np.random.Generator
@@ -271,7 +271,9 @@ def _outer(outfit: Outfit, garment: Garment) -> None:
 
 
 def _outer_fit(outfit: Outfit, garment: Garment) -> Fit:
-    """Returns the fit of a jacket or coat. Padded ones stand off; they and blazers fold little."""
+    """Returns the fit of a jacket or coat. Padded garments stand off. Padded garments and blazers
+    have low folds.
+    """
     kind, loose, padded = garment.kind, garment.sizes["loose"], garment.kind in PADDED
     if kind == "coat":
         hang = 1.5

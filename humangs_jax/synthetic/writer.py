@@ -5,9 +5,10 @@ out/SEED/                            a capture (docs/capture_format.md): views o
                                      or several poses
 out/SEED/held_out/                   a separate capture with the views that reconstruction may not
                                      see
-out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
-out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see
-                                     `bank`
+out/SEED/motion.npz                  if `Layout.frames` is not 0: the whole motion. The capture
+                                     shows some of its frames
+out/SEED/scan/                       if `Layout.scan_texture` is not 0: the first pose as a lit,
+                                     textured mesh, see `bank`
 """
 
 import dataclasses
@@ -92,13 +93,12 @@ class Layout:
     the cameras of `views`, and see only a part of the person.
     """
     held_out_views: int = 0
-    """Number of cameras in held_out/ that see the first pose, and each of the novel poses."""
+    """Number of cameras in held_out/ for each of its poses: the first pose and the novel poses."""
     novel_poses: int = 0
     """Number of further poses that only held_out/ shows."""
     frames: int = 0
-    """Number of frames of the motion, at 30 per second; `poses` evenly spaced frames are shown.
-
-    0: there is no motion, and poses are independent.
+    """Number of frames of the motion, at 30 per second. The capture shows `poses` evenly spaced
+    frames of it. 0: there is no motion, and poses are independent.
     """
     scan_texture: int = 0
     """Side of the scan's texture, texels. 0: no scan is written."""
@@ -171,6 +171,9 @@ def capture_views(
 def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout) -> None:
     """Writes one person. An existing capture in the folder is replaced. If writing fails, the
     folder stays as before.
+
+    Raises: ValueError if the folder has files but no capture, if the body is not the package's
+    body, or if the size of the scan's texture is no multiple of 128; OSError.
     """
     subject = make_subject(seed, body)
     # poses are independent, or evenly spaced frames of one motion
@@ -236,8 +239,9 @@ def write_set(
     Returns: the folders.
 
     Raises: ValueError if the people reach beyond the split, if `out` was written with other
-    settings or by another version of the generator, or at the end if some people could not be made;
-    OSError if nothing can be written there; KeyError if there is no such split.
+    settings, for another split or body or by another version of the generator, or at the end if
+    some people could not be made; OSError if nothing can be written there; KeyError if there is no
+    such split.
     """
     out, seeds = Path(out), seeds_of(split, first, subjects)
     # a set is made with one set of settings, which its manifest keeps
@@ -315,10 +319,11 @@ def _views(
 def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
     """Returns the capture folders in `root`, sorted by name, or `root` itself if it is a capture.
 
-    split: the split that all people of a synthetic set must belong to. None: any. It is ignored for
-    real captures and for captures of `humangs preprocess`.
+    split: the split that all people must belong to if `root` is a synthetic set. None: any. It is
+    ignored if `root` has no manifest, as with real captures, and for sets of `humangs preprocess`.
 
-    Raises: ValueError if a synthetic set has a person of another split, or if there is no capture.
+    Raises: ValueError if a synthetic set has a person of another split, if its manifest cannot be
+    read, or if there is no capture.
     """
     root = Path(root)
     folders = find_captures(root)

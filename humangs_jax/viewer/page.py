@@ -471,7 +471,7 @@ def known_body(avatar: Avatar) -> BodyModel | None:
 
 
 def page_script(*names: str) -> str:
-    """Returns the text of some of the page's scripts, after the tables of `page_rules`.
+    """Returns the tables of `page_rules` as script, followed by some of the page's scripts.
 
     names: names of files in page/, without .js.
     """
