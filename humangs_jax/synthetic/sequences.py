@@ -277,8 +277,8 @@ def _swing_arms(
 ) -> None:
     """Sets arms and hands in `rotations`: arms hang, and swing against the legs.
 
-    For each arm one hanging pose is drawn. In all frames the arm has this pose, turned about the x
-    axis by the angle of the swing.
+    For each arm one hanging pose is drawn. In each frame its shoulder is turned about the x axis by
+    the angle of the swing, and elbow and collar turn a little, too.
     """
     # arms hang beside straight legs
     stood = rotations[0].copy()

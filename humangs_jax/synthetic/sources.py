@@ -53,10 +53,11 @@ def on_the_fly_people(
     """Returns a function that makes a source of the people of a bank. They are rendered for every
     step on the device that trains.
 
-    Image sizes and views are those of the run's configuration.
+    Image sizes and views are those of the run's configuration. If the default device is not a CPU,
+    all views of an example are drawn at once.
 
-    each_once: whether each person is shown once, in order, for validation; otherwise people are
-    random.
+    settings: what else the examples show, and how they are drawn. each_once: whether each person is
+    shown once, in order, for validation; otherwise people are random.
     """
 
     def make(config: TrainConfig) -> Source:

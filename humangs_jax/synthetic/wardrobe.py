@@ -35,7 +35,7 @@ class Piece:
     material: Material
     """The material of the piece."""
     hidden: np.ndarray | None = None
-    """Whether a later layer covers each vertex, (n,). None: no layer hides any of the piece."""
+    """Whether a later layer covers each vertex, (n,). None: later layers hide nothing of it."""
 
     def visible(self) -> "Piece":
         """Returns the piece without the faces whose corners are all hidden."""
@@ -185,7 +185,7 @@ def _collar(
 
 
 def _top(outfit: Outfit, garment: Garment) -> None:
-    """Puts on a top: the bodice, and a collar or a hood that lies on it."""
+    """Puts on a top: the bodice, and for some kinds a collar or a hood that lies on it."""
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
     # looser tops stand off further, hang more, and have higher folds; short sleeves stand off too
