@@ -112,6 +112,8 @@ def fit_scene(
         FileNotFoundError: a path of an image without a file.
         FileError: an image or a checkpoint that cannot be read, or a checkpoint of other photos,
             cameras, points, settings or another background.
+        OSError: the checkpoint cannot be written.
+        TypeError: inside of `jit`, `vmap` and `grad`.
 
     Examples:
         >>> cameras = hg.load_cameras("garden/sparse/0")
