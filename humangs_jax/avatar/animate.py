@@ -191,8 +191,8 @@ def _animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
 def with_pixel_footprint(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> Avatar:
     """Returns the avatar with the low-pass of images in its scales.
 
-    pixel: side of a pixel of these images at the Gaussians, metres, one number or one for each
-    Gaussian. The avatar is returned as it is if its `rendering` is not "exact", or if its scales
+    pixel: side of an image's pixel at the Gaussians, metres: one number, or one for each Gaussian.
+    The avatar is returned as it is if its `rendering` is not "exact", or if its scales
     contain a low-pass already.
     """
     gaussians = avatar.gaussians

@@ -1,5 +1,5 @@
-"""Makes a face for an avatar on a body with expressions. It finds how the avatar's Gaussians move,
-and adds Gaussians for what photos do not show.
+"""Makes the face of an avatar whose body has expressions. It finds how the avatar's Gaussians
+move, and adds Gaussians for what photos do not show.
 """
 
 import functools
@@ -103,11 +103,10 @@ def shipped_network() -> HumanGSConfig:
 
 
 def body_of(avatar: Avatar) -> BodyModel | None:
-    """Returns the shipped body if the avatar has the face of this body, else None. The body is
-    returned as it is or remeshed to carry Gaussians (`gaussian_body`), as the avatar's vertices
-    are.
+    """Returns the shipped body if the avatar has the face of this body. Returns the body that
+    `gaussian_body` makes of it if the avatar has the face of that body, and None if it has neither.
 
-    The avatar's vertices may be displaced, and the vertices of a skirt may follow them.
+    Only triangles are compared. The avatar's vertices may be displaced, and it may have a skirt.
     """
     if avatar.parents != PARENTS:
         return None

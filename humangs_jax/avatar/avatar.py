@@ -119,7 +119,7 @@ def turned_normals(
 def relit(
     colors: Float[Array, "g 3"], light: Light, linear: Float[Array, "g 3 3"]
 ) -> Float[Array, "g 3"]:
-    """Returns the colors of Gaussians after the linear maps `linear` of their surfaces.
+    """Returns the colors of Gaussians after their surfaces were turned by the linear maps `linear`.
 
     Colors do not exceed 1, except those that did before.
     """
@@ -319,7 +319,8 @@ class Avatar(Batchable):
 
         Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and for
         Gaussians with deformations, because an avatar in T-pose has none; FileError if `load` would
-        refuse the joints or an array, for example for numbers that are not finite; OSError.
+        refuse the joints or an array, for example for numbers that are not finite; OSError;
+        TypeError inside of JAX transformations.
         """
         require_concrete("Avatar.save", "writes a file", self)
         # a file holds one avatar in the T-pose

@@ -1,8 +1,7 @@
 """Reads the cameras of a file, and makes paths of cameras along which an avatar is seen.
 
-The person stands on the floor, at the middle of a world with y up and in metres, as in the motions
-of `motion_views` and in the files of `export`. If a format has another axis up, `file_cameras` can
-turn its world.
+The world is in metres and has y up. The person stands on its floor near x = z = 0, as in the files
+of `export`. If a format has another axis up, `file_cameras` can turn its world.
 """
 
 import logging

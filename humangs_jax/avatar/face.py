@@ -32,8 +32,8 @@ RIM = 0.3
 Gaussians are some millimetres wide.
 """
 BEFORE_LIPS = 0.004
-"""A point of the mouth, such as the tip of the tongue, is fully seen if it is at least this far in
-front of the lips, metres.
+"""While the mouth is open, a point of the mouth, such as the tip of the tongue, is fully seen if it
+is at least this far in front of the lips, metres.
 """
 
 
@@ -108,7 +108,7 @@ def moved_hidden(face: Face, expression: Float[Array, " e"]) -> Gaussians:
 
 def between_lips(points: Float[Array, "q 3"], lips: Float[Array, "4 3"]) -> Float[Array, " q"]:
     """Returns how much of each point is seen through the opening of the mouth, in [0, 1]. The
-    opening is an ellipse; a point well in front of the lips is fully seen.
+    opening is an ellipse. While the mouth is open, points well in front of the lips are fully seen.
     """
     upper, lower, left, right = lips
     center = (upper + lower) / 2

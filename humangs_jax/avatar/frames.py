@@ -46,8 +46,8 @@ FOLLOWING = 0.5
 camera follows a walk, but not the swing of steps and arms, which takes about a second.
 """
 WIDEST = 2
-"""The largest standard deviation of this kernel, as a multiple of the number of frames. With this
-standard deviation, less than 1e-8 is left of anything in the path but a straight line.
+"""The largest standard deviation of this kernel, as a multiple of the number of frames. The path is
+then a straight line, because less than the share 1e-8 of any deviation from it is left.
 """
 TRACKED = 1024
 """Number of Gaussians, evenly spread, on which a person's extent is measured."""
@@ -60,8 +60,8 @@ MOST_TRACKED = 1 << 25
 MOST_FRAMES = 4
 """The largest number of frames that are drawn at the same time on a CPU."""
 PIXELS_AT_ONCE = 1 << 22
-"""Number of pixels that these frames have together, if there is more than one. Drawing needs some
-100 bytes a pixel.
+"""The largest number of pixels in the frames that are drawn at the same time. A frame with more
+pixels is drawn alone. Drawing needs some 100 bytes a pixel.
 """
 A_POSE = 48.0
 """Degrees by which the arms hang down in the A-pose, as in the viewer's page."""
@@ -78,7 +78,7 @@ def draw(
     exposure_gains: Float[np.ndarray, "v 3"] | None = None,
     at_once: int | None = None,
 ) -> Iterator[Rendering]:
-    """Yields one rendering for each pose and its camera. how: the configuration. None: the preset
+    """Yields one rendering for each pose and its camera. how: how to splat. None: the preset
     `avatar.rendering`, for which the avatar was trained. exposure_gains: factors on the colors in
     each image, (v, 3), see `data.exposure`. at_once: as for `draw_gaussians`.
     """
@@ -104,7 +104,8 @@ def draw_gaussians(
     at_once: int | None = None,
 ) -> Iterator[Rendering]:
     """Yields one rendering for each frame of Gaussians and its camera. at_once: the number of
-    frames that are drawn at the same time. None: as many as cores and memory allow.
+    frames that are drawn at the same time. None: on a CPU as many as cores, `MOST_FRAMES` and
+    `PIXELS_AT_ONCE` allow, elsewhere one.
 
     Buffers are planned for the first frame, with room to spare. Programs are compiled once per
     image size, and again only if a frame needs more room than that.
@@ -368,8 +369,8 @@ def motion_views(
     """Puts a motion on the floor, and returns a pose and a camera for each of its frames.
 
     Arguments: turn: degrees by which the camera goes around the person during the motion. follow:
-    whether the camera goes along with the person. If not, it looks at one point, from far enough
-    away to keep the person in the image.
+    whether the camera goes along with the person. If not, it looks at one point. Unless the shot
+    has a distance, the camera is far enough away to keep the person in the image.
 
     Raises: ValueError if the motion has another number of joints than the avatar, or the shot is
     out of range.

@@ -8,9 +8,9 @@ position: the point of the world at this depth on the ray of the pixel, metres.
 normal: unit normals of the body's surface, in the world. Each Gaussian has the normal of the
     vertex that is nearest to it in the T-pose, turned by its own skinning transform. A pixel has
     the mean of these normals with the weights of its color, scaled to length 1.
-part: the joint that most of the pixel's color follows. 1 is the first joint of the header's
-    `parts`. 0 is no joint, where alpha is below 1/2. A Gaussian follows the joint of its largest
-    skinning weight.
+part: the number of the joint that moves the largest part of the pixel's color, counted from 1 in
+    the header's `parts`. It is 0 where alpha is below 1/2. Each Gaussian counts for the joint of
+    its largest skinning weight.
 
 None of these is multiplied by alpha. All are 0 where alpha is 0.
 
@@ -80,7 +80,7 @@ class ExrView:
 
 @dataclasses.dataclass(frozen=True)
 class ExrLayers:
-    """The contents of an EXR file of views."""
+    """Which layers an EXR file of views has, and with how many bits."""
 
     layers: tuple[str, ...] = ("rgba", "z")
     """The layers to write, names in `LAYERS`. Colors are always written."""
@@ -174,8 +174,8 @@ def exr_view(
     layers: Iterable[str],
     how: SplatConfig,
 ) -> ExrView:
-    """Returns a view with its layers. rendering: the rendering of this avatar, pose and camera onto
-    black.
+    """Returns a view with its layers. rendering: the avatar in this pose, drawn from this camera
+    onto black.
     """
     layers, alpha = set(layers), np.asarray(rendering.alpha)
     channels, attributes = {}, {}

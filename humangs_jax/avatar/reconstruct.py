@@ -92,17 +92,20 @@ def reconstruct(
     rounded up to few sizes; a program is compiled for each.
 
     Worlds that are not y-up are turned for the network. The avatar then has no light, because its
-    directions would be those of another world. For a network that looks at the person's pixels
-    alone, the body is displaced first, unless `Runtime.displacement` is False. If the capture has a
-    displacement, it is used. If it has masks only, the body is moved to their edges if it does not
-    fit them, or in any case if `Runtime.displacement` is True. If the masks show a skirt, the body
-    of the avatar has one (`data.skirt`). What no photo shows is guessed from what photos show
-    (`avatar.unseen`). If the network has a driver, which corrects Gaussians for each frame, the
-    avatar is without these corrections.
+    directions would be those of another world.
+
+    If the network looks only at the person's pixels, what no photo shows is guessed from what
+    photos show (`avatar.unseen`). Before that the body is displaced, unless `Runtime.displacement`
+    is False. A displacement of the capture is used as it is. Without one, vertices are moved to the
+    edges of the masks: always if `Runtime.displacement` is True, else only if the body does not fit
+    the masks. If the masks show a skirt, the body gets one (`data.skirt`).
+
+    If the network has a driver, which corrects Gaussians for each frame, the avatar is without
+    these corrections.
 
     Args:
-        variables: of the network; with `config`, what `load_weights` returns.
-        config: of the network.
+        variables: the variables of the network. `load_weights` returns them with `config`.
+        config: the configuration of the network.
         capture: photos, cameras, poses, and masks if there are some; or what `prepare_capture` made
             of it.
 
@@ -110,8 +113,9 @@ def reconstruct(
         The avatar in the T-pose of the person's own shape.
 
     Raises:
-        ValueError: if the network makes no Gaussians, the capture has no view, none that shows the
-            person, or values that are not finite or out of range, naming the array.
+        ValueError: if the network makes no Gaussians, if no view of the capture shows the person,
+            or if an array of the capture has values that are not finite or out of range. The
+            message names the array.
 
     Examples:
         >>> avatar = hg.reconstruct(*hg.load_weights(), hg.load_capture("demo_capture"))
@@ -202,8 +206,8 @@ def reconstruct_batch(
     reconstructed alone. A capture that cannot be used does not stop the others.
 
     Args:
-        variables: of the network; with `config`, what `load_weights` returns.
-        config: of the network.
+        variables: the variables of the network. `load_weights` returns them with `config`.
+        config: the configuration of the network.
         captures: the captures, of people whose shapes may differ, or functions that return one
             capture each. A function is called when its turn comes.
         batch: captures at a time.
@@ -259,13 +263,13 @@ def reconstruct_batch(
 def stack_captures(
     config: HumanGSConfig, captures: Sequence[Capture | PreparedCapture]
 ) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
-    """Stacks the photos of several people and their body, for a program that you write and compile.
+    """Stack the photos of several people, for a program that you write and compile.
 
     Skirts, which `reconstruct` adds, are left out.
 
     Args:
-        config: of the network.
-        captures: of people with one body model.
+        config: the configuration of the network.
+        captures: the captures of people who all have the same body model.
 
     Returns:
         Three values: the body that carries the Gaussians; the photos as the network wants them
@@ -273,10 +277,10 @@ def stack_captures(
         these photos, and without light if no world is y-up.
 
     Raises:
-        ValueError: if there is no capture, if one has no view, none that shows the person, or
-            values that are not finite or out of range, or if the bodies differ. Also if `config`
-            wants light and only some of the worlds are y-up, because in a batch all avatars have a
-            light or none has.
+        ValueError: if there is no capture, if a capture has no view that shows the person, if a
+            capture has values that are not finite or out of range, or if the body models differ.
+            Also if `config` wants light and only some of the worlds are y-up, because in a batch
+            all avatars have a light or none has.
 
     Examples:
         >>> body, views, config = hg.stack_captures(config, captures)
@@ -333,7 +337,8 @@ def fit_buffers(
 ) -> HumanGSConfig:
     """Returns the configuration with room for the foreground tokens of one subject or of a batch.
 
-    foreground: which pixels are foreground. view_count: the number of real views; None: all are.
+    foreground: which pixels are foreground. view_count: the number of views that are no padding.
+    None: all views.
     """
     patch, capacity = config.architecture.encoder.patch_size, 0
     if config.tokens != "all":
@@ -353,18 +358,19 @@ def reconstruct_views(
     photos need.
 
     Args:
-        variables: of the network; with `config`, what `load_weights` returns.
-        config: of the network.
-        body: the body that carries the Gaussians, of `stack_captures`.
-        views: photos at the network's size, cameras and poses, of `stack_captures`.
+        variables: the variables of the network. `load_weights` returns them with `config`.
+        config: the configuration of the network.
+        body: the body that carries the Gaussians, as `stack_captures` returns it.
+        views: photos at the network's size, cameras and poses, for one subject of
+            `stack_captures`.
 
     Returns:
         The avatar, and how many foreground patches did not fit into
         `config.runtime.token_capacity`.
 
     Raises:
-        ValueError: if the body is not the one that this configuration wants, or the photos are not
-            of its size.
+        ValueError: if the body is not the one that this configuration wants, or if the photos do
+            not have its image size.
 
     Examples:
         >>> batched = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))

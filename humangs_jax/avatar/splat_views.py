@@ -1,5 +1,5 @@
-"""Draws images of any Gaussians, also of other programs, from a circle of cameras or from the
-cameras of a calibration. Large scenes are drawn in bands of rows, in bounded memory.
+"""Draws images of any Gaussians, also of those that other programs made, from a circle of cameras
+or from the cameras of a calibration. Large scenes are drawn in bands of rows, in bounded memory.
 """
 
 from collections.abc import Iterator, Mapping
@@ -138,8 +138,8 @@ def render_in_bands(
     transformations.
 
     A band is at least one row of tiles high, and may then have more pairs. The image is drawn as a
-    whole if it depends on its height (`jacobian_margin`), or if values of each Gaussian are wanted
-    (`visibility`, `means2d`, `radii`). Raises: as `render`.
+    whole if the config has a `jacobian_margin`, whose effect depends on the image's height, or if
+    values of each Gaussian are wanted (`visibility`, `means2d`, `radii`). Raises: as `render`.
     """
     whole = (
         config.jacobian_margin is not None or config.visibility or config.means2d or config.radii

@@ -1,18 +1,18 @@
 """Guesses the parts of a person that no photo shows from the parts that photos show.
 
-The network knows that a back wears something, but not what: without a photo it paints cloth in
-grey. Here each vertex that no photo shows takes colors, opacities and heights above the skin of its
-Gaussians from vertices that photos show. These are near it on the surface, in front of it or behind
-it, or on the other side of the body. The guess is an attention over the vertices v that are shown,
-and over their mirror images:
+Without a photo of the back, the network paints it grey, because it does not know what the person
+wears there. Here the Gaussians of a vertex that no photo shows take their colors, opacities and
+heights above the skin from vertices that photos show. These vertices are near it on the surface, in
+front of it or behind it, or on the other side of the body. The guess for a vertex u is an attention
+over the vertices v that are shown, and over their mirror images:
 
     guess(u) = sum_v softmax_v(log sure(v) - |f(u) - f(v)|^2 / (2 SPREAD^2)) value(v)
 
-The features f are the position in the T-pose, in metres, where depths from front to back count
-little, and the skinning weights, because a sleeve is not like the trunk behind it. On the head and
-the hands the plain position is the feature. On the head only hair is a source, so that the back of
-a head gets hair and not a second face. The face stays as the network made it. Hands take guesses
-from hands alone.
+The features f of a vertex are its position in the T-pose, metres, and its skinning weights. Depths
+from front to back count less than other distances. The weights are there because a sleeve is not
+like the trunk behind it. On the head and the hands the position alone is the feature. On the head
+only hair is a source, so that the back of a head gets hair and not a second face. The face stays as
+the network made it. Heads take guesses from heads alone, and hands from hands alone.
 """
 
 from typing import NamedTuple
@@ -35,15 +35,17 @@ from humangs_jax.network.reader import project_and_test
 from humangs_jax.rendering.gaussians import Gaussians
 
 UNSEEN = 0.15
-"""Cosine between a vertex's normal and the direction to the camera, in the photo with the largest
-cosine. Below this, nothing is known of the vertex.
+"""Nothing is known of a vertex if in every photo the cosine between its normal and the direction to
+the camera is below this.
 """
 SEEN = 0.45
-"""If the cosine is this or more, nothing is guessed for the vertex. Between `UNSEEN` and `SEEN`
-guesses are mixed in.
+"""Nothing is guessed for a vertex if the cosine is at least this in one of the photos. Between
+`UNSEEN` and `SEEN` guesses are mixed in.
 """
 SPREAD = 0.015
-"""Standard deviation of the weights of sources in the space of the features, metres."""
+"""The weight of a source falls with its distance in the space of the features, as a Gaussian with
+this standard deviation, metres.
+"""
 LEAST_HIDDEN = 1 / 3
 """Something is guessed only if photos hide more than this share of the vertices. If photos show a
 person from all around, only folds and the insides of hands are left, which the network knows
@@ -86,7 +88,9 @@ HEAD_JOINTS = ("head", "jaw", "eye")
 BLOCK = 256
 """Number of vertices whose guesses are computed at a time. It bounds the memory."""
 TINY = 1e-6
-"""The least distance and weight, so that quotients and logarithms are finite."""
+"""The least squared distance, length, depth, weight and area, so that quotients and logarithms are
+finite.
+"""
 
 
 def with_guesses(

@@ -49,7 +49,7 @@ def check_video(
 
     A path without a suffix is a folder of PNG files. Raises: ValueError for another suffix, for
     transparency in a format without it, for a GIF that would not fit into memory, for a video whose
-    path is a folder, or for a folder whose path is a file.
+    path is a folder, or for a folder of PNG files whose path is a file.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -82,8 +82,8 @@ def write_video(
     frames: Float[np.ndarray, "m h w c"] | UInt8[np.ndarray, "m h w c"] | Iterable[Frame],
     fps: float | int,
 ) -> int:
-    """Write frames as a video or as PNG files. They appear when all frames are written. If writing
-    fails, nothing changes.
+    """Write frames as a video or as PNG files. No file appears before all frames are written. If
+    writing fails, nothing changes.
 
     Frames are asked for one by one. A .gif keeps one byte for each channel of all frames in memory,
     other formats keep no frame. Video codecs want even sides: odd ones get one more row or column,
@@ -100,10 +100,11 @@ def write_video(
         The number of frames that were given.
 
     Raises:
-        ValueError: if there is no frame, they differ in shape, a number is not in [0, 1], they hold
-            integers other than uint8, `fps` is not positive, the suffix is another one or has no
-            alpha, or a PNG file that would be replaced was not written by humangs.
-        OSError: if the file cannot be written; also what `frames` raises.
+        ValueError: if there is no frame, if frames differ in shape, have a number outside of
+            [0, 1], or have integers other than uint8, or if `fps` is not positive. Also if the
+            suffix is unknown, if frames have alpha and the format has none, if a GIF does not fit
+            into memory, or if a PNG file that would be replaced was not written by humangs.
+        OSError: if the file cannot be written. Errors of the iterator `frames` are passed on.
 
     Examples:
         >>> images = (hg.render(hg.animate(avatar, pose), camera).rgb for pose in poses)
@@ -285,8 +286,9 @@ def _write_by_ffmpeg(
 
 
 def _indexed(frame: np.ndarray, palette: Any, background: np.ndarray) -> Any:
-    """Returns a frame (h, w, 3) in the colors of a palette. Pixels of the background get index 255:
-    Pillow looks up colors by their upper 6 bits, in which white and 252 are equal.
+    """Returns a frame (h, w, 3) in the colors of a palette. Pixels of the color `background` get
+    index 255. Pillow alone might not give it to them, because it looks up colors by their upper 6
+    bits, in which 252 and 255 are equal.
     """
     from PIL import Image
 
@@ -363,7 +365,9 @@ def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple
 
 
 LARGEST_ERROR = 0.25
-"""Mean absolute difference of the channels for which the last of `ERROR_COLORS` stands."""
+"""The error from which on the last of `ERROR_COLORS` is shown: the mean absolute difference of the
+channels.
+"""
 GAP = 4
 """Width of the white gap between tiles, pixels."""
 TEXT_SHARE = 1 / 14

@@ -193,11 +193,11 @@ def load_gaussians(path: str | os.PathLike[str], *, y_up: bool = False) -> Gauss
     PlayCanvas), `.splat`, `.spz`, `.glb`, `.sog` (PlayCanvas) and `.pt` (checkpoints of gsplat).
 
     Args:
-        path: The file. Its first bytes decide the format. Its suffix does for the formats without
-            typical first bytes (`.splat`, `.sog`, `.pt`).
+        path: The file. Its first bytes decide the format. For the formats without typical first
+            bytes (`.splat`, `.sog`, `.pt`) its suffix decides.
         y_up: Whether the Gaussians are turned from the world that viewers of the format expect (y
             down in `.ply`, `.splat`, `.sog` and `.pt`) to one with y up, as `orbit` has it. False:
-            the numbers stay as they are in the file, and the cameras of the scene fit.
+            the numbers stay as they are in the file, so that the scene's own cameras fit them.
 
     Returns:
         Gaussians in float32 with unit quaternions (wxyz), linear scales, opacities in [0, 1],

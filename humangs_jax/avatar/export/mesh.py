@@ -3,7 +3,7 @@
 The texture has the colors that the Gaussians show to someone who looks at each point of the skin
 along its normal. Gaussians near the line of sight are blended front to back, as a renderer blends
 them. Clothes therefore end up on the skin, like a bodysuit, because the mesh is the body's. The
-atlas is our own (`rendering.mesh.atlas`), for any body.
+atlas is made from the mesh (`rendering.mesh.atlas`), so that any body has one.
 
     .glb    https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#skins: mesh, skin and motion,
             as Blender, Unity, Unreal and three.js open it. The texture holds the photos' light, so
@@ -61,7 +61,7 @@ thickness.
 LEAST_WEIGHT = 1e-4
 """The least weight of the nearest Gaussian. It gives a color to points that no Gaussian covers."""
 WEIGHTS = 4
-"""The number of joints for each vertex. All programs can read this many."""
+"""The number of joints that a vertex follows in a file. All programs can read this many."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -45,7 +45,7 @@ from humangs_jax.io.tensors import tensors_in
 from humangs_jax.rendering.gaussians import COUNTS, Gaussians, factored, skin_gaussians
 
 OPACITY_MARGIN = 1e-6
-"""Opacities are clipped to be this far from 0 and 1, so that their logit is finite."""
+"""Opacities are clipped to be at least this far from 0 and 1, so that their logit is finite."""
 SMALLEST_SCALE = 1e-9
 """The least scale that is written, metres. It keeps the logarithm finite for flat Gaussians."""
 LONGEST_HEADER = 1 << 16

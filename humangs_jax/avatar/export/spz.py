@@ -12,7 +12,8 @@ bytes that is not compressed, perhaps records of other programs, a table at the 
 header names, and a zstd frame for each array that is not empty. The table has the compressed and
 the unpacked size of each array, bytes.
 
-Libraries that write it bring a compiler (gsply) or do not install (PyPI's spz).
+The format is written here because the libraries for it need a compiler (gsply) or cannot be
+installed (spz of PyPI).
 """
 
 import gzip
@@ -109,8 +110,9 @@ class _Header(NamedTuple):
 def write_spz(path: str | os.PathLike[str], gaussians: Gaussians, version: Version = 3) -> None:
     """Write a `.spz`. If writing fails, the path stays as it was.
 
-    Scales change by up to 3 %. Colors, harmonics and opacities are rounded to 8 bits, components of
-    quaternions to 10 bits. Harmonics are clipped to [-1, 1].
+    Scales change by up to 3 %, and are clipped to the range from 0.045 mm to 379 m. Colors,
+    harmonics and opacities are rounded to 8 bits, components of quaternions to 10 bits. Harmonics
+    are clipped to [-1, 1].
 
     Raises: ValueError if a coordinate of a Gaussian exceeds 8,388,607 m, and as `plain_arrays`;
     OSError.

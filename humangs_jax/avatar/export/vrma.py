@@ -1,5 +1,5 @@
-"""Motions as VRM animations (.vrma), which VRM characters of any program play: humanoid bones and
-expressions, no mesh.
+"""Writes motions as VRM animations (.vrma): humanoid bones and expressions, no mesh. Programs for
+VRM characters play them on any character.
 
 https://github.com/vrm-c/vrm-specification/tree/master/specification/VRMC_vrm_animation-1.0: a glTF
 file whose nodes are the bones of a person in T-pose. Each expression is a further node, and its
