@@ -1,1 +1,3 @@
-"""Demonstration, presets and budgets, checks of captures, photos without a calibration."""
+"""What the command line runs: the demonstration, presets for a budget, checks of captures, and
+avatars from photos or videos.
+"""

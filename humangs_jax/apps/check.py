@@ -3,9 +3,9 @@ computes numbers that show what is wrong.
 
 Blue is the person's left side, red is the right side, and the green line is the boundary of the
 body. Photo and body should coincide. A yellow line is the boundary of the displaced body that
-`reconstruct` uses. If the capture has no displacement, `reconstruct` finds one that moves the body
-to the masks. It adds a skirt if the masks show one. `apps.quick_check` names what is wrong with a
-view.
+`reconstruct` uses. The displacement is that of the capture. If the capture has none, `reconstruct`
+moves the body to the masks, and adds a skirt if the masks show one. `apps.quick_check` names what
+is wrong with a view.
 
 On the sheet of a fit a disc is a keypoint: blue for the person's left, red for the right, white for
 the middle. A ring is a keypoint that is an outlier. A line leads from the keypoint to a cross,
@@ -179,8 +179,8 @@ class CheckReport:
 def check_capture(
     capture: Capture | PreparedCapture, out: str | Path, keypoints: Keypoints | None = None
 ) -> CheckReport:
-    """Draws the posed body over every photo, writes the sheet as a PNG, and reports how well they
-    agree.
+    """Draws the posed body over every photo, writes the sheet as a PNG, and reports how well body,
+    photos and masks agree.
 
     Arguments: capture: a plain capture is prepared for the network that comes with the package. A
     prepared capture stays as it is. keypoints: keypoints of the views, if they are known. They show

@@ -57,11 +57,11 @@ _PICTURES = (
 )
 FILES = ("report.json", *_PICTURES, "avatar.npz", "avatar.ply", "avatar.html")
 """Names of the files that the demonstration writes; refined.png only with refinement. The first one
-marks a folder as one of the demonstration.
+marks a folder that the demonstration has written.
 """
 REPORTED = frozenset(("psnr", "views", "baseline_psnr"))
-"""Keys that report.json has at least. A folder whose report.json has them is one of the
-demonstration.
+"""Keys that report.json has at least. The demonstration has written a folder whose report.json has
+all of them.
 """
 
 

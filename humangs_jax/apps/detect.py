@@ -333,9 +333,9 @@ def person_of(
     person has the same number everywhere, and the number. Where a photo's keypoints or masks
     contradict the match between photos, the keypoints or masks decide.
 
-    Arguments: sheet: where to write the sheet of people if this is refused.
-    Raises: ValueError if the keypoints or masks belong to nobody found, or if a photo has none and
-    it is unclear who in it is intended.
+    Arguments: sheet: where to write the sheet of people if the call fails.
+    Raises: ValueError if the keypoints or masks belong to nobody who was found. Also if a photo has
+    no keypoints or mask, and it is unclear who in the photo is intended.
     """
     kind = "keypoints" if isinstance(given, Keypoints) else "masks"
     scores = [

@@ -83,7 +83,9 @@ class Step:
     warning: bool = False
     """Whether something looks wrong."""
     photos: PreparedCapture | None = None
-    """The prepared capture with its fitted body; None in steps before the avatar is made."""
+    """The prepared photos, whose `capture` has the fitted body; None in steps before the avatar is
+    made.
+    """
     avatar: Avatar | None = None
     """The finished avatar, in the last step; None before."""
 

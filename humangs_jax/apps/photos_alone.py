@@ -1,7 +1,7 @@
 """Makes a capture without a body from photos without a calibration: finds the people in the photos,
 and from the chosen person the cameras.
 
-`capture.fitting.person_cameras` finds the cameras, and `apps.detect` decides who is who. Large
+`capture.fitting.person_cameras` finds the cameras, and `apps.detect` finds the people. Large
 photos may be reduced first, because later steps look at no more than some hundred pixels of a
 person.
 """

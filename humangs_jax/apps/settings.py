@@ -167,8 +167,8 @@ def reconstruct_with(
 
     Args:
         settings: the settings, or the name of one of `PRESETS`.
-        variables: of the network. `load_weights` returns them with `config`.
-        config: of the network. The settings replace its runtime.
+        variables: the variables of the network. `load_weights` returns them with `config`.
+        config: the configuration of the network. The settings replace its runtime.
         capture: a capture, or a prepared one as `Settings.photos` returns it. The settings choose
             which of its photos are used.
         progress: whether to show the progress of refinement.
@@ -282,8 +282,8 @@ def tune(
     does not count. Without masks, presets that refine are not tried.
 
     Args:
-        variables: of the network. `load_weights` returns them with `config`.
-        config: of the network.
+        variables: the variables of the network. `load_weights` returns them with `config`.
+        config: the configuration of the network.
         capture: the person to reconstruct.
         reconstruct_ms: longest time in which the avatar may be made, with refinement, milliseconds.
             None: no limit.

@@ -2,9 +2,9 @@
 missing, and which well-known tools make them.
 
 The user need not describe the folder, because its files are found by their names.
-docs/your_photos.md shows the way. The module also measures how well an avatar reproduces a photo
-that it has not seen, and chooses between two bodies by this. `apps.video_photos` takes the best
-frames of a video.
+docs/your_photos.md shows the way. The module also holds a photo out, measures how well an avatar of
+the other photos reproduces it, and chooses between two bodies by this measure. `apps.video_photos`
+takes the best frames of a video.
 """
 
 import dataclasses
@@ -224,8 +224,8 @@ def _expect_folder(folder: Path) -> None:
 def missing(material: PhotoFolder, images: Path | None = None) -> tuple[Missing, ...]:
     """Returns which of cameras, masks and keypoints are missing, with the commands that make them.
 
-    Arguments: images: folder of the photos for which keypoints are to be made, if an import has
-    changed them, for example removed lens distortion. None: the folder's own photos.
+    Arguments: images: folder of the photos for which keypoints are to be made. Give it if an import
+    has changed the photos, for example by removing lens distortion. None: the photos of `material`.
     """
     folder, found = material.folder, []
     # two ways to cameras: structure from motion, or a calibrated set
@@ -354,7 +354,7 @@ def held_out_psnr(
     are compiled already.
 
     Arguments:
-        variables, config: of the network.
+        variables, config: the variables and the configuration of the network.
         refinement: how the avatar is refined, always without steps on the head; None: not at all.
         number: which photo is held out. 0 is the photo with the nearest neighbour, 1 the next in
             this order.

@@ -1,7 +1,7 @@
 """Finds the motion of a person in a video whose camera stands still.
 
-The person is followed through all frames. Where one frame has found the person, only the landmark
-network looks at the next. While the work goes on, the landmarks are kept in a file beside the
+The person is followed through all frames. Once the person is found in a frame, only the landmark
+network looks at the next frame. While the work goes on, the landmarks are kept in a file beside the
 result, so that an interrupted run can go on. Then one fit uses all frames
 (`capture.fitting.motion_fit`).
 """
@@ -59,8 +59,8 @@ class _Following:
     """How one person is followed from frame to frame."""
 
     patience: int = 8
-    """Number of frames in a row without the person that are all searched. A search takes ten times
-    as long as following the person from the frame before.
+    """Number of frames that are all searched once the person is lost. A search takes ten times as
+    long as following the person from the frame before.
     """
     rarely: int = 8
     """After `patience` frames without the person, only one of this many frames is searched."""

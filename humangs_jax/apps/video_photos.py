@@ -1,9 +1,9 @@
 """Chooses photos from a video: sharp frames that show the person from all sides.
 
-`capture.calibration.frame_choice` offers frames. The person is followed through them, at a longer
-side of 640 pixels. Where one frame has found the person, only the landmark network looks at the
-next. The landmarks show in which direction the person faces in each frame, and which pose is the
-usual one.
+`capture.calibration.frame_choice` offers frames. The person is followed through these frames, at a
+longer side of 640 pixels. Once the person is found in a frame, only the landmark network looks at
+the next frame. The landmarks show in which direction the person faces in each frame, and which pose
+is the usual one.
 """
 
 from collections.abc import Iterable, Sequence
@@ -136,8 +136,8 @@ def seconds_of_photos(folder: Path, names: Sequence[str]) -> Float[np.ndarray, "
     """Returns the times at which photos were taken in a video, (v,), seconds. They follow from the
     names of the photos.
 
-    Returns None if the folder of photos is not of one video, if the video does not have a rate, or
-    if the names do not end in ascending numbers.
+    Returns None if the photos in the folder were not taken from a video by `photos_of_video`, if
+    the video does not have a rate, or if the names do not end in ascending numbers.
     """
     known = None
     if (folder / MARK).is_file():

@@ -327,7 +327,8 @@ class Check:
             suggest("humangs reconstruct", self.capture, "--out avatar.npz")
 
     def _found(self, capture: Any, keypoints: Any) -> tuple[Any, Any]:
-        """Finds missing masks and keypoints in the photos. Returns capture and keypoints with them.
+        """Finds missing masks and keypoints in the photos. Returns the capture with masks, and the
+        keypoints.
 
         No file is written, except the sheet of people if it is unclear who is meant.
         """

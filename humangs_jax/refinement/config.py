@@ -84,9 +84,9 @@ class RefineConfig:
     )
     """Number of steps on the head alone, after all others. They compare crops of the photos around
     the head, move only its Gaussians, and penalise alpha beyond the masks (see `head.py`). They are
-    made under three conditions. The longer side of the photos, at most `image_size`, has 512 pixels
-    or more. Cameras are calibrated, or there are several photos and each has its pose. `seconds` is
-    None or `steps` is 0.
+    made under three conditions. The longer side of the photos has 512 pixels or more, also after
+    they are reduced to `image_size`. Cameras are calibrated, or there are several photos and each
+    has its pose. `seconds` is None or `steps` is 0.
     """
     region: tuple[str, ...] = HEAD
     """Words in the names of the joints whose Gaussians the `head_steps` move. `("left_wrist",
@@ -113,9 +113,9 @@ class RefineConfig:
     further and overfit to the photos.
     """
     visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
-    """Least weight of a Gaussian on some pixel of a photo with which it moves at the full rate, in
-    [0, 1]. A Gaussian with a smaller largest weight moves more slowly, in proportion. Gaussians
-    that no photo shows stay.
+    """A Gaussian moves at the full rate if its largest weight on any pixel of the photos is at
+    least this. If the weight is smaller, the rate is lower in proportion. Gaussians that no photo
+    shows stay.
     """
     held_out: Share = 0.05
     """With fewer photos than `search.HELD_OUT_PHOTOS`: share of the pixels, in square blocks, that

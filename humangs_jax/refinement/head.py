@@ -40,8 +40,8 @@ from humangs_jax.refinement.steps import RefineState, started, update
 from humangs_jax.rendering.splat_config import SplatConfig
 
 LEAST_SIDE = 512
-"""The least longer side of photos for steps on the head, pixels. In such photos heads show more
-detail than the iterations reach.
+"""Steps on the head are made only if the longer side of the photos has at least this many pixels.
+In such photos heads show more detail than the iterations reach.
 """
 LARGEST_HEAD = 112
 """The side that the largest head should have, pixels. Photos are reduced until it is about that

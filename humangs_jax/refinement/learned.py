@@ -61,8 +61,8 @@ PERSON = 8000.0
 to it, so that the size of the photos does not matter.
 """
 SEEN = 0.02
-"""A Gaussian counts fully as seen in a photo if its weight on some pixel is at least this. With a
-smaller largest weight it counts in proportion.
+"""A Gaussian counts fully as seen in a photo if its largest weight on any pixel is at least this.
+If the weight is smaller, the Gaussian counts in proportion.
 """
 TYPICAL_LOG_SCALE = -4.5
 MOST_PHOTOS = 6

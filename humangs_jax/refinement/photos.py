@@ -18,7 +18,7 @@ from humangs_jax.geometry.camera import Camera
 
 MARGIN = 8
 """Width of the margin around the mask that a crop also contains, pixels. The window of structural
-similarity has 11 pixels, and Gaussians beyond the silhouette cost alpha there.
+similarity has 11 pixels, and the loss counts alpha beyond the silhouette there.
 """
 MULTIPLE = 16
 """Sides of crops are multiples of this number of pixels, so that few sizes are compiled. A crop is
@@ -63,7 +63,7 @@ def crop_to_person(photos: PreparedCapture, image_size: int | None = None) -> Su
     """Returns the photos cut to the person by windows of one size, with cameras that see these
     windows.
 
-    Photos whose longer side exceeds `image_size` are reduced to it.
+    Photos whose longer side exceeds `image_size` are reduced to it before they are cut.
 
     Raises: ValueError without masks.
     """

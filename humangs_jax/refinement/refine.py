@@ -116,7 +116,7 @@ def refine(
     returned. `refine_with_report` also returns the steps, the seconds and the gain.
 
     Args:
-        avatar: of the person in the photos, on the body of the capture.
+        avatar: the avatar of the person in the photos, on the body of the capture.
         capture: photos with masks, in any poses, or the result of `prepare_capture`.
         config: the settings. None: `RefineConfig()`.
         seconds: limit in seconds. If `seconds` or `steps` is given, these two arguments replace

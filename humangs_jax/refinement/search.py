@@ -297,8 +297,8 @@ def prepare(
 
 
 def calls_of_photos(avatar: Avatar, views: SubjectViews) -> Iterator[Call]:
-    """Yields the long programs of iterations on these photos. `prepare` starts to compile the same
-    programs.
+    """Yields the programs of iterations on these photos that take long to compile. `prepare` starts
+    to compile the same programs.
     """
     start = with_pixel_footprint_of(avatar, views)
     parameters, graph = unconstrained(start.gaussians), graph_like(len(start.gaussians.means))
@@ -461,10 +461,10 @@ def _search_by_photo(
 def _iterations_that_help(
     task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
 ) -> tuple[Candidate, list[_Trial], float]:
-    """Returns whether and where the learned update helps: a state, trials, and seconds.
+    """Tries whether the learned update helps, and on which photos. Returns three values:
 
-    The state comes from the first trial, and its `used` are the photos on which the update helps.
-    The steps continue the trials. The update on all of `used` will take the seconds.
+    The state after the first trial's update. Its `used` are the photos on which the update helps.
+    The trials, which the steps continue. The seconds that the update on all of `used` will take.
 
     The update is tried on all photos, then without the photo of the largest loss. If neither helps,
     or if there are no iterations, the state is the start, two trials begin at the start, and the
