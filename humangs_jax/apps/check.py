@@ -4,8 +4,8 @@ computes numbers that show what is wrong.
 Blue is the person's left side, red is the right side, and the green line is the boundary of the
 body. Photo and body should coincide. A yellow line is the boundary of the displaced body that
 `reconstruct` uses. The displacement is that of the capture. If the capture has none, `reconstruct`
-moves the body to the masks, and adds a skirt if the masks show one. `apps.quick_check` names what
-is wrong with a view.
+moves a body that does not fit the masks to their edges. It adds a skirt if the masks show one.
+`apps.quick_check` names what is wrong with a view.
 
 On the sheet of a fit a disc is a keypoint: blue for the person's left, red for the right, white for
 the middle. A ring is a keypoint that is an outlier. A line leads from the keypoint to a cross,
@@ -104,8 +104,8 @@ class ViewCheck:
     iou: float | None
     """Intersection over union of body and mask, 0 to 1; None without masks."""
     outside: float | None
-    """Share of the body's pixels that are more than one pixel off the mask, in a photo of at most
-    512 pixels a side; None without masks.
+    """Share of the body's pixels that are more than one pixel off the mask; None without masks.
+    Photos with a side of more than 512 pixels are reduced to 512 before.
     """
     inside: float
     """Share of the body that is inside the image, 0 to 1."""

@@ -295,9 +295,8 @@ def person_in_capture(
     person: int | None = None,
 ) -> tuple[list[PhotoPeople], int]:
     """Finds the people in the photos of a capture folder, and returns them with the number of the
-    intended person. Keypoints decide who is intended. Without keypoints, `person` decides, which is
-    the number that was asked for. Without a number, the masks decide. Without masks, the only large
-    person is intended.
+    intended person. Keypoints decide who is intended. Without keypoints, the number `person`
+    decides. Without a number, the masks decide. Without masks, the only large person is intended.
 
     Raises: see `found_in_photos`, `choose` and `person_of`. Also ValueError for a photo whose
     keypoints belong to nobody found in it.

@@ -623,7 +623,7 @@ class FromPhotos:
         yield Step("the avatar in a browser", file=page, photos=photos, avatar=avatar)
 
     def _check(self, capture: Capture | PreparedCapture) -> Iterator[Step]:
-        """Draws the body over the photos, and yields how well they agree."""
+        """Draws the body over the photos, and yields how well body and photos agree."""
         with stage("checking"):
             report = check_capture(capture, self.out / "check.png")
         yield Step(f"\n{report}")

@@ -167,9 +167,9 @@ def _matched(
 
 
 def _with_only_ones(rows: list[Row], frames: Int[np.ndarray, " v"]) -> list[Row]:
-    """Joins people who are each the only large person of a photo into one person, even if they were
-    not matched. Returns the rows with the joined person. Returns the given rows if nobody is
-    joined.
+    """Takes all people who are the only large person of their photo for one person, even if they
+    were not matched. Returns the rows in which these people are joined. Returns the given rows if
+    nobody is joined.
 
     Two people who are in one photo together are not joined. If somebody else would still be large,
     nobody is joined, because a person who is alone in a photo could then be either of the two.

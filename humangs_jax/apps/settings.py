@@ -119,8 +119,8 @@ class Settings:
         return prepare_capture(capture, views=self.views)
 
     def shot(self, shot: FrameSettings) -> FrameSettings:
-        """Returns `shot` with the way of drawing of these settings. A `splat` other than
-        "as_trained" stays as it is in `shot`. `prune` is True if `shot` or these settings have it.
+        """Returns `shot` with `splat` and `prune` of these settings. The `splat` of `shot` stays
+        unless it is "as_trained". `prune` is True if it is True in `shot` or in these settings.
         """
         splat = self.splat if shot.splat == "as_trained" else shot.splat
         return dataclasses.replace(shot, splat=splat, prune=shot.prune or self.prune)

@@ -4,10 +4,10 @@ size.
 
 A renderer adds `EPS2D` pixels^2 to the projected variances of each Gaussian, whatever the size of
 the image. Gaussians that fit images of one size are therefore too wide in smaller images, and too
-narrow in larger ones. Here `EPS2D - MIP_EPS2D` pixels^2 are added to the squared scales. These are
-pixels of the images that the Gaussians were fitted to (after Mip-Splatting,
-https://arxiv.org/abs/2311.16493). `Gaussians.pixel_footprint` holds the size of these pixels, and
-renderers then add at most `MIP_EPS2D`.
+narrow in larger ones. Here `EPS2D - MIP_EPS2D` pixels^2 are added to the squared scales. A pixel
+means one of the images that the Gaussians were fitted to (after Mip-Splatting,
+https://arxiv.org/abs/2311.16493). `Gaussians.pixel_footprint` holds its side in metres. To
+Gaussians that have a footprint, renderers add at most `MIP_EPS2D`.
 """
 
 import jax.numpy as jnp
@@ -192,8 +192,8 @@ def with_pixel_footprint(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> A
     """Returns the avatar with the low-pass of images in its scales.
 
     pixel: side of an image's pixel at the Gaussians, metres: one number, or one for each Gaussian.
-    The avatar is returned as it is if its `rendering` is not "exact", or if its scales
-    contain a low-pass already.
+    The avatar is returned as it is if its `rendering` is not "exact", or if its scales contain a
+    low-pass already.
     """
     gaussians = avatar.gaussians
     if avatar.rendering != "exact" or gaussians.pixel_footprint is not None:

@@ -76,8 +76,8 @@ direction.
 """
 NEAR = {"mouth": 0.06, "lid": 0.04}
 """Radii around the middle of the mouth's parts and around the middle of a lid, metres. The parts
-are moved by the affine map that takes the vertices within the radius from the mean body to the
-avatar.
+are moved by an affine map. It takes the vertices of the mean body within the radius to the same
+vertices of the avatar.
 """
 FEWEST = 12
 """The least number of vertices from which an affine map is computed. If fewer are within the
@@ -328,9 +328,9 @@ def _map_around(
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Returns a function that maps places, metres, by an affine map. The map is the least-squares
     fit that takes the vertices `before` near `points` to the vertices `after`. A vertex is near if
-    it is within `reach` of the middle of the points. If fewer than `FEWEST` vertices are, the
-    `FEWEST` nearest ones are taken. With fewer vertices in all, the map is a shift. All lengths are
-    in metres.
+    it is within `reach` of the middle of the points. If fewer than `FEWEST` vertices are near, the
+    `FEWEST` nearest ones are taken. If there are fewer vertices in all, the map is a shift. All
+    lengths are in metres.
     """
     middle = points.reshape(-1, 3).mean(axis=0)
     distance = np.linalg.norm(before - middle, axis=1)

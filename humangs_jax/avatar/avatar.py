@@ -245,7 +245,7 @@ class Avatar(Batchable):
     `SPLAT_PRESETS`.
     """
     light: Light | None = None
-    """The light of the photos, where it has been estimated; other poses are drawn in it."""
+    """The light of the photos, in which other poses are drawn. None: it was not estimated."""
     face: Face | None = None
     """The face, which poses with an expression need (see `with_face`). None: no pose can have an
     expression.

@@ -437,7 +437,7 @@ def images(
     progress: str | None = None,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """Yields one image for each pose and its camera, (h, w, 3), or (h, w, 4) with alpha, see
-    `composite_over`. Frames are drawn when they are asked for, a few of them ahead.
+    `composite_over`. Frames are drawn when they are asked for. On a CPU a few are drawn ahead.
 
     progress: the label of a progress bar; None: no bar.
     """

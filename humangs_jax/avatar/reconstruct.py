@@ -96,9 +96,9 @@ def reconstruct(
 
     If the network looks only at the person's pixels, what no photo shows is guessed from what
     photos show (`avatar.unseen`). Before that the body is displaced, unless `Runtime.displacement`
-    is False. A displacement of the capture is used as it is. Without one, vertices are moved to the
-    edges of the masks: always if `Runtime.displacement` is True, else only if the body does not fit
-    the masks. If the masks show a skirt, the body gets one (`data.skirt`).
+    is False. If the capture has a displacement, it is used. If it has only masks, vertices are
+    moved to the edges of the masks: always if `Runtime.displacement` is True, else only if the body
+    does not fit the masks. If the masks show a skirt, the body gets one (`data.skirt`).
 
     If the network has a driver, which corrects Gaussians for each frame, the avatar is without
     these corrections.

@@ -56,8 +56,8 @@ DEPTH = 0.5
 its front than like its sides.
 """
 PART = 0.6
-"""Distance in the features that stands for a change of the square root of a skinning weight by 1,
-metres.
+"""Distance in the features, metres, that stands for a change of the square root of a skinning
+weight by 1.
 """
 MIRRORED = 0.05
 """The square of this distance, metres, is added to the squared distance of a source's mirror image.
@@ -285,8 +285,8 @@ CLEARLY = 0.5
 the direction to the camera is larger than this.
 """
 LEAST_SHOWN = 0.5
-"""Share of the area of a side that photos must show clearly, and share of the area of a part of the
-body that must lie in photos. Below it the side or the part is a guess.
+"""A side is a guess if photos show less than this share of its area clearly. A part of the body is
+a guess if less than this share of its area lies in photos.
 """
 SIDES = {
     "front": (0.0, 0.0, 1.0),

@@ -187,7 +187,9 @@ class Render:
         "humangs render scene.ply --camera sparse/0 --out views",
     )
     avatar: Positional[Path]
-    """File written by `humangs reconstruct`, or a file of Gaussians: .ply, .splat, .spz or .glb."""
+    """File written by `humangs reconstruct`, or a file of Gaussians: .ply, .splat, .spz, .glb, .sog
+    or .pt.
+    """
     shot: OmitArgPrefixes[FrameSettings]
     camera: Annotated[
         Path | None,

@@ -356,8 +356,8 @@ class Convert:
 
 @dataclasses.dataclass(frozen=True)
 class LpipsFiles:
-    """Weights of LPIPS. Each option takes a file of the backbone and, if that file has no heads,
-    one of the heads (docs: loss_networks).
+    """Weights of LPIPS, for the networks that the protocol has. Each option takes a file of the
+    backbone and, if that file has no heads, one of the heads (docs: loss_networks).
     """
 
     lpips_vgg: tuple[Path, ...] = ()

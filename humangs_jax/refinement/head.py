@@ -179,8 +179,8 @@ def _steps(
 
 
 def head_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
-    """Returns `image_loss` of the colors inside the mask, plus `EXCESS` times the mean excess of
-    alpha over the mask.
+    """Returns `image_loss`, where colors count inside the mask only, plus `EXCESS` times the mean
+    excess of alpha over the mask.
     """
     rgb = photo.image + photo.mask[..., None] * (image[0] - photo.image)
     return image_loss((rgb, image[1]), photo, config) + EXCESS * jnp.mean(

@@ -111,9 +111,9 @@ def refine(
 
     First come iterations of a learned optimizer, then steps of Adam. Steps on the head alone follow
     if photos have 512 pixels or more (`RefineConfig.head_steps`), unless `steps` is above 0 or the
-    time is limited. Views whose mask does not show the person are left out, and
-    exposure is made equal as in `reconstruct`. Ctrl-C ends the run; the best state until then is
-    returned. `refine_with_report` also returns the steps, the seconds and the gain.
+    time is limited. Views whose mask does not show the person are left out, and exposure is made
+    equal, as in `reconstruct`. Ctrl-C ends the run; the best state until then is returned.
+    `refine_with_report` also returns the steps, the seconds and the gain.
 
     Args:
         avatar: the avatar of the person in the photos, on the body of the capture.

@@ -510,7 +510,7 @@ def _trials_of_iterations(
 def _share_that_helps(gains: Mapping[int, Sequence[float]], length: int) -> float:
     """Returns the largest share of the steps that helps, in [0, 1]; 1 if no step was tried.
 
-    gains: the decibels that the photos have gained after a number of steps of the trials, by this
+    gains: for some numbers of steps of a trial, the decibels that the photos have gained after that
     number. length: the number of steps of a trial.
     """
     if length == 0:

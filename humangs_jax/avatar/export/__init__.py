@@ -47,7 +47,7 @@ class ExportFormat(Format):
     `files_beside`.
     """
     reader: str | Callable[[bytes], Any] = ""
-    """The function that reads Gaussians, or its place as "module:function". It takes the bytes of a
+    """The function that reads Gaussians, or its name as "module:function". It takes the bytes of a
     file and a list, to which it appends lines about the file. It raises
     `io.reading.InvalidFileError`. Empty: the format is not read.
     """

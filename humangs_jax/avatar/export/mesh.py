@@ -365,8 +365,8 @@ def _animation(
     writer: GlbWriter, avatar: Avatar, motion: Motion, name: str, mesh_node: int
 ) -> dict[str, Any]:
     """Returns the glTF animation of a motion. It has the rotations of every joint that turns and
-    the translation of the root. It has expressions if the motion has any of those of the avatar's
-    face.
+    the translation of the root. It has expressions if the motion has at least one expression of the
+    avatar's face.
     """
     times = writer.array("SCALAR", np.arange(len(motion.translations)) / motion.fps, bounds=True)
     rotations = np.asarray(motion.rotations)

@@ -57,7 +57,8 @@ TABLE_ROW = struct.Struct("<QQ")
 RECORD = struct.Struct("<II")
 """The beginning of a record of another program: its kind, and the number of bytes that follow."""
 COORDINATE_SYSTEM = 0xADBE0003
-"""The kind of a record that names the axes. Files have it if their axes are not right, up and back.
+"""The kind of a record that names the axes. Files have it unless their axes point to the right, up
+and back.
 """
 ANTIALIASED = 1
 """The flag of files whose Gaussians were trained with the filters of Mip-Splatting."""
