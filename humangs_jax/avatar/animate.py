@@ -4,9 +4,9 @@ size.
 
 A renderer adds `EPS2D` pixels^2 to the projected variances of each Gaussian, whatever the size of
 the image. Gaussians that fit images of one size are therefore too wide in smaller images, and too
-narrow in larger ones. Here `EPS2D - MIP_EPS2D` pixels^2 are added to the squared scales. A pixel
-means one of the images that the Gaussians were fitted to (after Mip-Splatting,
-https://arxiv.org/abs/2311.16493). `Gaussians.pixel_footprint` holds its side in metres. To
+narrow in larger ones. Here `EPS2D - MIP_EPS2D` pixels^2 are added to the squared scales. These
+pixels are those of the images that the Gaussians were fitted to (after Mip-Splatting,
+https://arxiv.org/abs/2311.16493). `Gaussians.pixel_footprint` holds their side in metres. To
 Gaussians that have a footprint, renderers add at most `MIP_EPS2D`.
 """
 

@@ -276,7 +276,7 @@ class Avatar(Batchable):
 
     def with_face(self, body: BodyModel | None = None) -> "Avatar":
         """Returns the avatar with a face, so that poses may have an expression. Poses without an
-        expression are drawn as before.
+        expression are drawn as before. An avatar that has a face is returned as it is.
 
         Args:
             body: the body model that the avatar's vertices belong to. It must have expressions.

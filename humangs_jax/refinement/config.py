@@ -121,10 +121,11 @@ class RefineConfig:
     """With fewer photos than `search.HELD_OUT_PHOTOS`: share of the pixels, in square blocks, that
     no iteration and no step sees. The state with the highest PSNR on these pixels is kept.
 
-    With as many photos or more, any share above 0 has the same effect: trials leave out one whole
-    photo each, and take a third of the steps. The PSNR on that photo decides whether the iterations
-    are kept, and how many of the steps. Then all photos are fitted. 0: nothing is held out.
-    Iterations are kept if they lower the loss, and the last of the steps is kept.
+    With that many photos or more, any share above 0 has the same effect. Each trial leaves out one
+    whole photo, and all trials together take a third of the steps. The PSNR on that photo decides
+    whether the iterations are kept, and how many of the steps. Then the photos are fitted, without
+    one that contradicts the others. 0: nothing is held out. Iterations are kept if they lower the
+    loss, and the last of the steps is kept.
     """
     checks: Count = 5
     """How many times the PSNR is measured during a run of steps."""

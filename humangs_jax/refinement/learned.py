@@ -2,13 +2,13 @@
 errors at every Gaussian and moves it.
 
 As in ReSplat (https://arxiv.org/abs/2510.08575), the input views are drawn, their errors are
-gathered at the Gaussians, and a network that knows the neighbours adds to their parameters. All
-iterations have the same weights, and no gradient passes through the errors. Two points differ. The
-errors arrive as the gradient of the squared error with respect to each Gaussian's parameters, and
-not as features of a frozen network. The neighbours are those in the T-pose, at two levels:
-Gaussians, and clusters of Gaussians. A Gaussian that faces between two cameras can be 20 cm away
-from the nearest silhouette of a photo. Messages between Gaussians reach 5 cm; clusters carry them
-on.
+gathered at the Gaussians, and a network that also reads the neighbours of a Gaussian changes its
+parameters. All iterations have the same weights, and no gradient passes through the errors. Two
+points differ. The errors arrive as the gradient of the squared error with respect to each
+Gaussian's parameters, and not as features of a frozen network. The neighbours are those in the
+T-pose, at two levels: Gaussians, and clusters of Gaussians. A Gaussian that faces between two
+cameras can be 20 cm away from the nearest silhouette of a photo. Messages between Gaussians reach
+5 cm; clusters carry them on.
 
 The network was trained (`python -m experiments train_refiner`) on views that are not among the
 photos. Parts that no photo shows move with their neighbours. Gradient descent on the photos cannot

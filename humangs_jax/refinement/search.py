@@ -1,10 +1,11 @@
 """Searches for the result of `refine`: decides which photos are fitted, by how many iterations of
 the learned update, and by how many steps.
 
-With `HELD_OUT_PHOTOS` photos or more, trials come first. A trial leaves one photo out. The PSNR on
-this photo then says whether the iterations help, whether they help without the photo that fits
-least, and how many of the steps help. Then all photos are fitted as the trials say. If there are no
-steps, there are trials of the iterations only if one photo fits much less than the others. Several
+With `HELD_OUT_PHOTOS` photos or more, trials come first. A trial leaves one photo out, and fits the
+others. The PSNR on the photo that was left out says whether the iterations help, and how many of
+the steps help. If the iterations do not help, they are tried without the photo of the largest loss,
+which may contradict the others. Then the photos are fitted as the trials say. If there are no
+steps, there are trials only if one photo fits much less than the others (`SUSPICIOUS`). Several
 photos are left out in turn, see `photos_agree`. The photos that the avatar explains best before it
 is refined come first, so that a photo that misleads is never the first.
 
@@ -418,8 +419,9 @@ def _search_by_blocks(
 def _search_by_photo(
     task: Task, start: Candidate, losses: Float[np.ndarray, " v"]
 ) -> Iterator[Candidate]:
-    """Yields the states of trials, which each leave one photo out, then the states of a fit to all
-    photos. The fit has the iterations and the steps that helped in the trials. losses: the loss of
+    """Yields the states of trials, which each leave one photo out, then the states of the final
+    fit. The final fit has the photos, the iterations and the steps that helped in the trials.
+    Without steps there are no trials, unless one photo contradicts the others. losses: the loss of
     the start on each photo.
     """
     clock = task.clock

@@ -4,8 +4,9 @@ a row for each format.
 Our Gaussians are in metres with y up, the person faces +z, quaternions are wxyz, scales are linear,
 and opacities and colors are in [0, 1]. glTF's world is the same. Viewers of `.ply` and `.splat`
 take y for down: SuperSplat and PlayCanvas turn what they read by half a turn about z. The axes of
-`.spz` point to the right, up and back, half a turn about y from ours. Converters assume the same.
-`export` turns avatars into these worlds; `load_gaussians` and `save_gaussians` do so with `y_up`.
+`.spz` point to the right, up and back, half a turn about y from ours. Other converters assume
+these axes, too. `export` turns avatars into these worlds; `load_gaussians` and `save_gaussians` do
+so with `y_up`.
 """
 
 import logging
@@ -434,7 +435,7 @@ def export(
         motion: None for the T-pose. A `.glb` of the mesh holds all of it as animation.
         numbers: for each frame of the motion the number in the name of its file: "x.ply" becomes
             "x_0007.ply". All frames have one floor, so that a person who jumps is above it. None:
-            the motion has one frame, whose feet are on 0. A format that holds a whole motion does
+            the motion has one frame, and the feet are on 0. A format that holds a whole motion does
             not use the numbers.
         mesh: whether a mesh is written if the suffix also has a format of Gaussians (`.glb`).
         up: the axis that points up; None for the format's own.
