@@ -2,8 +2,8 @@
 long refinement takes, and how frames are drawn.
 
 `PRESETS` are the best trade-offs that `python -m experiments tradeoff` has measured
-(docs/tradeoff.md). `tune` times them on a machine with a person, and picks the best one within a
-budget.
+(docs/tradeoff.md). `tune` times them on the user's machine for one person, and picks the best one
+within a budget.
 """
 
 import dataclasses

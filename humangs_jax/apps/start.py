@@ -185,7 +185,7 @@ def photo_files(folder: Path) -> tuple[Path, list[Path]]:
 
 
 def scan_photos(folder: Path) -> FolderScan:
-    """Finds the photos of a folder, which may be in a subfolder such as "images" or "photos". The
+    """Finds the photos of a folder. They may be in a subfolder such as "images" or "photos". The
     scan also has the files of both folders that are not used.
 
     Raises: CaptureError (one line) if there is no photo.

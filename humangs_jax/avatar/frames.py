@@ -165,7 +165,7 @@ def composite_over(
 
 
 def rest_pose_of(avatar: Avatar) -> BodyPose:
-    """Returns the T-pose, at the place where the avatar's body is modelled."""
+    """Returns the T-pose without a translation, as the avatar's body is modelled."""
     return BodyPose(from_host(np.zeros((len(avatar.parents), 3))), from_host(np.zeros(3)))
 
 
@@ -189,8 +189,8 @@ def a_pose_of(avatar: Avatar) -> BodyPose:
 
 
 def tracked_points(avatar: Avatar, poses: BodyPose) -> Float[np.ndarray, "m p 3"]:
-    """Returns the positions of opaque Gaussians of the avatar in each pose of a batch, metres. All
-    of these points have to be in the images.
+    """Returns the positions of opaque Gaussians of the avatar in each pose of a batch, metres.
+    Cameras are placed so that the images contain all of these points.
     """
     opacities = np.asarray(avatar.gaussians.opacities)
     opaque = np.flatnonzero(opacities >= min(TRACKED_OPACITY, opacities.max()))

@@ -6,8 +6,8 @@ Layers of a view, besides the colors:
 Z: depth along the camera's axis, metres.
 position: the point of the world at this depth on the ray of the pixel, metres.
 normal: unit normals of the body's surface, in the world. Each Gaussian has the normal of the
-    vertex that is nearest to it in the T-pose, turned by its own skinning transform. A pixel has
-    the mean of these normals with the weights of its color, scaled to length 1.
+    vertex that is nearest to it in the T-pose, turned by its own skinning transform. The normal of
+    a pixel is the mean of these normals, weighted as its color is, and scaled to length 1.
 part: the number of the joint that moves the largest part of the pixel's color, counted from 1 in
     the header's `parts`. It is 0 where alpha is below 1/2. Each Gaussian counts for the joint of
     its largest skinning weight.
@@ -118,8 +118,8 @@ def write_views(
     """Draw v images of an avatar into a folder, pose i from camera i: view_000.png and so on. With
     `exr`, the file views.exr is written, too.
 
-    exposure_gains: the gains of the cameras, (v, 3), see `data.exposure`. names: the names of the
-    images, in place of view_000 and so on.
+    exposure_gains: factors on the colors in each image, (v, 3), see `data.exposure`. names: the
+    names of the images, in place of view_000 and so on.
 
     The files appear together when all are drawn. Images view_*.png and a views.exr of an earlier
     call are removed. Returns the number of views.

@@ -71,8 +71,8 @@ LEGS = tuple(
     for side in ("left", "right")
 )
 SMALLEST_VOLUME = 0.2
-"""A blended transform is inverted only if its determinant is larger than this. Transforms between
-limbs that are turned against each other collapse; Gaussians there keep their weights.
+"""A blended transform is inverted only if its determinant is larger than this. Where two limbs are
+turned against each other, blended transforms collapse. Gaussians there keep their weights.
 """
 POSED = "the posed vertices, which all arrays of the body move"
 BATCH = 8
@@ -442,8 +442,8 @@ def completed_avatar(
     outputs: HumanGSOutputs, body: BodyModel, views: SubjectViews, config: HumanGSConfig
 ) -> Avatar:
     """Returns the avatar of `make_avatar`, completed as the conventions of the configuration ask
-    for. They may change the skinning weights between the legs, and add the light of the photos and
-    the low-pass.
+    for. The conventions may change the skinning weights between the legs, and add the light of the
+    photos and the low-pass.
     """
     conventions = config.conventions
     avatar = make_avatar(outputs, body, subject_rest(body, views.betas, views.displacement), config)

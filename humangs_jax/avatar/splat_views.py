@@ -37,8 +37,8 @@ NEARLY_ALL = 0.999
 """Share of the opaque Gaussians that stands for all of them, because a few may be outliers."""
 COMPACT = 3.0
 """All opaque Gaussians are shown if the radius that contains nearly all of them is less than this
-many times the radius that contains the share `SHOWN`. There are no outliers then, as around a
-person.
+many times the radius that contains the share `SHOWN`. Then there are no outliers, as in files of a
+person alone.
 """
 ROOM = 1.1
 """Factor on the least distance from which the cameras see the Gaussians."""

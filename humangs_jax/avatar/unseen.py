@@ -39,8 +39,8 @@ UNSEEN = 0.15
 the camera is below this.
 """
 SEEN = 0.45
-"""Nothing is guessed for a vertex if the cosine is at least this in one of the photos. Between
-`UNSEEN` and `SEEN` guesses are mixed in.
+"""Nothing is guessed for a vertex if the cosine (see `UNSEEN`) is at least this in one of the
+photos. Between `UNSEEN` and `SEEN` guesses are mixed in.
 """
 SPREAD = 0.015
 """The weight of a source falls with its distance in the space of the features, as a Gaussian with
@@ -130,8 +130,8 @@ def _shown_by_view(inputs: HumanGSInputs, config: HumanGSConfig) -> Float[Array,
 
 
 class Regions(NamedTuple):
-    """The vertices of a body that may take guesses and give them, and their places in the space of
-    the features.
+    """Which vertices of a body take guesses and which give them, and the features of all
+    vertices.
     """
 
     head: Bool[Array, " n"]

@@ -44,8 +44,8 @@ LEAST_SIDE = 512
 In such photos heads show more detail than the iterations reach.
 """
 LARGEST_HEAD = 112
-"""The side that the largest head should have, pixels. Photos are reduced until it is about that
-small.
+"""The side that the largest head should have in the photos, pixels. Photos are reduced to make it
+about that small.
 """
 LOOK = 1024
 """The largest longer side of the photos in which heads are looked for, pixels. Crops are made of
@@ -54,8 +54,8 @@ photos of at most twice this side.
 SIDES = 32
 """The sides of the crops are multiples of this number of pixels."""
 SIMILAR = 1.25
-"""Photos are reduced again if the heads in them are smaller or larger than wanted by more than this
-factor.
+"""If the largest head is smaller or larger than wanted by more than this factor, crops are made of
+photos of another size.
 """
 EXCESS = 1.0
 """Weight of alpha beyond the mask in the loss."""

@@ -54,8 +54,8 @@ CLUSTER_LEVELS = 9
 NEAREST_CLUSTERS = 4
 """The number of clusters that each Gaussian reads."""
 CLUSTER_BLUR = 0.01
-"""Length that is added to the distance between a Gaussian and a cluster before the weight, 1 /
-distance, is computed, metres.
+"""Length, metres, that is added to the distance between a Gaussian and a cluster. The cluster's
+weight is 1 divided by the sum.
 """
 PERSON = 8000.0
 """The number of pixels that a person covers in the photos of training. Sums over pixels are scaled

@@ -53,9 +53,9 @@ def _options() -> dict[str, Any] | None:
 
 
 compiled_part = compiled(static=("config", "splat"), options=_options)
-"""Decorator of the parts of refinement that are programs when they are called with arrays. Inside
-of a transformation they become a part of the transformed program. Parameters named config and splat
-are static.
+"""Decorator of a part of refinement. If it is called with arrays, the part runs as a compiled
+program. Inside of a transformation it becomes a part of the transformed program. Parameters named
+config and splat are static.
 """
 
 

@@ -340,7 +340,8 @@ def align(task: Task, start: Candidate, each: Comparison) -> tuple[Task, Compari
 
     Iterations fit photos of one moment to a small part of a pixel. If the person has moved from
     photo to photo, or a pose or a camera is off, the result of iterations lies between the photos.
-    Then smooth moves bring the photos to the start, so that detail is fitted instead of its mean.
+    Then smooth moves bring the photos to the start, so that detail is fitted and not a blurred mean
+    of the photos.
     """
     if task.config.iterations < ITERATIONS:  # fewer leave more than that
         return task, each

@@ -1,4 +1,4 @@
-"""Makes Adam's part of refinement: a state, and a step that makes the next state from a photo.
+"""Has the steps of Adam: the state of a run, and a step on one photo that returns the next state.
 
 All functions are pure and for one person. On the host they are a few compiled programs. Under
 `jax.jit` and `jax.vmap` they are part of a single program.
@@ -107,7 +107,7 @@ def _trust(visibility: Float[Array, " g"], config: RefineConfig) -> Float[Array,
 def step(state: RefineState, photo: Photo, avatar: Avatar, config: RefineConfig) -> RefineState:
     """Returns the state after one step on a photo.
 
-    If this state has an overflow, repeat the step with larger buffers.
+    If the returned state has an overflow, repeat the step with larger buffers.
     """
     image, pull_back, rendering = drawn_photo(state.parameters, avatar, photo, state.splat)
     gradient, _ = pulled(pull_back, loss_gradient(image, photo, config))

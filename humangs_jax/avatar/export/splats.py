@@ -76,8 +76,8 @@ KNOWN = re.compile(
     r"[xyz]|n[xyz]|red|green|blue|alpha|opacity|filter_3D"
     r"|(f_dc|f_rest|scale|rot|packed|min|max)_\w+"
 )
-"""Matches the names of the properties that are read, and of properties that only repeat their
-contents.
+"""Matches the names of the properties that are read. Also matches properties that need no mention
+if they are not read, such as normals and 8-bit colors.
 """
 SHOWN = 6
 """The largest number of names in a line about unused properties."""

@@ -96,8 +96,8 @@ class _Header(NamedTuple):
 
     @property
     def widths(self) -> tuple[int, ...]:
-        """The bytes of a Gaussian in each array: positions, opacities, colors, scales, quaternions,
-        harmonics.
+        """The number of bytes of a Gaussian in each array: positions, opacities, colors, scales,
+        quaternions, harmonics.
         """
         positions = 6 if self.version == 1 else 9
         quats = 3 if self.version < 3 else 4
