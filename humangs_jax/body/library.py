@@ -2,9 +2,9 @@
 SMPL-X model.
 
 The package's body file is one small npz without pickles. Shape directions are multiples of 10
-micrometres in int16 where they fit. Skinning weights are the entries of each vertex that are not 0,
-in uint16. Indices are uint16 where they fit. `read_body` returns float32 weights whose rows sum to
-1. SMPL-X's licence forbids redistribution, so users bring that file.
+micrometres in int16 if all of them fit. Skinning weights are the entries of each vertex that are
+not 0, in uint16. Indices are uint16 where they fit. `read_body` returns float32 weights whose rows
+sum to 1. SMPL-X's licence forbids redistribution, so users bring that file.
 """
 
 from importlib import resources
@@ -35,7 +35,7 @@ from humangs_jax.io.reading import FileError, InvalidFileError, check_limit, ope
 FORMAT = "humangs-body-1"
 DIRECTION_STEP = 1e-5
 """Step of the stored shape directions, metres. int16 then spans +-0.33 m per unit of a shape
-coefficient. Larger directions are stored as float32.
+coefficient. If one of the directions is larger, all are stored as float64.
 """
 UV_STEPS = 65535
 KEYS = {
@@ -142,8 +142,8 @@ def _dense_rows(
 
 
 def save_body(path: str | Path, body: BodyModel) -> None:
-    """Writes a body model to a file, without pickles. `texels` and `relative_vertex_spacing` are
-    not written.
+    """Writes a body model to a file, without pickles. `texels`, `relative_vertex_spacing` and
+    `remesh_key` are not written.
 
     Raises: ValueError for a body with pose directions, which this format does not hold; OSError.
     """

@@ -117,13 +117,13 @@ def blend_leg_weights(
     """Returns skinning weights (g, j) of points off the skin. Points between the legs get mean
     weights of the body around them, so that a hem does not tear when the legs part.
 
-    The mean for a point is taken over the vertices around it, with a normal kernel. The standard
-    deviation of the kernel is d, the distance of the point from its vertex. The weights move
-    towards the mean by a share, the product of two factors. The first rises from 0 at d = 3/4
-    `reach` to 1 at d = 5/4 `reach`. The second is ten times the smaller of the two legs' shares in
-    the mean, at most 1. So hair and sleeves keep their weights. At most a quarter of the points
-    change, those with the largest d. LHM diffuses weights through a grid of voxels for the same
-    purpose (https://arxiv.org/abs/2503.10625).
+    The mean for a point is taken over every eighth vertex, with a normal kernel around the point.
+    The standard deviation of the kernel is d, the distance of the point from its vertex. The
+    weights move towards the mean by a share, the product of two factors. The first factor rises
+    from 0 at d = 3/4 `reach` to 1 at d = 5/4 `reach`. The second factor is ten times the smaller of
+    the two legs' shares in the mean, at most 1. So hair and sleeves keep their weights. At most a
+    quarter of the points change, those with the largest d. LHM diffuses weights through a grid of
+    voxels for the same purpose (https://arxiv.org/abs/2503.10625).
 
     Arguments: points: in the rest pose, metres. distances: of each point from its vertex, metres.
     weights: of the vertex of each point. vertices, vertex_weights: of the body in the rest pose.
@@ -260,8 +260,8 @@ class BodyModel:
     its own number. None: as for `collapse_order`.
     """
     relative_vertex_spacing: Float[Array, " n"] | None = None
-    """Distance to neighbouring vertices, divided by this distance before subdivision, (n,), see
-    `body.resolution`. None: the mesh was not subdivided.
+    """Spacing of the vertices around each vertex, divided by the spacing before long edges were
+    split, (n,), see `body.resolution.split_long_edges`. None: no edges were split.
     """
     texels: Texels | None = None
     """The point of the surface that each texel of a map shows, for networks that work on a map, see

@@ -7,8 +7,8 @@ and values must be finite and in range.
         first at [17]: nan
 
 Classes and shapes are known inside of `jit`, `vmap` and `grad`, too, and checking them computes
-nothing. Values are known only outside. Inside they are not checked, so the pure function behind a
-public one needs no switch.
+nothing. Values are known only outside of these transformations, and are not checked inside. So the
+pure function behind a public one needs no switch.
 """
 
 import dataclasses
@@ -67,8 +67,8 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
     number of axes is checked.
 
     Raises:
-        TypeError: of one line, for an argument of another class, for a name that is no parameter,
-            and for a missing argument.
+        TypeError: of one line, for an argument of another class, for a value without a shape where
+            an array is expected, for a name that is no parameter, and for a missing argument.
         ValueError: for an array with another number of axes, for a pytree that does not fit its
             annotations (`shape_fault`), and for a batch where the function takes one example
             (`one_at_a_time`).

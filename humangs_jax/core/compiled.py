@@ -1,17 +1,17 @@
 """Compiled functions whose programs stay on disk from one command to the next.
 
 JAX's cache keeps what XLA compiles, but finds it only by the lowered function. So a new process
-traces and lowers each function again, which takes longer than reading its program. A function with
-the decorator `compiled` finds its program by its name, the shapes of its arguments, its static
-arguments and the source of the package, and is not traced at all.
+traces and lowers each function again, which takes longer than reading its program. The program of a
+function with the decorator `compiled` is found by the name of the function, the shapes of its
+arguments, its static arguments and the source of the package. The function is not traced then.
 
 Programs that JAX's own cache had are not written, because XLA cannot write what it has read. So
 after an edit of the source, functions whose programs have not changed are traced in each process. A
 new version of the package begins with an empty cache, and keeps all programs again.
 
-Only the console script does this (`core.processes.keep_programs`), on a CPU. Elsewhere `compiled`
-is `jax.jit`: a notebook may change a function of the package while it runs, which the source does
-not show.
+Programs are kept only in processes that call `core.processes.keep_programs`, as the console script
+does, and only on a single CPU. Elsewhere `compiled` works as `jax.jit`. A notebook may change a
+function of the package while it runs, and the source would not show this change.
 """
 
 import contextlib
@@ -55,7 +55,9 @@ KNOWN = (PACKAGE.name, "builtins", "types", "collections", *MADE_BY)
 SETTINGS = ("enable_x64", "default_matmul_precision")
 """Settings of JAX that a program depends on and that a block of code may change."""
 DIGEST = hashlib.sha256().digest_size
-"""Number of bytes of the hash at the beginning of each file. XLA would run a damaged program."""
+"""Number of bytes of the hash at the beginning of each file. The hash shows whether the file is
+damaged, because XLA would run a damaged program.
+"""
 HIT = "/jax/compilation_cache/cache_hits"
 """JAX's event of a program that its own cache on disk had."""
 
@@ -132,7 +134,9 @@ class Compiled(Generic[T]):
         return self.jitted.lower(*args, **kwargs)
 
     def eval_shape(self, *args: Any, **kwargs: Any) -> Any:
-        """Returns the shapes of the result, as `jax.eval_shape`. They are kept on disk, too."""
+        """Returns the shapes of the result, as `jax.eval_shape`. They are kept on disk if programs
+        are.
+        """
         call = self._call(args, kwargs)
         file = None if call is None else self._file(call, "shapes")
         if call is None or file is None:
@@ -145,8 +149,8 @@ class Compiled(Generic[T]):
         return shapes
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
-        """Compiles the program of these arguments, or reads it, so that the call need not. Arrays
-        may be `jax.ShapeDtypeStruct`.
+        """Compiles the program of these arguments, or reads it, so that a later call need not.
+        Arrays may be `jax.ShapeDtypeStruct`.
         """
         call = self._call(args, kwargs)
         if call is None or self._program(call) is None:
@@ -154,7 +158,8 @@ class Compiled(Generic[T]):
 
     def _call(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> "_Call | None":
         """Returns the arguments of a call apart from the static ones, and what its program depends
-        on. None if programs are not kept, or if an argument is neither an array nor a number.
+        on. None if programs are not kept, if an argument is neither an array nor a number, or under
+        the settings `jax_disable_jit` and `jax_debug_nans`.
         """
         folder = _folder()
         # under these settings JAX calls the function itself, to find faults
@@ -178,7 +183,7 @@ class Compiled(Generic[T]):
 
     def _program(self, call: "_Call") -> Callable[..., T] | None:
         """Returns the program of a call. If another thread is making it, waits for it. None if
-        programs of this kind are not kept.
+        `_made` returns None.
         """
         own: Future[Any] = Future()
         # Ctrl-C may come at any time, and must leave nothing that other threads would wait for
@@ -220,8 +225,8 @@ class Compiled(Generic[T]):
         return program
 
     def _file(self, call: "_Call", kind: str) -> Path | None:
-        """Returns the file of a call. kind: what it holds. None if what the call depends on has no
-        stable text.
+        """Returns the path of the file that keeps the program or the shapes of a call. None if what
+        the call depends on has no stable text. kind: "program" or "shapes".
         """
         function = f"{self.function.__module__}.{self.function.__qualname__}"
         options = None if self.options is None else self.options()
@@ -243,7 +248,8 @@ def compiled(
 
     Args:
         static: names of static parameters. Those that a function does not have are ignored.
-        options: returns the options of XLA. Called with the first arrays.
+        options: a function without arguments that returns the options of XLA. It is called when
+            the function is called with arrays, and not before.
 
     Examples:
         >>> @compiled(static=["config"])
@@ -294,14 +300,14 @@ class _Call:
     kwargs: dict[str, Any]
     """Keyword arguments that are not static."""
     key: tuple[Any, ...]
-    """What the program depends on: the tree, the shapes of its leaves, the static arguments, and
-    the values of `SETTINGS`.
+    """What the program depends on: the tree of the arguments, the shapes and types of its leaves,
+    the static arguments, and the values of `SETTINGS`.
     """
 
 
 def _stands_alone(program: str) -> bool:
-    """Returns whether a lowered program calls nothing but XLA and LAPACK. Functions of Python that
-    it calls would not be there in another process, and that would crash.
+    """Returns whether a lowered program calls nothing but XLA and LAPACK. A program that calls
+    functions of Python would crash in another process, which does not have these functions.
     """
     called = re.findall(r"custom_call @(\S+)", program)
     return all(name.startswith("lapack_") for name in called)
@@ -324,7 +330,8 @@ def _shape(leaf: Any) -> tuple[Any, ...] | None:
 def _stable(value: Any) -> str:
     """Returns a text that is equal in two processes if, and only if, the values are.
 
-    Raises: TypeError for values of other packages' classes, whose source may change.
+    Raises: TypeError for values of classes that are not in a package of `KNOWN`, because their
+    source may change, and for arrays of JAX.
     """
     # values of Python
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
@@ -386,6 +393,8 @@ def _surroundings() -> str:
 def _read(file: Path) -> Any:
     """Returns what a file holds, and marks the file as used. Files that were not used for longest
     are deleted first.
+
+    Raises: OSError; ValueError if the file is damaged; anything that pickle raises.
     """
     data = file.read_bytes()
     if hashlib.sha256(data[DIGEST:]).digest() != data[:DIGEST]:

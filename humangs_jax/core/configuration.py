@@ -97,7 +97,7 @@ Length = Annotated[float, Range(1e-6, 100)]
 Bias = Annotated[float, Range(-100, 100)]
 Vertices = Annotated[int, Range(1, 10_000_000)]
 Edge = Annotated[float, Range(0.005, 10)]
-"""Length to which the edges of a body are split, metres. Shorter edges would make millions of
+"""Length above which the edges of a body are split, metres. Shorter edges would make millions of
 Gaussians.
 """
 
@@ -425,9 +425,9 @@ def config_from_json(cls: type[T], text: str) -> T:
     """Returns the configuration of class `cls` that `config_to_json` wrote. Missing fields take
     their defaults.
 
-    Raises: ValueError if the text is not JSON. Also, with the path of the field, for a field that
-    the configuration does not have, a missing field without a default, or a value of a wrong type
-    or out of range.
+    Raises: ValueError if the text is not JSON. Also for a field that the configuration does not
+    have, for a missing field without a default, for an unknown part, and for a value of a wrong
+    type or out of range; these errors name the path of the field.
     """
     try:
         values = json.loads(text)
@@ -437,9 +437,9 @@ def config_from_json(cls: type[T], text: str) -> T:
 
 
 def _build(annotation: Any, value: Any, path: str) -> Any:
-    """Returns a JSON value converted to the annotated type. Objects become configurations, lists
-    become tuples, and integers become floats. A value that cannot be converted is returned
-    unchanged, and the caller checks it.
+    """Returns a JSON value converted to the annotated type. Where the annotation says so, objects
+    become configurations, lists become tuples, and integers become floats. Any other value is
+    returned unchanged, and the caller checks it.
 
     path: names the value in messages. Raises: ValueError if a configuration cannot be made of an
     object, or if an item of a tuple is wrong.

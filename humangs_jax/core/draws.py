@@ -1,8 +1,8 @@
 """Draws random numbers by name, all at once.
 
-For each shape that random numbers are drawn in, JAX adds a function of some 230 lines to the
-program, which takes time to compile. So code that needs many numbers draws them once, uniform in
-[0, 1).
+For each shape of random numbers, JAX adds a function of more than a hundred lines of StableHLO to
+the program, and compiling it takes time. So code that needs many numbers draws all of them at once,
+uniform in [0, 1).
 """
 
 import math

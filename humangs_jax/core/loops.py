@@ -34,8 +34,8 @@ def over(function: Callable[[PyTree], T], xs: PyTree, pixels: int = 1) -> T:
         function: a pure function of one element.
         xs: arrays with one leading axis.
         pixels: number of pixels in an element's image. An accelerator works on several elements
-            side by side, with at most `PIXELS_AT_ONCE` pixels together, and on at least one. The
-            parts have equal numbers of elements.
+            side by side, if they have at most `PIXELS_AT_ONCE` pixels together, else on one. All
+            parts have the same number of elements.
     """
     if one_after_the_other():
         return jax.lax.map(function, xs)

@@ -135,13 +135,14 @@ def in_processes(
     tasks run in several processes, each with one thread, on the CPU.
 
     If the caller stops, by Ctrl-C or otherwise, or if a task fails, unfinished tasks are dropped
-    and these processes end. Other processes of the caller go on.
+    and the worker processes are ended. Other processes of the caller go on.
 
     Arguments: work: a function. tasks: the arguments of `work` by name. workers: largest number of
-    processes. prepare: called as prepare(*given) when a process starts. All of these are pickled.
+    processes. prepare: called as prepare(*given) when a process starts. Both functions, their
+    arguments and the results are pickled.
 
-    Raises: OSError if a process is killed; PicklingError and others if the arguments cannot be
-    pickled; anything that `work` raises.
+    Raises: OSError if a process is killed, or if `prepare` fails; PicklingError and others if the
+    arguments cannot be pickled; anything that `work` raises.
     """
     import concurrent.futures.process
 
@@ -202,10 +203,11 @@ def in_threads(
     work: Callable[..., T], tasks: Iterable[tuple[Any, ...]], threads: int
 ) -> Iterator[T]:
     """Yields work(*arguments) for each task, in the order of the tasks. At most `threads` tasks run
-    at a time, and at most one more result waits for the caller.
+    at a time. A task is started early only while at most `threads` earlier results are not yielded.
 
-    XLA draws an image on one core of a CPU, but several programs run at the same time. The settings
-    of JAX that a block of code may change are those of the calling thread.
+    XLA draws an image on one core of a CPU, but several threads can draw at the same time. The
+    tasks run under the values that JAX's settings `enable_x64` and `default_matmul_precision` have
+    in the calling thread.
 
     If the caller stops, by Ctrl-C or otherwise, or if a task fails, tasks that have not begun are
     dropped.
@@ -261,7 +263,7 @@ def end_with_parent() -> None:
 # where it lies, and how large it may grow.
 
 VARIABLE = "HUMANGS_COMPILE_CACHE"
-"""Environment variable that names the folder of compiled programs."""
+"""Environment variable that names the folder of compiled programs. 0: no folder."""
 OF_JAX = "JAX_COMPILATION_CACHE_DIR"
 """JAX's environment variable for the folder of compiled programs."""
 LARGEST = 2 << 30

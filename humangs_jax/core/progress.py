@@ -1,4 +1,5 @@
-"""Shows stages of long work, bars and lines of text (`say`) on a terminal. All of it is printable.
+"""Shows stages of long work, bars and lines of text (`say`) on a terminal. Characters that a
+terminal would act on are escaped in lines of text, names of stages and descriptions of bars.
 
     with stage("reading the capture"):
         ...

@@ -49,8 +49,8 @@ class ArrayField(NamedTuple):
     axes: tuple[str | int, ...] | None
     """Names and sizes of the axes. None: any axes."""
     values: Values | None
-    """Values that the entries may have. None: they are not floating-point numbers, and are not
-    checked.
+    """Values that the entries may have. None: the entries are not checked, because they are not
+    floating-point numbers and have no mark.
     """
     parts: tuple[Part, ...]
     """Parts of the array that are checked in addition."""
@@ -60,7 +60,7 @@ class ArrayField(NamedTuple):
         axis's name is in its place.
 
         sizes: the known sizes of axes by name. If the array has as many axes as expected, the sizes
-        of its axes that were not known are added to it.
+        of its axes that are not in `sizes` yet are added to it.
         """
         own = np.shape(array)
         if self.axes is None:

@@ -182,7 +182,9 @@ class Camera(Batchable):
         return replace(moved, K=self.K * scale)
 
     def moved(self, twist: Float[Array, "*b 6"]) -> "Camera":
-        """Returns the camera after a rigid motion in its own frame, exp(twist) `cam_from_world`.
+        """Returns the camera with exp(twist) `cam_from_world` in place of `cam_from_world`. In the
+        camera's frame, the world moves by exp(twist). In the world, the camera moves by the inverse
+        motion.
 
         twist: a rotation vector in radians, then a velocity in metres (see `transform.from_twist`),
         both in the camera's axes. Twists can be optimized without constraints: a twist of zeros is
@@ -229,7 +231,8 @@ def _pixels(width: int | float, height: int | float) -> tuple[int, int]:
 def stack_cameras(cameras: list[Camera]) -> Camera:
     """Returns a batch of cameras that have one image size and lens.
 
-    Raises: ValueError if image sizes or lenses differ or the list is empty.
+    Raises: ValueError if the list is empty, or if image sizes, lenses or numbers of coefficients
+    differ.
     """
     if not cameras:
         raise ValueError("no cameras to stack")

@@ -167,7 +167,7 @@ def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], b
 
 def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
     """Checks that joints form a tree with one root, whose parent is -1, that their names are
-    printable, and that they are within the limit `joints`.
+    printable, and that their number is within the limit `joints`.
 
     Raises: InvalidFileError.
     """

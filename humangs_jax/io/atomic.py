@@ -263,13 +263,13 @@ def check_replaceable(
 ) -> None:
     """Checks that a folder can be replaced. Call it before the work begins.
 
-    Arguments: mark: a file that all folders of this kind hold. The folder has to be empty, or to
-    hold this file and `overwrite` to be True. Without a mark it may hold anything. inputs: paths
-    that the work reads. They may not lie in the folder, because they would be deleted. Paths of
-    None are ignored.
+    Arguments: mark: a file that all folders of this kind hold. A folder that is not empty can be
+    replaced only if it holds this file and `overwrite` is True. Without a mark it may hold
+    anything. inputs: paths that the work reads. They may not lie in the folder, because they would
+    be deleted. Paths of None are ignored.
     Raises: ValueError if the content of the folder or an input forbids to replace it. Also if the
     path is a symbolic link, a file, a mount point, the working folder or a folder that contains the
-    working folder, or if nothing can be written in the folder above.
+    working folder, or if the nearest existing folder above it cannot be written to.
     """
     # the place can be replaced
     folder = Path(folder)
@@ -442,7 +442,7 @@ def only_writer(folder: str | os.PathLike[str], *, replaced: bool = False) -> Ge
     Arguments: replaced: whether the work makes or replaces the folder. Then a file beside the
     folder is locked, and removed at the end.
     Raises: BlockingIOError, an OSError, if another process holds the folder; OSError, which names
-    the folder, if it cannot be locked.
+    the folder, if the folder or the file beside it cannot be opened.
     """
     folder = Path(folder)
     if not replaced:

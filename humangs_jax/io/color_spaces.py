@@ -118,8 +118,8 @@ CURVES: dict[int, Curve] = {
     16: _pq_to_light,
     18: _hlg_to_light,
 }
-"""Curves by their code point (H.273). All other curves are read as sRGB's. All programs show BT.709
-and similar curves in this way.
+"""Curves by their code point (H.273). All other curves are read as sRGB's. Other programs show
+BT.709 and similar curves in this way, too.
 """
 PQ = 16
 """Number of the transfer function PQ in H.273."""

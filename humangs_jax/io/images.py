@@ -8,9 +8,10 @@ Photos say how their colors are encoded, by an ICC profile or numbers in their h
 are converted to sRGB. Colors of files that say nothing, or say sRGB, are values as stored, and so
 are masks.
 
-Pixels come as stored, whatever the orientation flag says that phones write into JPEG files (EXIF).
-`orientation` reads the flag, and `oriented` turns pixels by it. The caller decides. HEIC photos
-come upright, because their format turns them without the flag.
+Pixels come as stored. Phones write an orientation flag into JPEG files (EXIF), and the functions
+that read pixels ignore it. A caller that needs upright pixels reads the flag with `orientation` and
+turns the pixels with `oriented`. HEIC photos come upright, because their format turns them without
+the flag.
 """
 
 import contextlib
@@ -119,8 +120,8 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
 
     In an image with colors, the mask is 1 where the image has the only color besides black.
 
-    The alpha channel is the mask if the colors are a photo's, or are all alike, or are the same
-    mask.
+    An alpha channel that is not 1 everywhere is the mask if the visible colors are a photo's, or
+    are all alike, or are the same mask.
 
     Raises: as `read_image`; FileError if it is not clear which part is the person. This is so if
     there are several labels or colors, if label 0 is used and not black, if an image with colors
@@ -313,8 +314,8 @@ def png_bytes(
 
 
 def mark_of(path: str | Path) -> str | None:
-    """Returns the mark that `write_png` wrote into a file. None for other files and for files that
-    cannot be read.
+    """Returns the mark that `write_png` wrote into a file. None for files without a mark and for
+    files that cannot be read.
     """
     with contextlib.suppress(OSError, ValueError), open_file(path, "image_bytes") as file:
         head = file.read(1024)  # the text stands before the pixels

@@ -57,8 +57,8 @@ def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, An
 
     Arguments: limit: name of the limit on the JSON's size. The default suits files whose JSON is
     short.
-    Raises: InvalidFileError, KeyError, TypeError, ... for sizes that do not fit the file or are
-    more than the limits allow.
+    Raises: InvalidFileError, KeyError, TypeError, ... for a file that is no GLB, is damaged, is
+    larger than the limits allow, or leaves numbers in another file.
     """
     # the header, and the chunk of JSON
     start, _, _, length, kind = struct.unpack_from("<IIIII", data.ljust(20, b"\0"))
@@ -230,7 +230,8 @@ class GlbWriter:
         """Writes the file from the glTF document and all arrays that were added. If writing fails,
         the path stays as it was.
 
-        document: glTF's JSON without the arrays; `asset` is added if it is missing.
+        document: glTF's JSON without the arrays; `asset` is added if it is missing. Raises:
+        ValueError if a number in the JSON is not finite; OSError.
         """
         self.data += bytes(-len(self.data) % 4)
         document = {"asset": {"version": "2.0", "generator": "humangs_jax"}} | document

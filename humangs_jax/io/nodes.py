@@ -65,6 +65,11 @@ def world_matrices(
     tracks: Tracks,
     times: Float[np.ndarray, " m"],
 ) -> dict[int, Float[np.ndarray, "m 4 4"]]:
+    """Returns the matrices (m, 4, 4), world from node, of the nodes in `order` at m times, by the
+    number of the node. order: each node after its parent. times: seconds.
+
+    Raises: InvalidFileError. Damaged numbers may raise other errors.
+    """
     world: dict[int, np.ndarray] = {}
     for i in order:
         local = _local(
@@ -78,7 +83,8 @@ def world_matrices(
 
 
 def node_matrices(nodes: Nodes) -> list[Float[np.ndarray, "4 4"]]:
-    """Returns a matrix (4, 4), world from node, for each node of a GLB file without animation.
+    """Returns the matrix (4, 4), world from node, of each node of a glTF file. Animations are
+    ignored.
 
     Raises: InvalidFileError. Damaged numbers may raise other errors.
     """

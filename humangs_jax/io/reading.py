@@ -227,8 +227,8 @@ class FileError(ValueError):
 
 
 def is_unread(error: BaseException) -> bool:
-    """Says whether a file could not be read because of its permissions, so that nothing is known
-    about its content. error: as `reading` raised it.
+    """Says whether an error of `reading` means that a file could not be read because of its
+    permissions. Nothing is known about the content of such a file.
     """
     return isinstance(error.__cause__, PermissionError)
 
@@ -458,8 +458,8 @@ def read_text(path: str | os.PathLike[str], limit: str = "text_bytes") -> str:
 def parse_json(text: str) -> Any:
     """Returns the value of a JSON text. NaN and Infinity, which Python's tools write, are accepted.
 
-    Raises: InvalidFileError (a ValueError) if the text is not JSON, which names the line, or if it
-    is nested too deeply.
+    Raises: InvalidFileError (a ValueError) if the text is not JSON, is nested too deeply, or has an
+    integer of thousands of digits. If the text is not JSON, the error names the line.
     """
     try:
         value = json.loads(text)

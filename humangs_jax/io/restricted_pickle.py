@@ -4,7 +4,8 @@ A pickle is a program: it names functions and classes, and calls them. `Restrict
 Python's own unpickler, but it finds only the names in a table. Each of these names gives it a
 harmless stand-in. `_Looked` looks at each instruction before the unpickler gets it. It refuses an
 instruction that no pickle of arrays has, a number or an index larger than files need, and a dict
-whose key is made of tuples within tuples. So a small file cannot take much memory.
+with a key that is made of more than `LARGEST_KEY` values, as tuples within tuples can be. So a
+small file cannot take much memory.
 
 For body models and motions the table has numpy's arrays, scipy's sparse matrices and chumpy's
 arrays. numpy itself gets a type and bytes only in the end, when `as_array` makes an array of
@@ -37,9 +38,12 @@ LARGEST_KEY = 256
 """Largest number of values that the key of a dict may be made of, because all of them are hashed.
 """
 COUNTED = 1 << 30
-"""Counts of values stop here, because tuples within tuples can stand for any number of values."""
+"""Largest count of values that `_Looked` holds. Larger counts are held as this number, because
+tuples within tuples can stand for any number of values.
+"""
 LONGEST_LIST = 1 << 24
-"""Largest count of numbers in a nested list. A list counts each time that it stands in another one.
+"""Largest number of items in a nested list. Items of inner lists count, too, as often as the inner
+list occurs.
 """
 
 
@@ -87,7 +91,7 @@ class _Looked:
     def look(self) -> None:
         """Checks the instructions that follow the last checked one, up to a BUILD or STOP.
 
-        Raises: InvalidFileError for a refused instruction; ValueError, from `pickletools`, for
+        Raises: InvalidFileError for anything that is refused; ValueError, from `pickletools`, for
         bytes that are no instruction or are cut off.
         """
         here = self.file.tell()
@@ -600,8 +604,8 @@ def plain_array(data: Any, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarra
 
 
 def as_array(value: Any) -> np.ndarray:
-    """Returns a full array of a value from `read_pickle`: an array, a number, a list of numbers, or
-    a stand-in with a method `to_array`.
+    """Returns a value from `read_pickle` as a full array. The value is an array, a number, a list
+    of numbers, or a stand-in with a method `to_array`.
 
     Raises: ValueError for anything else.
     """

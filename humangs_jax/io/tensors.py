@@ -48,12 +48,12 @@ OLD_STREAM = (
 )
 """Error about a file that torch wrote as a stream, with advice."""
 LARGEST_RATIO = 16
-"""Largest size to which members may unpack, relative to the file. torch does not compress at
-all.
+"""Largest sum of the unpacked sizes of the members, relative to the size of the file. torch does
+not compress at all.
 """
 LARGEST_SHARE = 4
-"""Largest size of the tensors together, relative to the file. It is above 1 because bfloat16 is
-widened, and weights may be tied.
+"""Largest size of the wanted tensors together, as they are stored, relative to the size of the
+file. It is above 1 because several tensors may share a storage (tied weights).
 """
 MOST_AXES = 32
 

@@ -144,9 +144,9 @@ class PatchTransformer(Encoder):
     patch_size: Patch = 8
     """Side of a token's patch, pixels."""
     geometry: Literal["rays_and_positions", "place"] = "rays_and_positions"
-    """What the encoder knows of a pixel besides its color. This is its ray and the canonical
-    position seen there, or only its place in the photo, for systems whose photos have neither
-    cameras nor poses.
+    """What the encoder knows of a pixel besides its color. "rays_and_positions": its ray, and the
+    canonical position that it shows. "place": only its place in the photo, for systems whose photos
+    have neither cameras nor poses.
     """
     texture: TriplaneConfig = TriplaneConfig()
     """Size of the neural texture that every pixel looks up."""

@@ -114,7 +114,8 @@ def sample_neighborhoods(
     grid: Float[Array, "h w c"], indices: Float[Array, "p 2"]
 ) -> tuple[Float[Array, "p 3*3*c"], Float[Array, " p"]]:
     """Returns the interpolated values at the 3 x 3 places around each position, one texel apart,
-    (p, 9 c), and the coverage of each position, (p,). Places are in rows, and channels run fastest.
+    (p, 9 c), and the coverage of each position, (p,). The 9 places are in row-major order, and
+    channels run fastest.
 
     The coverage is the sum of the bilinear weights of the texels that exist. It is 1 away from the
     border. indices: texel indices (x, y), see `network.maps`. Positions that are outside by a texel

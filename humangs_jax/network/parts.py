@@ -328,9 +328,10 @@ class TargetDecoder(Part, nn.Module):
         targets: PyTree,
         background: float,
     ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
-        """Returns images (v, h, w, 3) and alpha (v, h, w), or None for alpha, of a person in the
-        target views, for evaluations. variables, config: of the network. inputs: the photos of the
-        person.
+        """Returns the images of a person in the target views, (v, h, w, 3), and their alpha, (v, h,
+        w), or None if the part makes no alpha. Evaluations call it. variables, config: of the
+        network. inputs: the photos of the person. background: grey level of the background, in [0,
+        1].
         """
         raise NotImplementedError
 

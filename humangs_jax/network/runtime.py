@@ -163,7 +163,7 @@ class Conventions:
     pixels: Literal["all", "person"] = "all"
     """Pixels that count. "person": if a photo has a mask, only the pixels of the mask count. Parts
     of the body that cover background in a photo are then unseen there. With shells, Gaussians get
-    opacity 0 if their vertex lies off the person in all photos.
+    opacity 0 if no photo shows the person at any of the shells of their vertex.
     """
     position_map: Literal["plain", "gouraud"] = "plain"
     """How position maps are drawn: canonical positions that are interpolated ("plain"), or lit by a
@@ -186,9 +186,9 @@ class Conventions:
     `rendering.splat_config.SPLAT_PRESETS`.
     """
     leg_blend_distance: Length | None = None
-    """Distance from the vertex, metres. Gaussians between the legs that are farther than this from
-    their vertex move with both legs (`body.model.blend_leg_weights`). None: all move with their
-    vertex.
+    """Distance from the vertex, metres. Gaussians between the legs move with both legs if they are
+    farther from their vertex. From 3/4 to 5/4 of this distance the effect grows from none to full
+    (`body.model.blend_leg_weights`). None: all move with their vertex.
     """
     light: bool = False
     """Whether other poses are drawn in the light of the photos (`Avatar.light`)."""

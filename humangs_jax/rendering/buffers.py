@@ -89,6 +89,7 @@ def plan_buffers(
 
     Raises:
         TypeError: inside of `jit`, `vmap` and `grad`.
+        ValueError: for an unknown name of a preset.
 
     Examples:
         >>> config = hg.plan_buffers(gaussians, cameras, margin=2.0)

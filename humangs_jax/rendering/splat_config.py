@@ -243,7 +243,8 @@ def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
 
     All fields in which the two presets differ take the values of the preset `rendering`. Other
     fields stay as the user has set them. If `jacobian_margin`, `normalize_quats` and `square` of
-    the configuration all differ from those of the other preset, it is returned unchanged.
+    the configuration all differ from those of the other preset, the configuration is returned
+    unchanged.
     """
     wanted, other = SPLAT_PRESETS["inria"], SPLAT_PRESETS["exact"]
     if rendering == "exact":

@@ -204,7 +204,9 @@ def render_views(
         A `Rendering` with a leading axis v.
 
     Raises:
+        TypeError: as `render`.
         ValueError: as `render`, and for a single camera or several batch axes.
+        BufferOverflowError: as `render`.
 
     Examples:
         >>> images = hg.render_views(gaussians, cameras).rgb  # (v, h, w, 3)

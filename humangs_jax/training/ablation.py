@@ -147,8 +147,8 @@ def ablate(
         variants: for each variant, by its name, the fields that change. They are values by path, as
             `vary` takes them.
         seeds: number of runs of the base and of each variant.
-        people: people to train on. They are given as a number of synthetic people, who are rendered
-            during training, as capture folders, or as a function that makes a source.
+        people: people to train on, in one of three forms: a number of synthetic people, which are
+            rendered during training; a list of capture folders; a function that makes a source.
         validation: other people to compare on, in the same three forms. If it is a function, the
             first eight people of its source are used, else all people. All variants are compared on
             the photos and targets of the base.

@@ -140,10 +140,10 @@ class Checkpoints:
         """Returns the state of a step. If `step` is None, it is the newest state that is not
         damaged.
 
-        like: a state of the same run, for structure, shapes and devices. Checkpoints that are
-        newer and damaged are logged and set aside.
-        Raises: FileNotFoundError if there is no such checkpoint; FileError (a ValueError) if all
-        are damaged or of another model.
+        like: a state of the same run, for structure, shapes and devices. Newer checkpoints that
+        cannot be used are logged, and set aside unless `read_only`.
+        Raises: FileNotFoundError if there is no such checkpoint; FileError (a ValueError) if none
+        can be used, because they are damaged or of another model.
         """
         self.wait()
         folder = Path(self._manager.directory)

@@ -422,13 +422,13 @@ def diagnose_run(
     networks: LossNetworks = NO_NETWORKS,
     variables: Variables | None = None,
 ) -> Diagnosis:
-    """Returns the diagnosis of the first step of a run that its log calls skipped or not finite.
+    """Returns the diagnosis of one step of a run: the first step that the run's log calls skipped
+    or not finite. If the log has no such step, it is the step after the newest checkpoint.
 
-    The run is repeated from the newest checkpoint before that step, or from its start. If the log
-    has no such step, the step after the newest checkpoint is diagnosed. body, training, networks,
-    variables: as the run had them. Batches are functions of seed and step, so the step is repeated
-    bit for bit on the device that the run had. Raises: FileNotFoundError if `out` holds no run;
-    ValueError if its configuration, log or checkpoints cannot be used.
+    The run is repeated from the newest checkpoint before that step, or from the start. body,
+    training, networks, variables: as the run had them. Batches are functions of seed and step, so
+    the step is repeated bit for bit on the device that the run had. Raises: FileNotFoundError if
+    `out` holds no run; ValueError if its configuration, log or checkpoints cannot be used.
     """
     config = load_config(out)
     if isinstance(training, Sequence):

@@ -48,8 +48,8 @@ def usual_room(config: TrainConfig, body: BodyModel) -> int:
 def with_measured_room(
     config: TrainConfig, variables: Variables, body: BodyModel, batch: Example
 ) -> TrainConfig:
-    """Returns the configuration of a stage with room for `MARGIN` times what the targets of a batch
-    need.
+    """Returns the configuration of a stage with room for `MARGIN` times what the targets of the
+    first `MEASURED` subjects of a batch need.
 
     The configuration is returned unchanged if it sets `max_pairs`, if `usual_room` is below
     `WORTH`, or if the measured room is no smaller than `usual_room`.

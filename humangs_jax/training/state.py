@@ -201,8 +201,8 @@ def on_joined(
 ) -> optax.GradientTransformationExtraArgs:
     """Returns an optimizer that applies `inner` to the joined entries of parameters and gradients.
 
-    Its state has the same arrays as the state of `inner`, so that a run can continue on other
-    devices.
+    Its state has the same arrays as the state of `inner` for arrays that are not joined. So a run
+    can continue on devices on which nothing is joined.
     """
 
     def update(gradients: PyTree, state: PyTree, params: PyTree, **extra: Any):

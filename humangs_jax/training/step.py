@@ -54,7 +54,7 @@ def random_backgrounds(key: Key, count: int, share: float) -> Float[Array, "v 3"
 def change_background(
     images: Float[Array, "v h w 3"], masks: Float[Array, "v h w"], backgrounds: Float[Array, "v 3"]
 ) -> Float[Array, "v h w 3"]:
-    """Returns photos on white as they would look on other colors."""
+    """Returns photos with a white background as they would look on backgrounds of other colors."""
     return images + (1 - masks[..., None]) * (backgrounds[:, None, None, :] - 1)
 
 
@@ -224,8 +224,8 @@ def train_step(
     networks: LossNetworks = NO_NETWORKS,
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """Returns the state after one more step, and metrics. It calls `update`, compiled. The state
-    is donated.
+    """Returns the state after one more step, and metrics. It calls `update`, compiled. The given
+    state is donated, so it cannot be used afterwards.
     """
     return compiled_update()(
         state, batch, body, networks, seed_numbers(config.seed), compiled_for(config), mesh
