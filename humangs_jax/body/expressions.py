@@ -38,7 +38,7 @@ KEYS = (
     *("format", "names", "counts", "vertices", "offsets", "eye_turns"),
     *("lips", "inside_vertices", "part_faces", "parts"),
 )
-"""Keys that every file of `assets/face.npz`'s format has."""
+"""Keys that every face file has, such as `assets/face.npz`."""
 
 
 @pytree_dataclass

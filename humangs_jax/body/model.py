@@ -278,8 +278,8 @@ class BodyModel:
     name: str = static_field(default="body")
     """Name of the body in messages."""
     remesh_key: tuple | None = static_field(default=None)
-    """Result of `data.views.remesh_key` for which `data.views.gaussian_body` has made this body.
-    None: that function has not made it.
+    """If `data.views.gaussian_body` has made this body: the result of `data.views.remesh_key` that
+    says how. Otherwise None.
     """
 
 

@@ -78,7 +78,7 @@ class Motion:
 
     def at_rate(self, fps: float | int) -> "Motion":
         """Returns the motion at another frame rate. Between two frames, rotations are interpolated
-        on the shortest way, and positions and expressions linearly. fps: frames per second.
+        on the shortest way, translations and expressions linearly. fps: frames per second.
 
         Raises: ValueError if the rate is not positive, or if there would be more frames than the
         limit.

@@ -218,13 +218,13 @@ HIDDEN = 0.01
 count as if they were ten times shorter.
 """
 RIM = 2
-"""Number of rings of hidden vertices next to visible vertices that are treated as visible, because
+"""Hidden vertices in this number of rings around visible vertices are treated as visible, because
 they hold lips and eyelids in place.
 """
 VIEWS = 40
 CELL = 0.004
 """Size of a depth-buffer cell, metres, for a body of a person's size. It decides how narrow a gap
-may be and still let light through.
+may be through which vertices are still seen.
 """
 RIDGE = 1e-13
 """Regularization of the normal equations, relative to their trace. Without it they are singular
@@ -412,8 +412,8 @@ def collapse_sequence(
     """Returns the rank of each vertex in the progressive decimation of a triangle mesh, and the
     vertex that each one moves onto.
 
-    Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3): faces of the texture, whose
-    seams are kept closed; None: no texture.
+    Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3): texture vertices at the
+    corners of the faces. Seams of the texture are kept closed. None: no texture.
     Returns: order, (n,), the rank of each vertex. 0 stays longest, n - 1 collapses first. into,
     (n,), the vertex that each vertex moves onto. A vertex that can never collapse has its own
     number.

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from humangs_jax.core.array_types import Int
 
 SMALL = 1 << 16
-"""Arrays of at most this many entries are indexed on the host. Their way from an accelerator and
+"""Arrays of at most this many entries are indexed on the host. Copying them from an accelerator and
 back takes less time than compiling a program.
 """
 
@@ -22,7 +22,7 @@ def from_host(array: Any, dtype: Any = None) -> Any:
     """Returns an array of JAX with the numbers of a list or of an array of numpy. An array of JAX
     is only converted to `dtype`. dtype: None keeps the type.
 
-    `jnp.asarray` gives the same result, but compiles a program for each shape.
+    `jnp.asarray` gives the same numbers, but compiles a program for each shape.
     """
     if isinstance(array, jax.Array):
         if dtype is None or array.dtype == dtype:
@@ -32,8 +32,8 @@ def from_host(array: Any, dtype: Any = None) -> Any:
 
 
 def on_host(array: Any) -> bool:
-    """Says whether numpy can read an array at once. It can if the array is numpy's, or is JAX's on
-    a CPU of this process.
+    """Says whether numpy can read an array without a copy from an accelerator or from another
+    process. It can if the array is numpy's, or is JAX's, of numbers, on CPUs of this process.
     """
     if isinstance(array, np.ndarray):
         return True
@@ -43,8 +43,8 @@ def on_host(array: Any) -> bool:
 def taken(array: Any, index: Any) -> Any:
     """Returns `array[index]`, for arrays of numpy and of JAX.
 
-    An array of JAX is indexed by numpy if it is small or if numpy can read it at once, see
-    `on_host`. The result is then an array of JAX again.
+    An array of JAX is indexed by numpy if it is small, or if it is on the host (`on_host`). The
+    result is then an array of JAX again.
 
     Raises: IndexError for an integer out of range. If the index is traced, there is no error, and
     JAX clamps it.
@@ -74,7 +74,7 @@ def out_of_range(index: Any, size: int) -> Int[np.ndarray, " n"]:
 
 
 def joined(arrays: Sequence[Any]) -> Any:
-    """Returns `jnp.stack(arrays)`. numpy computes it if it can read all arrays at once."""
+    """Returns `jnp.stack(arrays)`. numpy computes it if all arrays are on the host (`on_host`)."""
     if all(on_host(array) for array in arrays):
         return from_host(np.stack(arrays))
     return jnp.stack(arrays)

@@ -62,9 +62,9 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """Decorates a function so that each call checks the classes of its arguments, and the shapes of
     the arrays in them.
 
-    A parameter is checked if its annotation consists of plain classes and sequences, or of arrays,
-    besides None. Parameters for numbers and callables are not checked. For an array, only the
-    number of axes is checked.
+    A parameter is checked if its annotation names either plain classes and sequences, or arrays.
+    None may be one of the options. Parameters for numbers and callables are not checked. For an
+    array, only the number of axes is checked.
 
     Raises:
         TypeError: of one line, for an argument of another class, for a value without a shape where
@@ -258,11 +258,12 @@ def check_values(
     Arrays of JAX on an accelerator are reduced there by one program, which returns two numbers for
     each array. Other arrays are checked on the host, without a copy.
 
-    Arguments: owner: the function that was called, for the message. arrays: by its name in the
-    message, each array and the values that its entries may have. None and empty arrays pass.
+    Arguments: owner: the function that was called, for the message. arrays: each array with the
+    values that its entries may have, by the name of the array in the message. None and empty arrays
+    pass.
 
-    Raises: ValueError, which names the first array with wrong entries, their number, and the place
-    of the first one.
+    Raises: ValueError if an entry is wrong. The message has the name of the first array with wrong
+    entries, their number, and the place of the first of them.
     """
     given = {
         name: (array, values)

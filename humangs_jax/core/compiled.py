@@ -5,9 +5,9 @@ traces and lowers each function again, which takes longer than reading its progr
 function with the decorator `compiled` is found by the name of the function, the shapes of its
 arguments, its static arguments and the source of the package. The function is not traced then.
 
-Programs that JAX's own cache had are not written, because XLA cannot write what it has read. So
-after an edit of the source, functions whose programs have not changed are traced in each process. A
-new version of the package begins with an empty cache, and keeps all programs again.
+Programs that come from JAX's own cache are not written, because XLA cannot write what it has read.
+After an edit of the source, this concerns all functions whose programs stay the same: each process
+traces them. A new version of the package begins with an empty cache, and keeps all programs again.
 
 Programs are kept only in processes that call `core.processes.keep_programs`, as the console script
 does, and only on a single CPU. Elsewhere `compiled` works as `jax.jit`. A notebook may change a
@@ -59,14 +59,14 @@ DIGEST = hashlib.sha256().digest_size
 damaged, because XLA would run a damaged program.
 """
 HIT = "/jax/compilation_cache/cache_hits"
-"""JAX's event of a program that its own cache on disk had."""
+"""JAX's event for a program that it read from its own cache on disk."""
 
 
 class Compiled(Generic[T]):
     """What `compiled` returns: a function that is compiled when it is called with arrays. Inside of
     a transformation it becomes a part of the transformed program.
 
-    Types of arguments are not checked statically, as with `jax.jit`: arrays may be NumPy's.
+    As with `jax.jit`, a type checker accepts all arguments, because arrays may be NumPy's.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Compiled(Generic[T]):
         return self.function.__qualname__
 
     def lower(self, *args: Any, **kwargs: Any) -> Any:
-        """Returns the lowered function, as the function of `jax.jit` does."""
+        """Returns the lowered function, as `lower` of a function of `jax.jit` does."""
         return self.jitted.lower(*args, **kwargs)
 
     def eval_shape(self, *args: Any, **kwargs: Any) -> Any:
@@ -241,8 +241,8 @@ class Compiled(Generic[T]):
 def compiled(
     *, static: Sequence[str] = (), options: Callable[[], dict[str, Any] | None] | None = None
 ) -> Callable[[Callable[..., T]], Compiled[T]]:
-    """Returns a decorator that compiles a function when it is called with arrays, and keeps its
-    programs on disk if the process does so (`core.processes.keep_programs`).
+    """Returns a decorator that compiles a function when it is called with arrays. If the process
+    keeps programs (`core.processes.keep_programs`), those of the function stay on disk.
 
     The function must depend on nothing but its arguments and the source of the package.
 
@@ -260,7 +260,7 @@ def compiled(
 
 
 class _Hits(threading.local):
-    """Counts the programs that JAX's own cache had, for each thread."""
+    """Counts the programs that JAX read from its own cache, for each thread."""
 
     count = 0
 
@@ -328,7 +328,8 @@ def _shape(leaf: Any) -> tuple[Any, ...] | None:
 
 
 def _stable(value: Any) -> str:
-    """Returns a text that is equal in two processes if, and only if, the values are.
+    """Returns a text for a value. The texts of two values, also of two processes, are equal if and
+    only if the values are equal.
 
     Raises: TypeError for values of classes that are not in a package of `KNOWN`, because their
     source may change, and for arrays of JAX.
@@ -406,8 +407,9 @@ def _read(file: Path) -> Any:
 
 
 def _write(file: Path, data: bytes) -> None:
-    """Writes a file at once, so that no other process reads a part of it. Writes nothing if the
-    source has changed since the process began: the program may be that of either source.
+    """Writes a file under a temporary name and renames it, so that no other process reads a part of
+    it. Writes nothing if the source has changed since the process began: the program may be that of
+    either source.
     """
     if source_has_changed():
         return

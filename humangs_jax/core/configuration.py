@@ -10,9 +10,9 @@ Numbers are annotated with their range. The range is checked whenever a configur
 A class variable `renamed_fields` maps the names of fields in earlier files to the names of today.
 
 A field annotated with a subclass of `Part` may hold an object of any class derived from it. The
-class must be decorated with `part`, or it cannot be written. The JSON names the class under "kind",
-as "PatchTransformer". Reading imports nothing: a part of another package is known once its module
-is imported.
+class must have the decorator `part`, or the configuration cannot be written. The JSON names the
+class under "kind", as "PatchTransformer". Reading imports nothing: a part of another package is
+known once its module is imported.
 """
 
 import dataclasses

@@ -2,7 +2,7 @@
 one subject.
 
 A CPU runs them one after the other. It then needs memory for one at a time, and the loops over
-tiles and faces end when the work of one image is done. An accelerator runs them side by side.
+tiles and faces of an image end when this image is done. An accelerator runs them side by side.
 Otherwise it would wait for thousands of small operations, one after the other.
 """
 
@@ -34,8 +34,8 @@ def over(function: Callable[[PyTree], T], xs: PyTree, pixels: int = 1) -> T:
         function: a pure function of one element.
         xs: arrays with one leading axis.
         pixels: number of pixels in an element's image. An accelerator works on several elements
-            side by side, if they have at most `PIXELS_AT_ONCE` pixels together, else on one. All
-            parts have the same number of elements.
+            side by side, as long as they have at most `PIXELS_AT_ONCE` pixels together, and at
+            least on one. All parts have the same number of elements.
     """
     if one_after_the_other():
         return jax.lax.map(function, xs)

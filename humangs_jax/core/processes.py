@@ -85,8 +85,8 @@ def memory_status(name: str) -> float:
 @contextlib.contextmanager
 def undisturbed() -> Generator[None]:
     """Makes Ctrl-C wait until the end of the block. Use it for short work that must not be left
-    half-done. It does nothing in a thread other than the main one, because Ctrl-C reaches only that
-    one.
+    half-done. It does nothing in a thread other than the main one, because Ctrl-C reaches only the
+    main thread.
     """
     if threading.current_thread() is not threading.main_thread():  # only that one gets it
         yield
@@ -203,7 +203,7 @@ def in_threads(
     work: Callable[..., T], tasks: Iterable[tuple[Any, ...]], threads: int
 ) -> Iterator[T]:
     """Yields work(*arguments) for each task, in the order of the tasks. At most `threads` tasks run
-    at a time. A task is started early only while at most `threads` earlier results are not yielded.
+    at a time. The work is at most `threads` + 1 results ahead of the caller.
 
     XLA draws an image on one core of a CPU, but several threads can draw at the same time. The
     tasks run under the values that JAX's settings `enable_x64` and `default_matmul_precision` have
@@ -267,8 +267,8 @@ VARIABLE = "HUMANGS_COMPILE_CACHE"
 OF_JAX = "JAX_COMPILATION_CACHE_DIR"
 """JAX's environment variable for the folder of compiled programs."""
 LARGEST = 2 << 30
-"""Largest size of the cache, bytes. `enable_compile_cache` deletes the files beyond it that were
-not used for longest. JAX's own limit needs the package `filelock`.
+"""Largest size of the cache, bytes. From a larger cache, `enable_compile_cache` deletes the files
+that were not used for longest. JAX's own limit needs the package `filelock`.
 """
 
 
@@ -341,8 +341,8 @@ _programs: list[Path] = []
 
 
 def keep_programs(cache: Path) -> None:
-    """Keeps the programs of `core.compiled` in a folder, if it is safe. A process calls it once,
-    before the first computation.
+    """Keeps the programs of `core.compiled` in a folder, if the folder is safe. Call this once in a
+    process, before the first computation.
 
     A program is code, and its file is read with `pickle`. So the folder is made for the user alone.
     Nothing is kept if the folder belongs to somebody else or is a link. Nothing is kept, either, if
@@ -471,7 +471,7 @@ a third faster.
 The second option turns off three passes of XLA. The first pass would divide kernels of tens of
 microseconds among several threads, which took twice the CPU time and gained nothing. The second one
 would remove barriers, which make sure that tables are stored before they are gathered from. The
-third one would make single kernels of the loops of tiny images, and single kernels know no
+third one would make one kernel of each loop over a tiny image, and inside of a kernel there are no
 barriers.
 
 Eager calls use these options. Pass `compiler_options()` to your own jitted functions.

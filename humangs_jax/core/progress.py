@@ -62,7 +62,7 @@ def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> list[str]:
 
 
 TICK = 0.2
-"""Seconds between two updates of the line."""
+"""Seconds between two updates of the line of a stage."""
 LONG = 10.0
 """Seconds between two updates of a bar, and seconds after which the name of a running stage is
 printed. Both apply only if stderr is no terminal.
@@ -128,8 +128,8 @@ def current() -> Progress:
 
 
 def end() -> None:
-    """Stops showing stages, as before `begin`. All bars that are still open are closed, which shows
-    their last line.
+    """Stops showing stages, so that all is as before `begin`. All bars that are still open are
+    closed, which shows their last line.
     """
     global _current
     _current = Progress()

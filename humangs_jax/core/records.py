@@ -27,7 +27,7 @@ class Part(NamedTuple):
     """
 
     words: str
-    """Name of the part in an error, which stands after the array's name."""
+    """Name of the part in an error. It stands after the array's name."""
     take: Callable[[np.ndarray], np.ndarray]
     """Function that returns the part of an array on the host."""
     values: Values

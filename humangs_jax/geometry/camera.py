@@ -171,8 +171,8 @@ class Camera(Batchable):
         return replace(self, K=from_host(K * scale[:, None]), width=width, height=height)
 
     def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
-        """Returns the camera for the same world in another unit of length. unit: its length in
-        metres. All lengths are divided by it.
+        """Returns the camera for the same world in another unit of length. unit: the length of the
+        new unit, metres. All lengths are divided by it.
         """
         translation = self.cam_from_world[..., :3, 3] / unit
         moved = replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))

@@ -1,6 +1,6 @@
 """Writes files and folders so that no unfinished one appears under its name.
 
-They are written under a temporary name in the same folder, then renamed.
+Files and folders are written under a temporary name in the same folder, then renamed.
 
 Temporary names are unique, so several processes may write at once. When a process was killed, a
 later process that writes to the same place removes the temporary files of the killed process. It

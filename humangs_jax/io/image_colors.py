@@ -31,8 +31,8 @@ def colors_in_srgb(
     path: str | Path, image: Any, data: bytes, levels: UInt[np.ndarray, "h w c"], most: int
 ) -> Float[np.ndarray, "h w 3"] | None:
     """Returns the colors of a photo in sRGB, (h, w, 3), in [0, 1]. Returns None if the levels are
-    to be taken as sRGB. That is so if the file says so or says nothing, or if its color profile
-    cannot be used. A profile that cannot be used is logged.
+    to be taken as sRGB. That is so if the file says that it has sRGB, if it says nothing, or if its
+    color profile cannot be used. A profile that cannot be used is logged.
 
     path: for the warning. image: the PIL.Image. data: bytes of the file. levels: the photo's
     levels, (h, w, c), from 0 to `most`.

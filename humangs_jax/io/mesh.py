@@ -185,7 +185,7 @@ class GlbWriter:
         accessor.
 
         Arguments: kind: a key of COLUMNS. target: as in `bytes_`. bounds: whether to record the
-        smallest and the largest number of each column, which positions and times need.
+        smallest and the largest number of each column. glTF asks for them for positions and times.
         """
         dtype = values.dtype if values.dtype.kind == "u" else "<f4"
         values = np.ascontiguousarray(values, dtype)

@@ -109,8 +109,8 @@ class HumanGSConfig:
 
     @property
     def tokens(self) -> TokenSelection:
-        """The selection of tokens that is used: `Runtime.tokens`, or if this is None
-        `Conventions.tokens`.
+        """The selection of tokens that is used: `Runtime.tokens`, or `Conventions.tokens` if that
+        is None.
         """
         return self.forward_context().tokens
 
@@ -122,8 +122,8 @@ class HumanGSConfig:
 
     @property
     def image_size(self) -> int:
-        """Side of the photos that is used, pixels: `Runtime.image_size`, or if this is None
-        `Conventions.image_size`.
+        """Side of the photos that is used, pixels: `Runtime.image_size`, or
+        `Conventions.image_size` if that is None.
         """
         return self.runtime.image_size or self.conventions.image_size
 

@@ -321,8 +321,8 @@ def touched_patches(
 def needed_tokens(
     foreground: Bool[Array, "*b v h w"], view_count: Int[Array, "*b"] | None, patch_size: int
 ) -> Int[Array, ""]:
-    """Returns the number of patches that the foreground touches, which is the token capacity that
-    photos need. For a batch, it is the largest number.
+    """Returns the number of patches that the foreground of one subject's photos touches. It is the
+    token capacity that these photos need. For a batch of subjects, returns the largest number.
     """
 
     def count(*subject):

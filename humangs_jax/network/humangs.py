@@ -38,10 +38,10 @@ from humangs_jax.network.parts import (
 
 
 class HumanGS(nn.Module):
-    """The encoder, reader and decoder as one module, whose variables have the names of these
-    fields.
+    """The encoder, reader and decoder as one module. The variables of each have the name of its
+    field.
 
-    Linen's tools to look inside a module, such as interceptors, work on it. The driver is not
+    Linen's tools that look inside a module, such as interceptors, work on it. The driver is not
     included.
     """
 
@@ -103,8 +103,9 @@ def apply_humangs(
 def intermediates(
     variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> dict[str, Any]:
-    """Returns the result of every module of the network by its path, such as
-    "encoder.transformer.block_0", in the order in which they finish. The path of the network is "".
+    """Returns the result of every module of the network by the path of the module, such as
+    "encoder.transformer.block_0", in the order in which the modules finish. The path of the whole
+    network is "".
     """
     found = {}
 

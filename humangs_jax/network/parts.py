@@ -1,5 +1,5 @@
-"""Defines what the exchangeable parts of a network take and return: encoder, reader, decoder and
-driver.
+"""Defines the exchangeable parts of a network: encoder, reader, decoder and driver, and what they
+take and return.
 
     encoding = encoder(photos)
     features = reader(encoding)
@@ -115,8 +115,8 @@ class ForwardContext(NamedTuple):
 
     @property
     def tokens(self) -> TokenSelection:
-        """The selection of tokens that is used: `Runtime.tokens`, or if this is None
-        `Conventions.tokens`.
+        """The selection of tokens that is used: `Runtime.tokens`, or `Conventions.tokens` if that
+        is None.
         """
         return self.runtime.tokens or self.conventions.tokens
 
@@ -219,8 +219,8 @@ class HumanGSOutputs:
     vertex each. None: the body's weights.
     """
     scene: PyTree = None
-    """The data from which a driver draws every target. If there is a driver and the decoder leaves
-    this None, it becomes the features.
+    """The data from which a driver draws every target. If there is a driver, and the decoder sets
+    nothing here, these are the features that the decoder took.
     """
 
     @property

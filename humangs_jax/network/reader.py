@@ -2,11 +2,10 @@
 the views.
 
 Vertices can also read the photos themselves, at the surface and on shells. Shells are points off
-the body's surface, where loose clothes and hair are, looked up in all photos. Each vertex has one
-point at every distance of a list along its posed normal. Where a photo shows the background, the
-point is not part of the person. Points that all photos show on the person are in the visual hull
-(Laurentini 1994). Functions here take lengths in normalised units, for cameras, vertices and depth
-maps alike.
+the body's surface, where loose clothes and hair are. Each vertex has one point at every distance of
+a list along its posed normal, and all photos are read there. Where a photo shows the background,
+the point is not part of the person. Points that all photos show on the person are in the visual
+hull (Laurentini 1994). Functions here take cameras, vertices and depth maps in normalised units.
 """
 
 import itertools
@@ -248,8 +247,8 @@ def photo_colors(
 
 
 def on_the_person(shells: Shells) -> Bool[Array, " n"]:
-    """Returns whether any photo shows the person at any of a vertex's points along the normal,
-    (n,). Also True if one of these points is in no photo.
+    """Says for each vertex whether some photo shows the person at one of the vertex's points along
+    the normal, (n,). Also True if one of these points is in no photo.
     """
     return jnp.any(shells.inside > 0, axis=1)
 

@@ -41,8 +41,8 @@ can still be corrected.
 WEIGHT_EPSILON = 1e-9
 """Number added to skinning weights before their logarithm, as published."""
 THINNER = 1.2
-"""Number that is subtracted from the bias of the scale along the normal. The thickness becomes a
-third, so that silhouettes are sharp.
+"""Number that is subtracted from the initial bias of the scale along the normal. Gaussians then
+start with a third of the thickness, so that silhouettes are sharp.
 """
 OBLIQUE = (0.36, 0.48, 0.8)
 """A unit vector that is parallel to no axis of a body. Frames change quickly between neighbouring
@@ -54,8 +54,8 @@ vertices where normals point in the opposite direction.
 class VertexDecoder(Decoder):
     """The paper's decoder: a light MLP from the features of a vertex to its Gaussians.
 
-    It computes in float32 at least. The decoder's share of the published network's arithmetic is a
-    thousandth. In bfloat16 it would double the error of the Gaussians.
+    It computes in float32 at least, which costs little: it has a thousandth of the published
+    network's arithmetic. In bfloat16 it would double the error of the Gaussians.
     """
 
     hidden: Width = 256

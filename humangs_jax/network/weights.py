@@ -1,10 +1,10 @@
-"""Writes and reads weights files. A weights file is a safetensors file, with tensors under their
-path in the variables, and a description of the network in its header.
+"""Writes and reads weights files. A weights file is a safetensors file. The name of a tensor is its
+path in the variables, and the header describes the network.
 
-Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format":
+Names are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format":
 "humangs-weights", "version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}.
-The first files have no checksum. float16 halves the file, and rounds to 11 bits. Loading gives
-float32.
+The first files have no checksum. float16 halves the size of the file, and rounds to 11 bits.
+Loading gives float32.
 """
 
 import os

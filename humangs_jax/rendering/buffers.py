@@ -30,9 +30,9 @@ class BufferOverflowError(ValueError):
 
 
 def round_up(size: int, smallest: int = 64) -> int:
-    """Returns the size rounded up to (4, 5, 6 or 7) 2^i. Sizes below `smallest` are rounded up from
-    `smallest`. Similar scenes then share one compilation. Of the result for a larger size, at most
-    a fifth is spare.
+    """Returns the size, or `smallest` if that is larger, rounded up to (4, 5, 6 or 7) 2^i. Similar
+    scenes then share one compilation. If the size is larger than `smallest`, at most a fifth of the
+    result is spare.
     """
     size = max(size, smallest)
     unit = 1 << max(0, (size - 1).bit_length() - 3)

@@ -80,8 +80,8 @@ class Rendering(Batchable):
     alpha: Float[Array, "h w"]
     """Share of the light that the Gaussians stop, (h, w), in [0, 1)."""
     depth: Float[Array, "h w"]
-    """Mean z of the Gaussians seen, weighted as the colors are, (h, w), metres; 0 where
-    alpha is 0.
+    """Mean z of the Gaussians that a pixel shows, with the weights of the colors, (h, w), metres; 0
+    where alpha is 0.
     """
     overflow: Int[Array, ""]
     """Number of (splat, tile) pairs that did not fit in the buffers and were not drawn."""

@@ -144,8 +144,8 @@ def ablate(
     Args:
         base: configuration of the base, or its name or file as `read_config` takes it, such as
             "tiny" or "small".
-        variants: for each variant, by its name, the fields that change. They are values by path, as
-            `vary` takes them.
+        variants: the changed fields of each variant, by the variant's name. The fields are given as
+            `vary` takes them, as values by path.
         seeds: number of runs of the base and of each variant.
         people: people to train on, in one of three forms: a number of synthetic people, which are
             rendered during training; a list of capture folders; a function that makes a source.

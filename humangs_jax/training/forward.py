@@ -1,9 +1,9 @@
 """Runs the network on an example, and validates it.
 
-The network makes canonical Gaussians of the input photos. They are posed and drawn for each target.
-A validation draws the same views of the same unseen people every time, and normalizes with the
-running statistics. It gives metrics and images for a sheet. Several processes share the people, and
-every process gets the means over all people.
+The network makes canonical Gaussians from the input photos. The Gaussians are posed and drawn for
+each target. A validation draws the same views of the same unseen people every time, and batch norms
+use the running statistics. It gives metrics, and images for a sheet. Several processes divide the
+people among them, and every process gets the means over all people.
 """
 
 import dataclasses
@@ -167,8 +167,8 @@ def validation_examples(
 def as_validated(config: TrainConfig) -> TrainConfig:
     """Returns the configuration with the views of validations.
 
-    Inputs are evenly spaced and of one pose. Their number is the middle one of the training's
-    counts. Targets are as large as the inputs.
+    Inputs are evenly spaced and of one pose. Their number is the middle one of
+    `views.input_counts`, sorted. Targets are as large as the inputs.
     """
     counts = sorted(config.views.input_counts)
     views = ViewSampling(

@@ -11,8 +11,8 @@ out/weights.safetensors              the newest weights (float16), averaged ones
                                      is set
 out/best.safetensors                 the weights of the validation with the highest psnr
 
-If there are several processes, all must see the same folder `out`. One of them writes everything
-but the checkpoints, which all write.
+If there are several processes, all must see the same folder `out`. All processes write the
+checkpoints, and one of them writes everything else.
 """
 
 import contextlib
@@ -234,8 +234,8 @@ class Watch:
 
 
 def forget_after(path: Path, step: int) -> None:
-    """Drops the lines of later steps from a log, and a last line that is incomplete. If writing
-    fails, the log is as before. Without a file at `path`, nothing is done.
+    """Drops the lines of steps after `step` from a log, and a last line that is incomplete. If
+    writing fails, the log is as before. Without a file at `path`, nothing is done.
 
     Raises: FileError if the file is no text, is too large, or has a line other than the last that
     is no record.
@@ -390,7 +390,7 @@ def train(
             examples (see `training.sources`).
         out: folder of checkpoints, logs, sheets and weights.
         validation: other people, in the same two forms. Empty: there are no validations.
-        validated: number of people of `validation` that a validation looks at, from the first on.
+        validated: number of people that a validation looks at: the first ones of `validation`.
         variables: variables that a new run starts from, for instance shipped weights. None: random
             variables of `config.seed`.
         networks: networks of the losses that need them.
@@ -479,8 +479,8 @@ def train(
 def _as_source_factory(
     people: Sequence[str | Path] | SourceFactory, body: BodyModel
 ) -> SourceFactory:
-    """Returns a function that makes a source of people. They are given as such a function, or as
-    capture folders.
+    """Returns a function that makes a source of people. people: such a function, or capture
+    folders.
     """
     if isinstance(people, Sequence):
         return captured_people(people, body)

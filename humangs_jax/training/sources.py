@@ -45,7 +45,7 @@ sizes.
 def stage_loader(
     make_source: SourceFactory, config: TrainConfig, step: int, mesh: Mesh | None = None
 ) -> Loader:
-    """Returns a loader of batches from a step on, for the stage that the step belongs to."""
+    """Returns a loader of the batches from `step` on, for the stage that this step belongs to."""
     part = config.at(step)
     sharding = None
     if mesh is not None:
@@ -145,8 +145,9 @@ def training_people(
 ) -> SourceFactory:
     """Returns a function that makes a source of people to train on.
 
-    They are the people of `people_on_disk`, or `on_the_fly` synthetic people who are rendered for
-    every step. If both are given, each makes half of the examples.
+    If `data` is given, these are the people of `people_on_disk`. If `on_the_fly` is above 0, these
+    are so many synthetic people, who are rendered for every step. With both, each kind makes half
+    of the examples.
     One process makes the synthetic people once, into out/people.npz. Raises: ValueError if there is
     nobody, or if synthetic people are asked for with another body than the shipped one.
     """

@@ -3,9 +3,9 @@
 Random numbers are not carried, because they follow from the seed and the step. By default the
 optimizer is the published one: AdamW, warm-up and cosine, clipped gradients, and a guard against
 bad steps. First a gradient is made finite entry by entry (NaN becomes 0, infinities +-1e-6). If
-then its norm exceeds `skip_norm`, or the loss is not finite, the step is skipped and counted. It
-then changes neither parameters nor batch statistics, moments or the schedule. Steps that had
-anything to make finite are counted, too.
+then its norm exceeds `skip_norm`, or the loss is not finite, the step is skipped. A skipped step
+changes neither parameters nor batch statistics, moments or the schedule. Two numbers of steps are
+kept: those that were skipped, and those whose loss or gradient was not finite.
 """
 
 from typing import Any, NamedTuple, cast

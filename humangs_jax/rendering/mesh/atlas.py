@@ -24,7 +24,7 @@ Points = Float[np.ndarray, "n 3"]
 Faces = Int[np.ndarray, "f 3"]
 
 SIDES = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
-"""Directions that charts look towards at first, (6, 3)."""
+"""The directions, (6, 3), of which each face is given one. A chart has faces of one direction."""
 LEAST_COSINE = 0.45
 """Smallest cosine between the normal of a face and the side of a chart that it may join."""
 PEELINGS = 3

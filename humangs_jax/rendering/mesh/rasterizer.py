@@ -18,7 +18,7 @@ faces.
 Watertightness: an edge function is computed relative to the pixel, (a - p) x (b - p), and the order
 of the ends a and b depends on their positions alone. Two faces that share an edge therefore compute
 the same number with opposite signs, however the compiler contracts the expression. Close to a
-vertex the differences are exact: both faces may cover a pixel, but never neither.
+vertex the differences are exact: both faces may cover a pixel, but at least one of them does.
 
 Derivatives: fragments are constants (`stop_gradient`). `interpolate_attributes` is differentiable
 with respect to the attributes.
