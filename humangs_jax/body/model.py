@@ -260,8 +260,9 @@ class BodyModel:
     its own number. None: as for `collapse_order`.
     """
     relative_vertex_spacing: Float[Array, " n"] | None = None
-    """Spacing of the vertices around each vertex, divided by the spacing before long edges were
-    split, (n,), see `body.resolution.split_long_edges`. None: no edges were split.
+    """Spacing of the vertices around each vertex, divided by the spacing in another mesh, (n,). The
+    other mesh is the one before long edges were split (`body.resolution.split_long_edges`), or the
+    one that weights were trained with (`data.views.gaussian_body`). None: 1 everywhere.
     """
     texels: Texels | None = None
     """The point of the surface that each texel of a map shows, for networks that work on a map, see

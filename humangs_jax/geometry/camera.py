@@ -29,7 +29,7 @@ skew of K is larger than this times the focal length. Calibrations are stored wi
 """
 LARGEST_NUMBER = 1e7
 """Largest magnitude of a number in K, pixels, and in `cam_from_world`, metres. Larger numbers are
-faults, and their products overflow in float32.
+faults, and products of several of them overflow in float32.
 """
 
 

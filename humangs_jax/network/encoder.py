@@ -258,8 +258,8 @@ def _foreground_patches(
     ctx: ForwardContext,
     patch_size: int,
 ) -> _ChosenPatches:
-    """Returns the patches that the person touches, packed to the front of the token capacity. The
-    slots behind them are padding.
+    """Returns the patches that the foreground touches, packed to the front of the token capacity.
+    The slots behind them are padding.
     """
     touched = touched_patches(inputs.foreground, inputs.view_count, patch_size)
     capacity = min(ctx.runtime.token_capacity or len(touched), len(touched))

@@ -64,7 +64,9 @@ class HumanGSInputs:
     depth_maps: Float[Array, "v h w"]
     """Rasterized z of the body, (v, h, w), normalised units; -1 on background."""
     foreground: Bool[Array, "v h w"]
-    """Pixels of the person, (v, h, w), used for "foreground" tokens and for shells."""
+    """Pixels of the mask or of the body, (v, h, w), for "foreground" tokens and for shells. With
+    `Conventions.pixels` "person", pixels of the mask alone, if the photo has one.
+    """
     view_count: Int[Array, ""] | None = None
     """Number of real views, which come first. The others are padding and change nothing. None: all
     views are real.

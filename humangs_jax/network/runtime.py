@@ -35,8 +35,8 @@ class Runtime:
         gain="5 x in time at a foreground share of 0.2",
         measured="performance.md",
     )
-    """Patches that become tokens: "all", or those that the "foreground" touches. None: as the
-    weights were trained.
+    """Patches that become tokens: all of them ("all"), or those that the person touches
+    ("foreground"). None: as the weights were trained.
     """
     token_capacity: CapacityOrAuto = knob(
         0,
@@ -125,10 +125,10 @@ class Runtime:
         measured="benchmarks/quality.md",
     )
     """Whether the body is first moved to the edges of the masks (`data.vertex_offsets`), for
-    weights whose `pixels` are "person". None: it is moved if a part of it sticks out of the masks.
-    True: it is always moved, which costs PSNR where the body is right. False: it is never moved,
-    and has no skirt (`data.skirt`). With None or True, a displacement of the capture is used
-    instead if there is one.
+    weights whose `pixels` are "person". None: it is moved if it does not fit the masks. True: it is
+    always moved, which costs PSNR where the body is right. False: it is never moved, and has no
+    skirt (`data.skirt`). With None or True, a displacement of the capture is used instead if there
+    is one.
     """
     raster: RasterConfig = RasterConfig()
     """Settings of the mesh rasterizer."""
@@ -159,7 +159,9 @@ class Conventions:
     )
     """Side of the photos, pixels. The network takes any multiple of the patch size."""
     tokens: TokenSelection = "all"
-    """Patches that became tokens: "all", or those that the "foreground" touches."""
+    """Patches that became tokens: all of them ("all"), or those that the person touches
+    ("foreground").
+    """
     pixels: Literal["all", "person"] = "all"
     """Pixels that count. "person": if a photo has a mask, only the pixels of the mask count. Parts
     of the body that cover background in a photo are then unseen there. With shells, Gaussians get

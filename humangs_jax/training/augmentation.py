@@ -35,7 +35,8 @@ class Augmentation:
     exposure: Spread = 0.08
     """Standard deviation of the natural logarithm of each photo's gain."""
     tint: Spread = 0.03
-    """Standard deviation of a further gain, for each channel of each photo, as a natural logarithm.
+    """Standard deviation of the natural logarithm of a further gain, one for each channel of each
+    photo.
     """
     mask_pixels: Annotated[int, Range(0, 64)] = 2
     """Largest number of pixels by which masks are eroded or dilated. The number is uniformly

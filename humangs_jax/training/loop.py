@@ -292,7 +292,7 @@ DROPPED = {
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """`train` raises this after Ctrl-C or SIGTERM, or if the machine is taken away. The state is
+    """`train` raises this after Ctrl-C or SIGTERM (several processes: after SIGTERM). The state is
     saved, and the same call continues the run.
 
     It is a KeyboardInterrupt, so that a loop of several runs stops, too. state: the saved state.
@@ -380,7 +380,8 @@ def train(
     checkpoint, training continues from the newest one.
 
     After Ctrl-C or SIGTERM the current step is finished, the state is saved, and
-    `TrainingInterrupted` is raised. A second Ctrl-C interrupts at once.
+    `TrainingInterrupted` is raised. A second Ctrl-C interrupts at once. Several processes do this
+    after SIGTERM only.
 
     Args:
         config: configuration of the run.
@@ -642,12 +643,13 @@ def _report(
 @contextlib.contextmanager
 def stop_requested() -> Generator[Callable[[int], bool], None, None]:
     """Yields a function that takes the number of steps done and returns whether the run should stop
-    now. The reason is Ctrl-C, SIGTERM, or a machine that is taken away.
+    now. All processes must call the function after every step.
 
-    All processes must call the function after every step. A single process checks its own signals,
-    and a second signal has its usual effect. It receives signals in its main thread only. Several
-    processes may receive a signal at different steps, so jax's coordination service agrees on a
-    step (https://docs.jax.dev/en/latest/_autosummary/jax.experimental.multihost_utils.html).
+    A single process stops after Ctrl-C or SIGTERM, and a second signal has its usual effect. It
+    receives signals in its main thread only. Several processes stop after SIGTERM, which announces
+    that a machine is taken away. They may receive it at different steps, so jax's coordination
+    service agrees on a step
+    (https://docs.jax.dev/en/latest/_autosummary/jax.experimental.multihost_utils.html).
     """
     if jax.process_count() > 1:
         from jax.experimental import multihost_utils

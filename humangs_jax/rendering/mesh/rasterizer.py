@@ -94,7 +94,7 @@ def rasterize_mesh(
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> Fragments:
     """Returns the nearest face at every pixel centre of one camera, a pinhole without distortion.
-    Use `jax.vmap` for batches. Raises: ValueError for a camera with a lens.
+    Use `jax.vmap` for batches. Raises: ValueError for any other camera.
     """
     vertices, camera = lax.stop_gradient((vertices, camera))
     if faces.shape[0] == 0 or vertices.shape[0] == 0:  # a face without area stands for no face
