@@ -6,8 +6,8 @@ import warnings
 from importlib.metadata import PackageNotFoundError, version
 
 WRONG_SUMS = "0.10.2"
-"""The version of jaxlib that computes wrong sums on CPUs. The sum of a vmapped product of a small
-matrix and a vector is wrong in thousands of rows, from 32,769 rows on
+"""The version of jaxlib that computes wrong sums on CPUs. If there are 32,769 rows or more, the sum
+of a vmapped product of a small matrix and a vector is wrong in thousands of them
 (https://github.com/jax-ml/jax/issues/39103). 0.10.1, and 0.11.1 and later, compute it right.
 """
 RIGHT_SUMS = "--xla_cpu_experimental_ynn_fusion_type=-LIBRARY_FUSION_TYPE_REDUCE"

@@ -362,9 +362,9 @@ def add_files(
     Other files of `folder` stay.
 
     The folder is made if needed. Nothing is moved if `write` raises. If a file cannot be moved, the
-    files moved or deleted before it are put back as they were. The moves follow each other at once,
-    so a kill seldom falls between two of them, and the moves of two processes do not mix. The
-    folder may be a mount point or the working folder.
+    files moved or deleted before it are put back as they were. The moves follow each other without
+    pause, so a kill seldom falls between two of them. A lock keeps the moves of two processes
+    apart. The folder may be a mount point or the working folder.
 
     Arguments: paths of files are relative to `folder`. without: files that are out of date. If no
     new file replaces them, they are deleted after the last move. invalid: files that must never lie

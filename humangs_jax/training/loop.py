@@ -107,7 +107,7 @@ class RunLog:
     def steps(
         self, done: int, metrics: dict[str, Any], subjects: int, waiting: Waiting, broken: int
     ) -> None:
-        """Logs the metrics of the last step done, with times and rates since the call before.
+        """Logs the metrics of the last step done, with times and rates since the previous call.
 
         done: number of steps done. subjects: number of subjects in a step. waiting: how long the
         loop has waited for data so far. broken: number of capture folders that could not be used.
