@@ -139,7 +139,7 @@ def _dense(arrays: dict[str, np.ndarray], count: int) -> Float[np.ndarray, "coun
 
 @functools.cache
 def shipped_expressions(body_vertices: int) -> Expressions:
-    """Returns the 52 shapes of ARKit on the shipped body. They turn the joints of the eyes.
+    """Returns the 52 shapes of ARKit on the shipped body. The eyeLook shapes turn the eyes' joints.
     body_vertices: number of vertices of that body.
     """
     arrays = _shipped()

@@ -33,7 +33,7 @@ def from_host(array: Any, dtype: Any = None) -> Any:
 
 def on_host(array: Any) -> bool:
     """Says whether numpy can read an array without a copy from an accelerator or from another
-    process. It can if the array is numpy's, or is JAX's, of numbers, on CPUs of this process.
+    process. True for arrays of numpy, and for arrays of JAX with numbers on CPUs of this process.
     """
     if isinstance(array, np.ndarray):
         return True

@@ -10,8 +10,8 @@ After an edit of the source, this concerns all functions whose programs stay the
 traces them. A new version of the package begins with an empty cache, and keeps all programs again.
 
 Programs are kept only in processes that call `core.processes.keep_programs`, as the console script
-does, and only on a single CPU. Elsewhere `compiled` works as `jax.jit`. A notebook may change a
-function of the package while it runs, and the source would not show this change.
+does, and only if JAX has one device, a CPU. Elsewhere `compiled` works as `jax.jit`. A notebook may
+change a function of the package while it runs, and the source would not show this change.
 """
 
 import contextlib
@@ -274,8 +274,8 @@ _hits = _Hits()
 
 @functools.cache
 def _folder() -> Path | None:
-    """Returns the folder of the programs that this process keeps. None if it keeps none, or if it
-    computes on anything but a single CPU.
+    """Returns the folder of the programs that this process keeps. None if it keeps none, or if JAX
+    has other devices in this process than one CPU.
     """
     folder = kept_programs()
     if folder is None or jax.default_backend() != "cpu" or jax.local_device_count() > 1:

@@ -545,7 +545,7 @@ def _sweep(parent: Path) -> None:
     """Removes the temporary files and folders that killed processes left in a folder. An old file
     or folder that was kept aside is put back if its name is free, else removed.
 
-    It runs once per process and folder, because folders may have very many files.
+    This is done once per process and folder, because folders may have very many files.
     """
     with contextlib.suppress(OSError):  # another process sweeps too, or the folder cannot be listed
         for entry in list(parent.iterdir()):

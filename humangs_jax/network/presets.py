@@ -17,7 +17,7 @@ SHELLS = (0.0, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18)
 
 def published() -> HumanGSConfig:
     """Returns the configuration of the authors' release: 99 M parameters, and conventions that only
-    the release has. It computes in bfloat16 (`Runtime.dtype`).
+    the release has. The network computes in bfloat16 (`Runtime.dtype`).
     """
     return HumanGSConfig(
         conventions=Conventions(
@@ -43,7 +43,7 @@ def small() -> HumanGSConfig:
     """Returns the configuration of the shipped network, which was trained on a CPU. Only patches of
     the foreground are tokens, and colors are read from the photos.
 
-    It has no upsampler, because of its cost on a CPU (docs/training.md).
+    The network has no upsampler, which would cost too much on a CPU (docs/training.md).
     """
     return HumanGSConfig(
         # sizes that a CPU trains in days, and all that reads the photos directly

@@ -236,8 +236,8 @@ def photo_colors(
     visible: Bool[Array, "v n"],
     grid: PixelGrid,
 ) -> Float[Array, "n 3"]:
-    """Returns the mean photo color of each vertex over the views that see it, (n, 3). It is grey if
-    no view does.
+    """Returns the mean photo color of each vertex over the views that see the vertex, (n, 3). A
+    vertex that no view sees is grey.
     """
     size = (images.shape[2], images.shape[1])
     colors = jax.vmap(sample_bilinear)(images, texel_indices(pixels, size, size, grid))

@@ -4,7 +4,7 @@ pytree without leaves.
 Two rasterizers set the conventions: INRIA's diff-gaussian-rasterization
 (https://github.com/graphdeco-inria/diff-gaussian-rasterization) and gsplat
 (https://github.com/nerfstudio-project/gsplat). Where the two differ, this renderer does as gsplat.
-It differs from both in two points. Alphas are clamped at `ALPHA_MAX`. Nothing is cut at three
+In two points it differs from both. Alphas are clamped at `ALPHA_MAX`. Nothing is cut at three
 standard deviations: a footprint ends where its alpha falls below `ALPHA_MIN`, so the image follows
 from the formula and not from a bounding box.
 """

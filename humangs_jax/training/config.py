@@ -234,7 +234,7 @@ def small() -> TrainConfig:
 
 def published() -> TrainConfig:
     """Returns the configuration of the release: 100,000 steps at 512 pixels, 4 input and 4 target
-    views. It needs VGG-19 and LPIPS, see `LossConfig`.
+    views. Its losses need VGG-19 and LPIPS, see `LossConfig`.
 
     The release has 2 subjects per device and does not say how many devices. Four are assumed here.
     """
@@ -253,7 +253,7 @@ def published() -> TrainConfig:
 
 def paper() -> TrainConfig:
     """Returns the configuration of the paper: 60,000 steps at 256 pixels with 8 subjects, then
-    10,000 at 512 pixels with 4. It needs VGG-19.
+    10,000 at 512 pixels with 4. Its losses need VGG-19.
     """
     return dataclasses.replace(
         published(),
