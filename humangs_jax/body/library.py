@@ -72,7 +72,7 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
         FileNotFoundError: if there is no such file.
         ValueError: if the file cannot be read. The message names the file and, for a wrong array,
             the key.
-        TypeError: for options of SMPL-X files given with another body.
+        TypeError: for an unknown option, and for options of SMPL-X files given with another body.
 
     Examples:
         >>> body = hg.load_body("SMPLX_NEUTRAL.npz")
