@@ -189,6 +189,8 @@ BAD_USAGE = {
         "--lpips-alex: expected a backbone"
     ),
     "view me.npz --port 99999": "--port 99999",
+    "view me.npz --clip 2": "--clip: expected --motion with it",
+    "export me.npz --out x.ply --motion-fps 30": "--motion-fps: expected --motion with it",
     "export me.npz --out x.ply --frame 1": "--frame 1: expected --motion and --out",
     "export me.npz --html x.html --motion jump.npz --frames :": (
         "--frames :: expected --motion and --out"

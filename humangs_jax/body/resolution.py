@@ -584,6 +584,9 @@ def decimate_with_kept(
         expressions=_kept_moves(body.expressions, renumber),
         uvs=uvs,
         uv_faces=uv_faces,
+        # of other vertices
+        relative_vertex_spacing=None,
+        texels=None,
         remesh_key=None,
         collapse_order=from_host(order[kept], jnp.int32),
         collapse_into=from_host(renumber[into[kept]], jnp.int32),

@@ -404,15 +404,17 @@ class View:
     """Open a browser."""
 
     def run(self) -> None:
+        self.part.check(self.motion)
         with stage("making the page"):
+            from humangs_jax.avatar.attach_face import with_face_for
             from humangs_jax.avatar.avatar import Avatar
             from humangs_jax.viewer.page import page_html, serve
 
             avatar = Avatar.load(self.avatar)
-            motion = (
-                None if self.motion is None else self.part.load(self.motion, avatar.rest_joints)
-            )
-            name = None if self.motion is None else self.motion.stem
+            motion, name = None, None
+            if self.motion is not None:
+                motion, name = self.part.load(self.motion, avatar.rest_joints), self.motion.stem
+                avatar = with_face_for(avatar, motion)
             text = page_html(avatar, motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)
 

@@ -112,6 +112,7 @@ class Export:
             suffixes = EXPORTS.where(lambda each: each.mesh >= self.mesh).suffixes
             require_file(out, suffixes, read=(self.avatar, self.motion))
             form = chosen_format(out.suffix, self.mesh)
+        self.part.check(self.motion)
         # frames are of a motion
         for option, value in (("--frame", self.frame), ("--frames", self.frames)):
             if value is not None and (self.motion is None or out is None):

@@ -97,6 +97,12 @@ class PartOfMotion:
         """Returns the fields that are not None, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
+    def check(self, path: Path | None) -> None:
+        """Raises UsageError for options without a file."""
+        given = self.given()
+        if path is None and given:
+            raise UsageError(f"{option_of(next(iter(given)))}: expected --motion with it")
+
     def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
         """Reads the motion of a file, or the shipped walk if `path` is None.
 
@@ -104,9 +110,7 @@ class PartOfMotion:
         """
         from humangs_jax.motion import load_motion
 
-        given = self.given()
-        if path is None and given:
-            raise UsageError(f"{option_of(next(iter(given)))}: expected --motion with it")
+        self.check(path)
         up = self.motion_up or "auto"
         return load_motion(
             path,

@@ -98,7 +98,8 @@ def read_table(path: Path, options: Reading) -> Poses:
             head[:, axis] = column(plain[name])
     codes = []
     if "timecode" in plain:
-        codes = [row[plain["timecode"]] for row in lines]
+        at = plain["timecode"]
+        codes = [row[at] if at < len(row) else "" for row in lines]
     fps, frames, note = _times(codes, options.fps)
     return _standing(
         values, Rotation.from_euler("YXZ", head[:, [1, 0, 2]]).as_rotvec(), fps, frames, note

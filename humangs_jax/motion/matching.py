@@ -230,8 +230,9 @@ def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
     bones = lengths[path[1:]]
     if len(bones) < 2:
         return None
-    first = int(np.argmax(np.minimum(bones[1:], bones[:-1])))
-    if bones[first] > 0:
+    shorter = np.minimum(bones[1:], bones[:-1])
+    first = int(np.argmax(shorter))
+    if shorter[first] > 0:
         return [path[first], path[first + 1], path[first + 2], *path[first + 3 : first + 4]]
     return None
 

@@ -11,7 +11,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loading import Source
 from humangs_jax.synthetic.bank import PeopleBank, build_bank, load_bank, save_bank
 from humangs_jax.synthetic.on_the_fly import ON_THE_FLY, OnTheFlyConfig, on_the_fly_source
-from humangs_jax.synthetic.subject import SPLITS, seeds_of
+from humangs_jax.synthetic.subject import seeds_of
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.sources import SourceFactory
 
@@ -89,7 +89,7 @@ def _bank(people: int, out: Path, body: BodyModel) -> PeopleBank:
     """Returns the bank in out/people.npz. If that file is missing or has other seeds, the first
     process of the run makes a bank and writes it there.
     """
-    path, seeds, bank = out / "people.npz", SPLITS["train"][:people], None
+    path, seeds, bank = out / "people.npz", seeds_of("train", 0, people), None
     if jax.process_index() == 0:
         bank = load_bank(path) if path.is_file() else None
         if bank is None or bank.seeds.tolist() != list(seeds):

@@ -111,6 +111,7 @@ def pack(
         "the page",
         record_values(avatar.gaussians, "gaussians")
         | record_values(avatar.light, "light")
+        | record_values(avatar.face, "face")
         | _other_values(avatar, motion),
     )
     joints = len(avatar.parents)
@@ -215,7 +216,7 @@ def _other_values(avatar: Avatar, motion: Motion | None) -> dict[str, tuple[Any,
     if motion is not None:
         values |= {
             f"motion.{name}": (getattr(motion, name), FINITE)
-            for name in ("rotations", "translations")
+            for name in ("rotations", "translations", "expressions")
         }
     return values
 

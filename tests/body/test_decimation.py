@@ -99,6 +99,11 @@ def test_the_whole_size_changes_nothing_and_others_are_refused(body):
         decimate(body, 2)
 
 
+def test_what_is_measured_on_the_full_body_does_not_stay(body):
+    known = replace(body, relative_vertex_spacing=jnp.ones(len(body.template)))
+    assert decimate(known, 4000).relative_vertex_spacing is None
+
+
 def sphere(rings=12, radius=1.0, open_below=False):
     """Returns vertices and faces of a sphere, or of its upper part, which has a rim."""
     columns = 2 * rings

@@ -104,6 +104,10 @@ def test_y_up_turns_the_world_and_pixel_centres_become_ours(tmp_path):
     rig = hg.load_cameras(tmp_path / "rig.json", tmp_path / "photos")
     np.testing.assert_allclose(rig["b"].K, K[1], rtol=1e-6)
     assert rig.points.shape == (0, 3)
+    # the size of another photo says nothing
+    (tmp_path / "photos" / FILES[1]).unlink()
+    with pytest.raises(CaptureError, match=r"rig\.json.*\bb\b"):
+        hg.load_cameras(tmp_path / "rig.json", tmp_path / "photos")
 
 
 @pytest.mark.parametrize(

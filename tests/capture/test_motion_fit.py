@@ -58,7 +58,14 @@ def test_a_walk_is_found_in_the_keypoints_of_one_camera_whose_noise_it_does_not_
     ends = [int(f(np.asarray(BODY.template)[:, 1])) for f in (np.argmin, np.argmax)]
     height_of = lambda betas: np.ptp(shape_body(BODY, jnp.asarray(betas)).vertices[ends, 1])
     height = float(height_of(BETAS))
-    found = fit_motion(BODY, keypoints, K, fps, height=height)
+    fits, done = [], []
+
+    def watch(stages, windows):
+        fits.append(len(stages))
+        return (done.append(stage) for stage in stages)
+
+    found = fit_motion(BODY, keypoints, K, fps, height=height, watch=watch)
+    assert fits == [len(done)]
     assert height_of(found.betas) == pytest.approx(height, abs=0.01)
     matrix = found.cam_from_world
     ours = found.joints[:, :22] @ matrix[:3, :3].T + matrix[:3, 3]

@@ -67,6 +67,13 @@ def test_a_table_of_live_link_face_is_read_in_any_order(tmp_path, spelling):
     assert motion.rotations[0, JOINT_NAMES.index("left_shoulder"), 2] < -1
 
 
+def test_a_line_may_end_before_its_timecode(tmp_path):
+    lines = [[*ARKIT, "Timecode"], [0.5] * len(ARKIT), [*[0.5] * len(ARKIT), "10:20:30:01"]]
+    path = tmp_path / "take.csv"
+    path.write_text("\n".join(",".join(map(str, line)) for line in lines))
+    assert np.allclose(coefficients(load_motion(path), "jawOpen"), 0.5)
+
+
 def test_frames_that_a_table_leaves_out_are_filled_in(tmp_path):
     names = ["JawOpen", "EyeBlinkLeft", "EyeBlinkRight", "MouthFunnel", "TongueOut"]
     rows = [[value] * 5 for value in (0.0, 0.1, 0.4)]

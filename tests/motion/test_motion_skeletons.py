@@ -30,7 +30,7 @@ from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.io.mesh import GlbWriter, read_accessor
 from humangs_jax.motion import MotionError, load_motion
 from humangs_jax.motion.clips import read_bvh
-from humangs_jax.motion.matching import matched
+from humangs_jax.motion.matching import _bends, matched
 from humangs_jax.motion.rules import frame_times
 from humangs_jax.motion.skeleton import retargeted, shipped_joints
 
@@ -271,6 +271,12 @@ def test_limbs_of_two_joints_each_are_as_long_as_both():
     ):
         assert names[source[f"left_{ours}"]] == f"{theirs}.L"
         assert names[source[f"right_{ours}"]] == f"{theirs}.R"
+
+
+def test_a_bone_without_length_is_no_bone_of_a_limb():
+    assert _bends([0, 1, 2], np.asarray([9.0, 1, 0])) is None
+    assert _bends([0, 1, 2], np.asarray([9.0, 0, 1])) is None
+    assert _bends([0, 1, 2, 3], np.asarray([9.0, 0, 1, 1])) == [1, 2, 3]
 
 
 LEG = (

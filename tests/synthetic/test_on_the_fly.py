@@ -26,6 +26,7 @@ from humangs_jax.synthetic import on_the_fly, subject, surroundings
 from humangs_jax.synthetic.anatomy import joint_positions
 from humangs_jax.synthetic.bank import build_bank, load_bank, save_bank, to_silhouettes
 from humangs_jax.synthetic.on_the_fly import jitted_example, on_the_fly_source
+from humangs_jax.synthetic.sources import people_of_run
 from humangs_jax.synthetic.subject import SPLITS, make_subject
 
 DEMO = SPLITS["demo"]
@@ -100,6 +101,8 @@ def test_banks_hold_people_of_one_split_only(bank, body, tmp_path):
             build_bank(seeds, body, split)
     with pytest.raises(ValueError, match="no seeds"):
         build_bank([], body, "train")
+    with pytest.raises(ValueError, match="reach beyond the split 'train'"):
+        people_of_run(10**9, tmp_path, body)
     with pytest.raises(ValueError, match="lies in no range"):
         build_bank([1_500_000], body, "train")
     save_bank(tmp_path / "bank.npz", dataclasses.replace(bank, split="train"))

@@ -210,6 +210,9 @@ def spoiled(name, index, value):
     )
 
 
+STILL = Motion(jnp.zeros((2, 3, 3)), jnp.zeros((2, 3)), expression_names=("smile",))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -222,6 +225,10 @@ def spoiled(name, index, value):
         (
             (small_avatar(), Motion(jnp.full((2, 3, 3), jnp.inf), jnp.zeros((2, 3)))),
             r"motion\.rotations",
+        ),
+        (
+            (small_avatar(), replace(STILL, expressions=jnp.full((2, 1), jnp.nan))),
+            r"motion\.expressions",
         ),
         ((small_avatar(), None, small_body(seed=9)), "does not explain the avatar's vertices"),
         ((jax.tree.map(lambda x: x[:0], small_avatar()),), "has no Gaussians"),

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.capture.calibration.importing import photo_size_of
+from humangs_jax.capture.calibration.photos import photo_of, photo_size
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.checks import checked_arguments
 from humangs_jax.data.cameras import (
@@ -131,7 +131,7 @@ def _size(source: Path, folder: Path | None, name: str) -> tuple[int, int]:
     if folder is None:
         problem = "the file does not say how large its images are: expected `images`, their folder"
         raise CaptureError(source, name, problem)
-    return photo_size_of(folder, source, name)
+    return photo_size(photo_of(folder, name, source))
 
 
 def _points(found: Calibration) -> tuple[np.ndarray, np.ndarray]:

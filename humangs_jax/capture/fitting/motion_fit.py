@@ -214,9 +214,12 @@ def fit_motion(
     if betas is None:
         shape = _of_height(shape, tall, height)
     poses = _start(model, seen, fps, shape)
-    # one stage for the shape, then all levels and the feet of each window
+    # the shape if it is fitted, then all levels and the feet of each window
     windows = _windows(m)
-    stages = iter(watch(range(1 + len(windows) * (len(_LEVELS) + 1)), len(windows)))
+    fits = len(windows) * (len(_LEVELS) + 1)
+    if betas is None:
+        fits += len(_LEVELS) - 1
+    stages = iter(watch(range(fits), len(windows)))
 
     def run(
         frames: np.ndarray, poses: BodyPose, scales: tuple[float, float], **options: Any
