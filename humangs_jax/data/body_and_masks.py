@@ -1,9 +1,9 @@
 """Compares the posed body with the masks, to find out which views show the person.
 
-A mask that is empty, or nowhere near the body, does harm: the network takes the white photo of this
-view for the person, and refinement makes the avatar transparent there. So such views are left out
-wherever photos are used, and a warning names them. All of this runs on the host, by numpy: nothing
-is compiled.
+A mask that is empty, or nowhere near the body, does harm. The photo of this view is white where the
+body is. The network takes this for the person, and refinement makes the avatar transparent there.
+So such views are left out wherever photos are used, and a warning names them. All of this runs on
+the host, by numpy: nothing is compiled.
 """
 
 import logging
@@ -24,17 +24,19 @@ logger = logging.getLogger(__name__)
 MASK_THRESHOLD = 0.5
 """A pixel belongs to the person when its mask is above this."""
 LEAST_SHARE = 0.05
-"""A view shows the person if at least this share of the body's points in the photo lie on the mask.
+"""A view shows the person if at least this share of the body's points in the photo lies on the
+mask.
 
 In the demo's photos, the share is 6 to 7 % for a mask of the head alone, and 1.4 % for an inverted
 mask.
 """
 POINTS = 1000
-"""The number of points on the skin."""
+"""The number of points on the skin that are compared with the masks."""
 
 
 def report_left_out(names: Sequence[str], reasons: dict[int, str]) -> None:
-    """Warns of views that are left out, by their names, with the reasons of `views_without_person`.
+    """Log a warning that names the views that are left out, with the reasons. reasons: what
+    `views_without_person` returns.
 
     Raises: CaptureError, one line that names the views, if none is left.
     """
@@ -54,11 +56,11 @@ def report_left_out(names: Sequence[str], reasons: dict[int, str]) -> None:
 
 def views_without_person(capture: Capture) -> dict[int, str]:
     """Returns the indices of the views that do not show the person, each with the reason. Either
-    the mask is empty, or fewer than `LEAST_SHARE` of the body's points in the photo lie on the
-    mask.
+    the mask is empty, or less than `LEAST_SHARE` of the body's points in the photo lies on the
+    mask. Points on unknown pixels do not count, unless nearly all points are on such pixels.
 
-    A view is not in the result if its body is not finite. The code that poses the body reports this
-    fault.
+    A view is not in the result if its posed body has numbers that are not finite. The code that
+    poses the body reports this fault.
     """
     found = dict.fromkeys(empty_views(capture.masks), "the mask is empty")
     if capture.masks is None or len(found) == capture.view_count:

@@ -2,7 +2,7 @@
 captures, lens distortion, and checks.
 
 Readers return a `Calibration`. Its cameras have OpenCV's axes (x right, y down, z forward). Its
-unit of length, the world's up axis and the place of pixel centres are as in the file.
+unit of length, the world's up axis and the place of pixel centres are those of the format.
 `in_capture_convention` changes these to metres, y up and pixel centres at +0.5.
 """
 
@@ -28,8 +28,9 @@ from humangs_jax.data.unknown import binary_kind, described
 from humangs_jax.io.reading import limits, reading
 
 ROUNDED_ROTATION = 5e-3
-"""The largest deviation of R R^T from the identity for matrices that are written with three
-decimals (EasyMocap). Such matrices are replaced by the nearest rotation.
+"""Largest difference of an entry of R R^T from the identity at which R counts as a rounded
+rotation. Rounding to three decimals (EasyMocap) stays below it. Rounded rotations are replaced by
+the nearest rotation.
 """
 LARGEST_COEFFICIENT = 1e100
 """The largest coefficient of a lens. Products of larger ones are not finite."""
@@ -90,8 +91,8 @@ class CalibratedCamera:
     height: int | None = None
     """The height of the image, pixels; None where the format does not say."""
     distortion: Float[np.ndarray, " coefficients"] | None = None
-    """Coefficients of the lens in OpenCV's order: k1 k2 p1 p2 k3. Only cameras with a `refusal`
-    have others: 8 or 12 coefficients, or at least 4 of a fisheye. None: the lens does not distort.
+    """Coefficients of the lens in OpenCV's order: k1 k2 p1 p2 k3. Cameras with a `refusal` have
+    other coefficients: 8 or 12, or at least 4 of a fisheye. None: the lens does not distort.
     """
     frame: int = 0
     """The frame of the image, counted from 0, where there is one camera for each image."""
@@ -191,8 +192,8 @@ class CalibrationFile:
     path: Path
     """The path of a file, or of the folder where a format has several files."""
     photo_size: Callable[[str], tuple[int, int]]
-    """Takes the name of a photo, and returns its width and height, for formats that do not have
-    these.
+    """Takes the name of a photo, and returns the photo's width and height. Readers call it if the
+    file does not say the size.
     """
 
     @functools.cached_property
@@ -237,8 +238,8 @@ def read_calibration(
     """Read the calibration in a file or folder. Its content decides which of the `CAMERAS` formats
     it has.
 
-    photo_size: as in `CalibrationFile`. any_lens: whether lenses are allowed if this package cannot
-    undistort their photos.
+    photo_size: as in `CalibrationFile`. any_lens: whether to accept lenses whose photos this
+    package cannot undistort.
 
     Raises: CaptureError, one line that names the file and what was expected.
     """
@@ -321,7 +322,7 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 def image_size(value: Any, file: object, field: str) -> tuple[int, int]:
     """Returns width and height in whole pixels, read from `value`.
 
-    Raises: CaptureError for other values.
+    Raises: CaptureError unless these are two positive whole numbers within the limit `side`.
     """
     width, height = floats(value, file, field, (2,)).tolist()
     if not (
@@ -351,8 +352,8 @@ def pose_matrix(
 
 
 def rotation(value: Any, file: object, field: str) -> Float[np.ndarray, "3 3"]:
-    """Returns the 3 x 3 matrix of a rotation in a file, which may be the 9 numbers of the matrix or
-    the 3 numbers of a rotation vector (cv2.Rodrigues).
+    """Returns the 3 x 3 matrix of a rotation in a file. value: the 9 numbers of the matrix, or the
+    3 numbers of a rotation vector (cv2.Rodrigues). A matrix is not checked to be a rotation.
     """
     from scipy.spatial.transform import Rotation
 
@@ -411,7 +412,7 @@ def pinhole_lens(values: Any, file: object, field: str) -> dict[str, Any]:
 
 def fisheye_lens(values: Any, file: object, field: str, refusal: CaptureError) -> dict[str, Any]:
     """Returns the fields of a `CalibratedCamera` for the coefficients k1 k2 k3 k4 of a fisheye;
-    missing ones are 0. refusal: the error where photos have to be undistorted.
+    missing ones are 0. refusal: the error to raise if photos have to be undistorted.
     """
     values = file_numbers(values, file, field).ravel()
     if values[4:].any():
@@ -472,7 +473,7 @@ def undistort_person(
     coefficients: Float[np.ndarray, "5"],
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """Returns a photo on white and its mask, both without distortion. Only pixels near the person
-    are computed, because this is faster; the others are white.
+    are computed, because this is faster. The others become white, with 0 in the mask.
     """
     step = 16
     rows, columns = (np.arange(0.0, size + step, step) for size in mask.shape)

@@ -63,10 +63,12 @@ BODY_KEYS = {"body", "betas", "rotations", "translations"}
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Capture:
-    """A capture in memory (numpy on the host). `capture_from_arrays` makes a checked one."""
+    """A capture in memory. Its arrays are numpy's; cameras, body and poses are pytrees of JAX.
+    `capture_from_arrays` makes a checked capture.
+    """
 
     images: Annotated[Float[np.ndarray, "v h w 3"], UNIT]
-    """The photos, (v, h, w, 3), in [0, 1], white behind the masks."""
+    """The photos, (v, h, w, 3), in [0, 1]. The background is white if there are masks."""
     masks: Annotated[Float[np.ndarray, "v h w"] | None, UNIT]
     """The coverage by the person, (v, h, w), in [0, 1]; None: there are no masks."""
     cameras: Annotated[Camera, Batch("v")]
@@ -84,9 +86,9 @@ class Capture:
     body_file: str = DEFAULT_BODY
     """Where the model comes from, "makehuman" or a path."""
     displacement: Float[np.ndarray, "n 3"] | None = None
-    """Displacement of the vertices of the shaped body in the T-pose, (n, 3), metres, as other tools
-    register them (SMPL+D). Joints stay where they are. A displacement belongs to one shape, so code
-    that changes `betas` removes it. None: `reconstruct` may find a displacement by the masks.
+    """Displacement of the vertices of the shaped body in the T-pose, (n, 3), metres, as in SMPL+D.
+    Joints stay where they are. A displacement belongs to one shape, so code that changes `betas`
+    removes the displacement. None: `reconstruct` may find a displacement by the masks.
     """
     calibrated: bool = True
     """Whether the cameras were calibrated; if not, they were found from the person, and are
@@ -118,8 +120,8 @@ class Capture:
     def check(self, owner: str) -> None:
         """Check a capture that may have been made by hand.
 
-        There have to be a photo, a camera and a frame for each view, and a mask for each view or
-        none at all. The body has to fit the poses, and numbers have to be finite and in range.
+        Each view needs a photo, a camera and a frame. Either all views have a mask, or none has.
+        The poses need as many joints as the body. Numbers have to be finite and in range.
 
         Raises: ValueError, one line that begins with `owner`.
         """
@@ -217,7 +219,7 @@ def capture_from_arrays(
         background: "photo": the images show their background, and the masks put the person on
             white. "white": the images are on white already.
         fit_masks: whether masks that are too large or too small are first moved to the edges in the
-            photos.
+            photos. Only with the background "photo".
         body: the model. None: the model in `body_file`.
         body_file: where the model comes from. Default: the shipped body.
         displacement: (n, 3) metres, of the vertices of the shaped body in the T-pose, or None.
@@ -310,15 +312,16 @@ def load_capture(
     """Read and check a capture folder.
 
     Args:
-        path: the folder that holds capture.json. "demo_capture", if there is no such folder, is the
-            shipped one ("demo_capture/held_out": its held-out views).
+        path: the folder that holds capture.json. If there is no folder "demo_capture", this name
+            stands for the capture that comes with the package, and "demo_capture/held_out" for its
+            held-out views.
         body: a model to use in place of the one that body.npz names.
         views: read these views only, in this order; the photos of others are not opened.
         fit_masks: move masks that are too large or too small to the edges in the photos, and log by
-            how much.
+            how much. See `data.photos.read_photos` for the masks that are never moved.
 
     Returns:
-        The photos on white, cameras, poses and body, in memory.
+        The capture in memory. Photos with masks are on white.
 
     Raises:
         CaptureError: for whatever is wrong in the folder, one line with file and field.
@@ -345,10 +348,10 @@ def load_capture(
 
 
 def capture_checksum(path: str | Path) -> str:
-    """Returns the SHA-256, in hexadecimal, of all files that a capture is read from: capture.json,
-    body.npz, the model, photos and masks.
+    """Returns a SHA-256, in hexadecimal, of all files that a capture is read from: capture.json,
+    body.npz, the model file if there is one, photos, masks, and images that mark unknown pixels.
 
-    Captures of the same name with other contents have other checksums.
+    If one of these files changes, the checksum changes.
 
     Raises: CaptureError if capture.json or body.npz is wrong, or a file cannot be read. Other files
     are not checked.
@@ -381,8 +384,9 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
         overwrite: replace a capture folder, as a whole, sub-folders included.
 
     Raises:
-        CaptureError: if the capture is not valid, or `path` is a folder with something in it (with
-            `overwrite`: with something else than a capture).
+        CaptureError: if the capture is not valid, or if `path` cannot be replaced. For example, it
+            is a file, a folder that holds something but no capture.json, or, without `overwrite`, a
+            folder that holds a capture.
         OSError: if the folder cannot be written.
 
     Examples:
@@ -434,8 +438,8 @@ def _load_model(file: object, name: str, folder: Path | None = None) -> BodyMode
 
 
 def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
-    """Returns the name of the model in a body.npz, and its other values as arguments of
-    `body_parameters`. These are not checked yet.
+    """Returns the name of the model in a body.npz, and the other values of the file as arguments of
+    `body_parameters`. `body_parameters` checks these values.
 
     Raises: CaptureError.
     """

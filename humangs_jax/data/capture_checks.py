@@ -26,13 +26,14 @@ such as 0 to 255.
 LARGEST_TURN = 1e3
 """The largest magnitude of a component of an axis-angle rotation, radians."""
 LARGEST_DISTANCE = 1e4
-"""The largest magnitude of a component of a translation, metres. Farther away float32 loses
-millimetres, and the numbers are hardly metres.
+"""The largest magnitude of a component of a translation, metres. Beyond it float32 loses
+millimetres, and the unit is hardly the metre.
 """
 LARGEST_BETA = 100.0
 """The largest magnitude of a shape coefficient. Bodies that exist have less than 10."""
 LARGEST_DISPLACEMENT = 0.5
-"""The largest magnitude of a component of a displacement, metres. Clothes are nearer to the body.
+"""The largest magnitude of a component of a displacement, metres. Clothes are nearer to the skin
+than this.
 """
 
 
@@ -104,7 +105,8 @@ KINDS: dict[type, str] = {
 
 
 def expect(value: Any, kind: type, file: object, field: str) -> Any:
-    """Returns a JSON value after a check that it is of a type in `KINDS`. Texts must not be empty.
+    """Returns a JSON value after checking its type. Texts must not be empty, and booleans are no
+    numbers. kind: the type, a key of `KINDS`.
 
     Raises: CaptureError.
     """
@@ -115,8 +117,8 @@ def expect(value: Any, kind: type, file: object, field: str) -> Any:
 
 
 def members(value: Any, file: object, field: str = "", /, **kinds: type) -> list[Any]:
-    """Returns the members of a JSON object with the names in `kinds`, each checked to be of its
-    type.
+    """Returns the members of a JSON object that `kinds` names, in its order, after checking their
+    types. kinds: the type of each member by name.
 
     Raises: CaptureError.
     """
@@ -157,7 +159,7 @@ def floats(
     value: Any, file: object, field: str, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "*shape"]:
     """Returns finite float64 numbers, nested in any way, reshaped to `shape` in row-major order.
-    Raises: CaptureError for another count of numbers, and if they are not finite.
+    Raises: CaptureError if there are more or fewer numbers, or if they are not finite.
     """
     array = file_numbers(value, file, field)
     if array.size != np.prod(shape):
@@ -225,6 +227,7 @@ def body_parameters(
 
     Arguments: shape_names: see `shape_coefficients`. displacement: see `Capture`; None: there is
     none.
+    Raises: CaptureError.
     """
     joints = len(body.parents)
     rotations = numbers(rotations, file, "rotations")
@@ -265,8 +268,8 @@ def shape_coefficients(
 
     Arguments: betas: the coefficients. names: for each of betas, the name of its direction, as in
     `BodyModel.shape_names`. None: betas belong to the first of the body's directions that are no
-    expressions. If these are not the directions of SMPL-X, all of them have to be given, or betas
-    have to be 0.
+    expressions. If the names of these directions are not shape_0, shape_1 and so on, as SMPL-X has
+    them, betas need a number for each of them, or have to be 0.
 
     Raises: CaptureError for a coefficient that is not 0 if the body has no such direction, and if
     there is not one name for each coefficient.

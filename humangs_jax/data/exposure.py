@@ -1,10 +1,10 @@
 """Makes the exposure and the white balance of the photos of one person equal.
 
-Cameras that meter for themselves show one skin in several colors. A gain for each photo and channel
-makes the colors agree. A point of the body that two photos show should have one color in both. For
-each pair of photos, the ratios of the two colors of shared points have a median. The gains bring
-these medians nearest to 1. The logarithms of the gains have the mean 0 over the photos. Gains of
-photos that share few points stay near 1.
+Cameras with automatic exposure show one skin in several colors. A gain for each photo and channel
+makes the colors agree. A point of the body that two photos show should have the same color in both.
+Each pair of photos has a median: that of the ratios of the two colors, over all points that both
+photos show. The gains bring these medians as near to 1 as possible. The logarithms of the gains
+have the mean 0 over the photos. Gains of photos that share few points stay near 1.
 
 Photos of the front and of the back share no point of the body, nor do photos of the left and of the
 right side. Groups of photos that are linked by shared points are compared by the parts of the body:
@@ -15,8 +15,8 @@ hardly depends on how the light falls on the part. Parts that differ (an open co
 over a neck) do not count, since the fit is robust. Brightness does depend on the light. It is made
 equal only between photos of different moments, or if their white balances differ.
 
-Gains are found once for the photos of a capture, which then records them (`Capture.gains`). Gains
-found again from photos that are nearly equal would not be 1.
+Gains are found once for the photos of a capture, which then records them (`Capture.gains`). If they
+were found again from photos that are nearly equal, they would not be 1.
 """
 
 import dataclasses
@@ -42,13 +42,15 @@ from humangs_jax.geometry.camera import Camera, project
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 
 EXPOSURE_SIZE = 256
-"""Side of the crops around the person that are compared, pixels."""
+"""Side of the squares around the person that are compared, pixels."""
 FACING = 0.5
-"""A photo shows a point where the cosine between normal and ray is at least this."""
+"""A photo shows a point if the cosine of the angle between its normal and the direction to the
+camera is more than this.
+"""
 THICKNESS = 0.02
-"""A photo shows a point that lies at most this many metres behind the nearest surface."""
+"""A photo shows a point if it lies less than this behind the nearest surface, metres."""
 INSIDE = 5
-"""Side of the square around each point that must lie in the mask, pixels."""
+"""Side of the square around each point, pixels. The square must lie in the mask."""
 WHOLE = 0.99
 """A point is used if the mask is above this everywhere in the square with side `INSIDE`."""
 BLUR = 3
@@ -58,8 +60,8 @@ USABLE = (0.06, 0.95)
 LEAST_POINTS = 50
 """Least number of points that two photos must share to be compared."""
 ALIKE = 50
-"""Number of neighbouring points with nearly the same error. So many points count as one independent
-measurement.
+"""Number of points that count as one independent measurement. The errors of neighbouring points are
+nearly the same.
 """
 NOISE = 0.03
 """Least standard deviation of the median of the log ratios of two photos, however many points they
@@ -77,7 +79,7 @@ NORMAL_MAD = 1.4826
 
 def equalize_exposure(capture: Capture) -> Capture:
     """Returns the capture in equal exposure, with its gains recorded. Network and refinement read
-    these photos. Returns the same object if its gains are recorded already.
+    these photos. If the capture has gains already, it is returned as it is.
 
     Captures without masks are returned as they are, because nothing is known of their exposure.
 
@@ -102,8 +104,8 @@ def equalize_exposure(capture: Capture) -> Capture:
 
 def exposure_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
     """Returns the factors by which the colors of a rendering are multiplied to get the exposure of
-    each camera, (v, 3): one for each view and channel. They are 1 for views that do not show the
-    person.
+    each camera, (v, 3): one for each view and channel. If the capture has no gains yet, they are
+    found here; views that do not show the person then have 1. All are 1 if there are no masks.
     """
     if capture.gains is not None:
         return 1 / capture.gains
@@ -150,8 +152,8 @@ def calls_of_exposure(capture: Capture) -> Iterator[Call]:
 def gains_of(
     colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the gains of views, found from the colors of common points. All are 1 if the colors
-    hardly differ, or if no two views share enough points.
+    """Returns the gains of views, (v, 3), found from the points that they share. All are 1 if the
+    colors hardly differ (`CLEAR`), or if no two views share enough points.
 
     colors: in [0, 1]. seen: which points each view shows.
     """
@@ -206,7 +208,9 @@ BRIGHTNESS = 0.2
 in one light. 16 synthetic people have 0.1 to 0.3.
 """
 OFFSET = 0.01
-"""Standard deviation of the stray light in a color. It makes the tints of dark parts uncertain."""
+"""Standard deviation of the stray light in a color, which is in [0, 1]. Stray light makes the tints
+of dark parts uncertain.
+"""
 OTHER_LIGHT = 0.04
 """Photos of one moment count as balanced differently if the root mean square of their log white
 balances is at least this. In one light at most 0.03 is found (16 synthetic people).
@@ -220,17 +224,17 @@ FITS = 16
 the fit before.
 """
 REDESCENDING = 8
-"""After this many fits, the last of `FITS`, weights are Cauchy's. Parts that differ then lose
-nearly all influence. If the first fits used these weights, too, the result would depend on where
-the search starts.
+"""Number of fits, the last of `FITS`, after which the rows get Cauchy's weights. Parts that differ
+then lose nearly all influence. If the first fits were followed by these weights, too, the result
+would depend on where the search starts.
 """
 
 
 def linked_views(
     colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]
 ) -> Int[np.ndarray, " v"]:
-    """Returns the number of each view's group. Two views are in one group if they share enough
-    points to compare their gains, directly or by way of other views.
+    """Returns the index of each view's group, (v,). Two views are in one group if they share enough
+    points to compare their gains. Views that are linked through other views are in one group, too.
     """
     known = np.all(_known(colors, seen), axis=-1)
     shared = np.einsum("an,bn->ab", known, known, dtype=int) >= LEAST_POINTS
@@ -244,8 +248,8 @@ def _known(
 
 
 def body_parts(body: BodyModel) -> Int[np.ndarray, " n"]:
-    """Returns for each vertex the part of the body that it moves with most, as an index into
-    `PARTS`, (n,). -1: none of these parts.
+    """Returns the part of the body that each vertex belongs to, as an index into `PARTS`, (n,). It
+    is the part of the joint with the vertex's largest skinning weight. -1: none of these parts.
     """
     of_joint = [
         next((i for i, words in enumerate(PARTS) if any(word in name for word in words)), -1)
@@ -352,9 +356,9 @@ def _robust_differences(
     errors: Float[np.ndarray, " r"],
     count: int,
 ) -> Float[np.ndarray, "count c"]:
-    """Returns `count` numbers x for each of c columns, (count, c). Each row asks that
-    x[one] - x[other] equals its value. Most rows are met nearly. Rows that contradict them count
-    little. x is near 0 where the rows leave it open.
+    """Returns `count` numbers x for each of c columns, (count, c). Each row asks that x[one] -
+    x[other] equals the value of the row. Most rows are nearly met. Rows that contradict most others
+    count little. x is near 0 where the rows do not determine it.
 
     The fit is weighted least squares, repeated `FITS` times: first with Huber's weights, then with
     Cauchy's.

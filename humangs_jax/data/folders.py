@@ -1,9 +1,8 @@
-"""Finds the photos of a folder that are used, and the files that are not used, each with the
-reason.
+"""Finds the photos to use in a folder, and the files that are not used, each with the reason.
 
-Every command that looks for photos asks `scan_folder`, so that all of them take the same files and
-can say what they leave out. Names that begin with a dot are no photos: macOS writes `._IMG_1.jpg`
-beside `IMG_1.jpg` on disks of other systems.
+Every command that looks for photos in a folder and its subfolders calls `scan_folder`. So all
+commands take the same files and can say what they leave out. Names that begin with a dot are no
+photos: macOS writes `._IMG_1.jpg` beside `IMG_1.jpg` on disks of other systems.
 """
 
 import dataclasses
@@ -40,9 +39,11 @@ RAW_PICTURES = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 OTHER_VIDEOS = (".webm", ".mts", ".m2ts", ".3gp", ".wmv", ".mpg")
 """File types of videos that are not read."""
 SYSTEM_FOLDERS = ("__MACOSX", "@eaDir")
-"""Names of folders of previews, which archives of macOS and disks of Synology have."""
+"""Names of folders that archives of macOS and disks of Synology have beside the photos. They are
+not searched.
+"""
 NAMES_SHOWN = 3
-"""The number of files of each unused kind that are named."""
+"""Largest number of unused files that are named for each reason."""
 
 _WORDS = "(?:masks?|mattes?|alpha|silhouettes?|seg|segmentation)"
 _MASK_BEHIND = re.compile(rf"(?P<photo>.+?)[._ -]+{_WORDS}", re.IGNORECASE)
@@ -91,16 +92,18 @@ class FolderScan:
     or a video are not among them.
     """
     masks: tuple[Path, ...] = ()
-    """The masks of the photos, where each photo has one in its folder. If only some photos have
-    masks, the masks are unused.
+    """The masks of the photos, if each photo has a mask in its own folder. Otherwise this is empty,
+    and the masks are in `unused`.
     """
 
 
 def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False) -> FolderScan:
-    """Find the photos of a folder and its subfolders, and the files that are not used.
+    """Find the photos of a folder and its subfolders, and the files that are not used. Subfolders
+    that are captures are not searched. A folder that does not exist has no photos.
 
-    Arguments: skip: whether a subfolder holds something else than photos; it is then not searched.
-    A folder that does not exist has no photos. Raises: CaptureError if the folder cannot be read.
+    Arguments: skip: returns whether a subfolder holds something other than photos. Such a subfolder
+    is not searched.
+    Raises: CaptureError if the folder cannot be read.
     """
     if not folder.is_dir():
         return FolderScan(folder, ())
@@ -144,7 +147,8 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
 
 
 def photos_in(folder: Path) -> dict[str, Path]:
-    """Returns the photos that lie directly in a folder, by their names without suffix.
+    """Returns the photos that lie directly in a folder, by their names without suffix. Masks of
+    these photos and pictures that humangs drew are left out.
 
     Of several photos with one name, the one with the first suffix of `PHOTO_SUFFIXES` is taken.
     """
@@ -205,8 +209,8 @@ def _masks_beside(pictures: Iterable[Path]) -> dict[Path, Path]:
 
 
 def unused_line(unused: Iterable[Unused]) -> str | None:
-    """Returns one line with the numbers, the reasons and the first names of the files that are not
-    used; None if there are none.
+    """Returns one line about the files that are not used: for each reason their number and some of
+    their names. None if there are none.
     """
     groups: dict[Reason, list[str]] = {}
     for each in unused:

@@ -32,7 +32,7 @@ F = TypeVar("F", bound="SourceFormat")
 @dataclasses.dataclass(frozen=True)
 class SourceFormat(Format):
     """A format whose files usually have certain names. A file belongs to the format if its content
-    fits.
+    fits. Files of a format with `folder` are known by their names instead.
 
     Its code is "module:read_NAME".
     """
@@ -40,7 +40,7 @@ class SourceFormat(Format):
     files: tuple[str, ...] = ()
     """Usual names in a folder, patterns of `Path.glob`."""
     content: str = ""
-    """The contents of its files, for the docs: a line of Markdown."""
+    """What its files contain, as a line of Markdown for the docs."""
     folder: bool = False
     """Whether the files of one folder are read together."""
 
@@ -49,8 +49,8 @@ class SourceFormat(Format):
         return self.about
 
     def fits(self, source: Any) -> bool:
-        """Returns whether the content of a source, one file, is of this format. False for formats
-        whose files are read together.
+        """Returns whether the content of one file is of this format. False for formats whose files
+        are read together. source: the file, as the reader gets it.
         """
         return not self.folder and imported(str(self.code).replace(":read", ":recognizes"))(source)
 
@@ -71,7 +71,9 @@ class CameraFormat(SourceFormat):
     per_image: bool = False
     """Whether there is one camera for each image, not one for each camera."""
     unit: float | None = None
-    """Metres per unit of length of the format; None where files may have any unit."""
+    """Metres per unit of length. None: the format states no unit, or its reader converts lengths to
+    metres.
+    """
 
     def __str__(self) -> str:
         if self.files:
@@ -105,8 +107,9 @@ class SourceFormats(Formats[F]):
         return next(named, None)
 
     def of_content(self, source: Any) -> F | None:
-        """Returns the first format that recognizes the content of a source, one file; None if there
-        is none. Formats of its suffix are tried before the others.
+        """Returns the first format that recognizes the content of one file; None if none does.
+        Formats that list the file's suffix are tried before the others. source: the file, as the
+        reader gets it.
         """
         asked = sorted(
             self.values(), key=lambda each: source.path.suffix.lower() not in each.suffixes
@@ -245,7 +248,7 @@ KEYPOINTS = SourceFormats(
         content="inferencer or demo scripts, a file an image or a video: 17, 26, 133 or 136 points",
     ),
 )
-"""The formats of detected keypoints, by name. A file may be a folder."""
+"""The formats of detected keypoints, by name. Some names in `files` are names of folders."""
 
 
 # Motions
@@ -279,21 +282,24 @@ class ArrayKeys:
     """The keys of the arrays of one person's motion, and the conventions of these arrays."""
 
     keys: tuple[str, ...]
-    """A file that has all of these keys is of this format."""
+    """A file that has all of these keys is of this format, unless it fits an earlier one in
+    `MOTIONS`.
+    """
     poses: dict[str, str]
     """Name of a part in `PLACES` -> key of the part's rotations in the file. The rotations are
-    axis-angles or rotation matrices.
+    axis-angles or rotation matrices, unless `six` or `kind` says otherwise.
     """
     moves: tuple[str, ...] = ("trans", "transl")
-    """The keys that positions may have; the first one in the file is used. If the file has none of
-    them, see `stays`.
+    """The keys that positions may have. The first of these keys that the file has is used. If the
+    file has none of them, see `stays`.
     """
     rates: tuple[str, ...] = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate")
-    """The keys that frames per second may have; the first one in the file is used."""
+    """The keys that frames per second may have. The first of these keys that the file has is used.
+    """
     fps: float | None = None
-    """Frames per second if the file does not say them. None: the file must say them."""
+    """Frames per second if neither the user nor the file says them. None: one of the two must."""
     up: str = "y"
-    """The axis that is up in files of this format."""
+    """The axis that points up in files of this format, see `fixed`."""
     fixed: bool = False
     """Whether `up` is certain. If not, the poses may show that another axis is up."""
     also: tuple[str, ...] = ()
@@ -323,13 +329,15 @@ class ArrayKeys:
 
 @dataclasses.dataclass(frozen=True)
 class MotionFormat(Format):
-    """A format of motion files. code: called as code(path, `motion.Reading`); returns
+    """A format of motion files.
+
+    Its code is called as code(path, options), where options is a `motion.Reading`. It returns
     `motion.Poses` or a `skeleton.Clip`.
     """
 
     arrays: ArrayKeys | None = None
     """The keys of a format of arrays. A file is read by the first format with fitting keys,
-    whatever the file's suffix is. None: the files do not hold arrays.
+    whichever of `ARRAY_SUFFIXES` it has. None: the files do not hold arrays.
     """
 
 
@@ -487,21 +495,24 @@ MOTIONS = Formats(
 
 @dataclasses.dataclass(frozen=True)
 class DataSetFormat(Format):
-    """A data set of captured people. code: opens one subject; called as code(path, body), returns a
-    `subject.Subject`.
+    """A data set of captured people.
+
+    Its code is called as code(path, body). It opens one subject, and returns a `subject.Subject`.
+    See `lists` and `scans` for exceptions.
     """
 
     find: str | Callable[[Path], tuple[Path, ...]] = ""
-    """Returns the sorted paths of the subjects in a folder, or the folder itself if it is a subject
-    or a list of people. The result is empty if the folder has another layout.
+    """The function that finds the subjects below a path, or its name as "package.module:function".
+    It returns their sorted paths. If the path itself is a subject, a list of people or a folder of
+    scans, it returns this path alone. The result is empty if the path has another layout.
     """
     lists: bool = False
-    """Whether one file lists many people. Then code is called as code(path, body, size), and
+    """Whether one file lists many people. The code is then called as code(path, body, size), and
     returns a tuple of `subject.Person`.
     """
     scans: bool = False
     """Whether people are textured scans, of which `humangs preprocess` has to render photos first.
-    For code see `preprocess.run`.
+    The code then takes only the path, see `thuman.open_thuman`.
     """
 
 

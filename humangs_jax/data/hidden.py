@@ -1,12 +1,12 @@
 """Finds things in front of the person that make a hole in a mask: a chair, a table, a bicycle.
 
-A mask says where the person is seen. Where the posed body lies well inside of the photo and the
-mask has a hole or ends, something is in front, or the mask is wrong: the photo says nothing there.
-These pixels become unknown (`Capture.unknown`).
+A mask says where the person is seen. If a pixel shows the posed body but is not on the mask,
+something is in front of the person, or the mask is wrong. The photo says nothing about the person
+there. Holes of such pixels become unknown (`Capture.unknown`).
 
-If the pose is a little wrong, the body also lies beside the mask. So holes count only well inside
-of the silhouette's edge, in parts of the silhouette that are thicker than an arm. There must also
-be little of the mask beside the body near a hole: it would be an arm or a leg with another pose.
+If the pose is a little wrong, the edge of the body also lies beside the mask. So holes count only
+well inside of the silhouette, in parts that are thicker than an arm. If much of the mask lies
+beside the body near a hole, the hole does not count: it comes from an arm or a leg in another pose.
 """
 
 import dataclasses
@@ -30,40 +30,42 @@ from humangs_jax.io.images import resized
 LONGEST = 512
 """Longest side of the photos in which silhouettes are compared, pixels."""
 INSIDE = 0.035
-"""A hole is looked for where the silhouette's edge is farther away than this, metres. Poses and
-shapes of fits are off by less.
+"""A hole is looked for where the silhouette's edge is farther away than this, metres. Fitted bodies
+are off by less.
 """
 THICK = 0.015
-"""Half of the least thickness of a hole, metres, measured inside of `INSIDE`. Arms, and the gap
-between arm and trunk, are too thin for holes.
+"""Half of the least thickness of a hole, metres. Only the part of the hole that is farther than
+`INSIDE` from the silhouette's edge is measured. Arms, and the gap between arm and trunk, are too
+thin for holes.
 """
 AREA = 0.005
-"""The least area of a hole, square metres."""
-EDGE = 0.01
-"""A hole that is found farther inside is extended up to this distance from the silhouette's edge,
-metres.
+"""The least area of a hole, square metres. Only the part that is thick enough (`THICK`) is
+measured.
 """
+EDGE = 0.01
+"""A hole is extended outwards until it is this near to the silhouette's edge, metres."""
 RIM = 0.03
 """Distance by which a hole is enlarged, metres. The thing in front hides clothes outside of the
 body, too, and its colors are seen along the edge of the mask.
 """
 INTO_MASK = 0.008
-"""The part of `RIM` that may lie on the mask, metres."""
+"""Distance by which a hole is enlarged onto the mask, metres."""
 LOOSE = 0.04
 """Distance outside of the silhouette up to which the mask may show clothes and hair, metres."""
 NEARBY = 0.25
 """Distance from a hole within which the mask beside the body is measured, metres, see `BESIDE`."""
 BESIDE = 0.35
-"""Largest area of the mask beside the body near a hole, as a share of the hole's area. If there is
-more, the hole is not something in front: an arm or a leg has another pose than the body.
+"""Largest area of the mask beside the body near a hole, as a share of the hole's area (see `AREA`).
+If the area is larger, nothing is in front: an arm or a leg of the person has another pose than the
+body's.
 """
 AGREES = 0.75
-"""At least this share of the mask has to lie on the body or within `LOOSE` of it. If not, the body
-is not where the person is, and no holes are looked for.
+"""At least this share of the mask has to lie on the body's silhouette or within `LOOSE` of it. If
+less does, the body is not where the person is, and no holes are looked for.
 """
 SHOWN = 0.3
-"""The mask has to show more than this share of the body's silhouette. If not, most of the body
-would be a guess, and no holes are looked for.
+"""The mask has to cover more than this share of the body's silhouette, without unknown pixels. If
+it covers less, most of the body would be a guess, and no holes are looked for.
 """
 
 
@@ -71,9 +73,9 @@ class _Photo(NamedTuple):
     """A photo of at most `LONGEST` pixels, with the silhouette of the posed body. Its arrays are
     (h, w).
 
-    mask: where the person is seen. known: where the photo says something. body: the silhouette.
-    beside: the part of the mask that is farther than `LOOSE` from the silhouette. per_metre: pixels
-    per metre at the median depth of the body.
+    mask: where the person is seen. known: the pixels that are not unknown already. body: the
+    silhouette. beside: the part of the mask that is farther than `LOOSE` from the silhouette.
+    per_metre: pixels per metre at the median depth of the body.
     """
 
     mask: np.ndarray
@@ -163,8 +165,8 @@ def _hidden_part(
 def _reduced_photo(
     capture: Capture, view: int, vertices: Float[np.ndarray, "n 3"], faces: np.ndarray
 ) -> _Photo | None:
-    """Returns a photo with the silhouette of the posed body; None if a part of the body is not
-    before the camera, or if no part is in the photo. vertices: see `_hidden_part`.
+    """Returns a photo with the silhouette of the posed body; None if a part of the body is not in
+    front of the camera, or if no part is in the photo. vertices: see `_hidden_part`.
     """
     assert capture.masks is not None
     # the photo is reduced to `LONGEST`, and its camera with it
@@ -204,8 +206,8 @@ def _shows_body(photo: _Photo) -> bool:
 
 
 def _holes(photo: _Photo) -> Bool[np.ndarray, "h w"]:
-    """Returns the pixels of holes in the mask that are thick, large and well inside of the body,
-    and what is connected to them up to the edge.
+    """Returns the pixels of holes in the mask that are thick, large and well inside of the body.
+    Holes extend to `EDGE` from the silhouette's edge.
     """
     per_metre = photo.per_metre
     # the border of the photo is not an edge of the body
@@ -228,7 +230,7 @@ def _holes(photo: _Photo) -> Bool[np.ndarray, "h w"]:
 
 
 def _with_rim(hole: Bool[np.ndarray, "h w"], photo: _Photo) -> Bool[np.ndarray, "h w"]:
-    """Returns the holes enlarged by `RIM`, but on the mask only by `INTO_MASK`."""
+    """Returns the holes enlarged by `RIM` outside of the mask, and by `INTO_MASK` on the mask."""
     away = ndimage.distance_transform_edt(~hole)
     in_rim = away < RIM * photo.per_metre
     at_hole = away < INTO_MASK * photo.per_metre
@@ -236,7 +238,7 @@ def _with_rim(hole: Bool[np.ndarray, "h w"], photo: _Photo) -> Bool[np.ndarray, 
 
 
 def _opened(where: Bool[np.ndarray, "h w"], radius: float) -> Bool[np.ndarray, "h w"]:
-    """Returns the union of the discs of a radius, in pixels, that fit into the True pixels."""
+    """Returns the union of all discs of this radius, pixels, that fit into the True pixels."""
     inner = ndimage.distance_transform_edt(where) > radius
     if not inner.any():
         return inner

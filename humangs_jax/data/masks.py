@@ -8,8 +8,9 @@ distance at which the colors change most, on average over the silhouette and nea
 points.
 
 A stripe along the rim may look like the background (rim light before a bright wall, piping). Its
-inner side is then a stronger edge than the rim. So a mask is moved only if enough sectors of the
-silhouette, in the view and in all views, have an edge where it would move and none where it ends.
+inner side is then a stronger edge than the rim. So the silhouette is divided into sectors. A mask
+is moved only if enough sectors, in its view and in all views, have an edge where the silhouette
+would move to, and no edge where the mask ends now.
 """
 
 import itertools
@@ -23,11 +24,11 @@ from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.io.images import resized
 
 PERSON_HEIGHT = 200
-"""Height of the person in the units of the lengths below. So a unit is a pixel if the person is
-this many pixels high.
+"""Height of the person in units. Most lengths below are in units. A unit is a pixel if the person
+is this many pixels high.
 """
 REACH = 4.0
-"""Largest distance that a silhouette is moved, in units (see `PERSON_HEIGHT`)."""
+"""Largest distance by which a silhouette is moved, in units (see `PERSON_HEIGHT`)."""
 STEP = 0.5
 """Distance between the moves that are tried, in units (see `PERSON_HEIGHT`)."""
 NEIGHBORHOOD = 4.0
@@ -38,21 +39,23 @@ SMOOTHING = 2.0
 """Standard deviation of the Gaussian that smooths the moves, in units (see `PERSON_HEIGHT`)."""
 LEAST = 0.75
 """A mask stays as it is if its silhouette is off by less than this on average, in units (see
-`PERSON_HEIGHT`). Exact masks would only lose (docs/stability.md).
+`PERSON_HEIGHT`). A move would only make exact masks worse (docs/stability.md).
 """
 LEAST_MOVE = 0.5
 """Parts of the silhouette that would move by less than this stay where they are, in units (see
 `PERSON_HEIGHT`).
 """
 MOST_PIXELS = 400
-"""Height of the person at which the photo is searched, pixels. Larger photos are reduced to it."""
+"""Largest height of the person in the image that is searched, pixels. If the person is higher in
+the photo, the photo is reduced.
+"""
 LEAST_PART = 0.005
 """Connected parts of a mask that have less than this share of the largest part's area are specks
 and not the person.
 """
 WHITE = 0.98
-"""A photo shows no background if nothing around the mask, beyond `REACH`, is darker than this. Then
-no edge can be found.
+"""A photo shows no background if no channel of a pixel farther than `REACH` outside of the mask is
+darker than this. No edge can then be found.
 """
 SECTORS = 16
 """Number of sectors. Sectors divide the silhouette by the angle about its middle, and have equally
@@ -76,13 +79,14 @@ OF_TEXTURE = 1.0
 SEEN_APART = 1.5
 """A sector votes for a move if its edge is at most this many units away from where the silhouette
 would move. An edge where the mask ends is looked for only if the mask is off by at least this many
-pixels.
+pixels of the image that is searched.
 """
 CLEAR = 1.3
-"""Distance from an edge, pixels, from which on the colors are not blurred by it."""
+"""Colors are not blurred by an edge that is at least this far away, pixels."""
 THIN = 0.0007
 """A mask that has grown by its excess has no part thinner than twice the excess. Masks are not
-moved if thinner parts have more than this share of the area that the masks would lose.
+moved if their thinner parts are larger than this, as a share of the area that the masks would lose,
+on average over the views.
 """
 
 
@@ -91,7 +95,7 @@ class _Shift(NamedTuple):
 
     excess: by how many pixels the mask is too large (negative: too small; 0: it stays). moves: the
     excess near each pixel of `window`, pixels. unit: pixels per unit, see `PERSON_HEIGHT`. votes:
-    the number of sectors for and against the correction. thin: see `THIN`.
+    the number of sectors for and against the correction. thin: what `_thin_parts` returns.
     """
 
     excess: float
@@ -103,8 +107,8 @@ class _Shift(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """What a photo shows at n points along the silhouette, all at one depth, or how much that
-    changes from one depth to another (`_change`).
+    """The colors of a photo at n points along the silhouette, all at one depth. Or the change of
+    these colors from one depth to another (`_change`).
 
     values: the colors of the points, (n, 3), or the distances between their colors at the two
     depths, (n,). counts: whether a point counts, (n,).
@@ -118,7 +122,7 @@ class _Edge(NamedTuple):
     """The strongest edge of a sector.
 
     depth: how far inside of the silhouette it is, pixels. change: the mean change of colors across
-    it. clear: whether colors change much less at most other depths.
+    it. clear: whether the change is at least twice the median of the changes at all depths.
     """
 
     depth: float
@@ -137,12 +141,12 @@ def masks_at_edges(
 
     A mask stays as it is, with 0, in these cases:
 
-    - It is empty, full or a line, or its photo shows no background.
+    - It is empty or full, it is only one pixel wide or high, or its photo shows no background.
     - It is off by less than `LEAST`.
-    - Too few sectors of the silhouette vote for the move, in its view (`AGREE_ALONE`) or in all
+    - Too small a share of the sectors votes for the move, in its view (`AGREE_ALONE`) or in all
       views that are off in the same direction (`AGREE`).
-    - Fewer than half of the views are off in this direction.
-    - The masks that are off in this direction have many thin parts (`THIN`).
+    - Fewer than half of the views, without those of the first case, are off in this direction.
+    - The masks that are off in this direction have too many thin parts (`THIN`).
     """
     found = [_shift(image, mask) for image, mask in zip(images, masks, strict=True)]
     seen = [shift for shift in found if shift is not None]
@@ -156,8 +160,8 @@ def masks_at_edges(
 
 
 def _believed(shift: _Shift, seen: Sequence[_Shift]) -> bool:
-    """Returns whether a shift corrects the mask and does not follow the person's colors. seen: the
-    shifts of all views.
+    """Returns whether a shift corrects the mask, and does not follow edges within the person. seen:
+    the shifts of all views.
     """
     alike = [other for other in seen if other.excess * shift.excess > 0]
     if not alike or 2 * len(alike) < len(seen) or np.mean([other.thin for other in alike]) > THIN:
@@ -243,12 +247,12 @@ def _boundary_moves(
 def _sector_votes(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], whole: float, unit: float
 ) -> tuple[int, int]:
-    """Returns the numbers of sectors for and against a move. A sector is for it if its edge lies
-    about `whole` pixels inside of the silhouette; against it if the edge lies elsewhere, or there
-    is one where the mask ends.
+    """Returns the numbers of sectors for and against a move. A sector is against the move if there
+    is an edge where the mask ends, or if the strongest edge of the sector is at the mask's end, or
+    is not about `whole` pixels inside of it. Otherwise the sector is for the move.
 
-    Sectors without a clear edge do not count, nor do sectors where both sides of the edge are
-    white.
+    A sector does not count in three cases: it has neither a clear edge nor an edge where the mask
+    ends, both sides of the mask's end are white, or too few of its points count.
     """
     distances = signed_distance(mask)
     # points on the end of the mask, with the direction inwards
@@ -297,7 +301,9 @@ def _colors_at(
 
 
 def _change(one: _Seen, other: _Seen) -> _Seen:
-    """Returns how much the colors of each point differ. A point counts if it does in both."""
+    """Returns how much the colors of each point differ. A point counts if it does at both
+    depths.
+    """
     return _Seen(np.linalg.norm(one.values - other.values, axis=-1), one.counts & other.counts)
 
 
@@ -370,7 +376,8 @@ def _votes(
 
 def _thin_parts(mask: Float[np.ndarray, "h w"], excess: float) -> float:
     """Returns the area of a mask's thin parts, divided by the area that the mask would lose. Thin
-    parts are narrower than a mask can be that has grown by `excess` (units, see `PERSON_HEIGHT`).
+    parts are narrower than every part of a mask that has grown by `excess`. The result is 0 if
+    `excess` is not positive. excess: in units, see `PERSON_HEIGHT`.
 
     A silhouette that has grown by some distance has no part thinner than twice that distance. A
     mask with thin fingers has not grown.
@@ -428,7 +435,7 @@ def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 # the person's.
 
 RIM_HEIGHT = 440
-"""Height of the person in the units of the lengths below."""
+"""Height of the person in units. `DEPTH` and `SPREAD` are in these units."""
 DEPTH = 2.0
 """Pixels outside the mask, and pixels inside that are nearer to its edge than this, are cleaned.
 The cleaning compares two means: the color of the person at least this far inside, and the color of
@@ -439,8 +446,8 @@ SPREAD = 1.5
 `RIM_HEIGHT`).
 """
 LEAST_WEIGHT = 1e-3
-"""Least weight of the pixels at least `DEPTH` inside. Where their weight is less, the rim stays as
-it is. This is so at fingers, which are too thin.
+"""Least weight of the pixels that are at least `DEPTH` inside of the mask. Where the weight is
+less, the rim stays as it is. Fingers, for example, are too thin to have such pixels.
 """
 CONTRAST = 0.02
 """A pixel may be cleaned if the distance between the two means (see `DEPTH`) is more than this, as
@@ -453,12 +460,12 @@ CERTAIN = 0.15
 def clean_rims(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Returns a photo without the background's share in the colors of pixels along and beyond the
-    edge of the mask.
+    """Returns a photo in which the background's share is removed from the colors of pixels along
+    and outside of the mask's edge.
 
-    A pixel's share says where its color lies between two means: the color further inside and the
-    color further outside. This share of the difference of the means is subtracted from the pixel.
-    All other detail stays.
+    The share says where a pixel's color lies between two means: the color farther inside of the
+    mask and the color farther outside. The difference of the means, times the share, is subtracted
+    from the pixel. All other detail stays.
     """
     inside = mask > 0.5
     if not inside.any() or inside.all():
@@ -501,7 +508,7 @@ def _blurred(
     colors: Float[np.ndarray, "h w 3"], where: Bool[np.ndarray, "h w"], sigma: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Returns the mean color of the True pixels around each pixel, weighted by a Gaussian, and
-    whether there are any.
+    whether their weight is at least `LEAST_WEIGHT`.
     """
 
     def blur(values):

@@ -1,8 +1,8 @@
 """Reads and writes the photos of a capture folder: capture.json, images, masks, cameras, and the
 frame that each view shows.
 
-No body is needed to read them. `humangs import cameras` writes such a folder without a body, and
-`humangs fit` adds the body. Every fault is a `CaptureError`, one line with file and field.
+No body is needed to read the photos. `humangs import cameras` writes such a folder without a body,
+and `humangs fit` adds the body. Every fault is a `CaptureError`, one line with file and field.
 docs/capture_format.md describes the format.
 """
 
@@ -54,7 +54,7 @@ OPTIONAL_TOP_KEYS = {"calibrated"}
 VIEW_KEYS = {"image", "mask", "unknown", "K", "cam_from_world", "frame"}
 Background = Literal["photo", "white"]
 LEAST_UNKNOWN = 0.5
-"""Least value of a pixel that is unknown, in an image that marks the unknown pixels."""
+"""Least value, in [0, 1], that marks a pixel as unknown in an image of unknown pixels."""
 OFF_CENTER = 0.05
 """K belongs to the photo turned by its EXIF orientation if the principal point is nearer to the
 middle of the turned photo than to the middle of the stored photo. The two distances have to differ
@@ -69,17 +69,17 @@ NEARLY_WHITE = 0.9
 `NEARLY_WHITE`.
 """
 LEAST_LABELLED = 1e-3
-"""A mask does not count as labels if at most this share of its pixels is not 0. It may be the rim
-of somebody outside the photo.
+"""A mask does not count as labels if at most this share of its pixels is not 0. These pixels may be
+the rim of somebody outside the photo.
 """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Photos:
-    """Photos of one person (numpy on the host)."""
+    """Photos of one person. Arrays are numpy's; the cameras are a pytree of JAX."""
 
     images: Float[np.ndarray, "v h w 3"]
-    """The photos, (v, h, w, 3), in [0, 1], white behind the masks."""
+    """The photos, (v, h, w, 3), in [0, 1]. The background is white if there are masks."""
     masks: Float[np.ndarray, "v h w"] | None
     """The coverage by the person, (v, h, w), in [0, 1]; None: there are no masks."""
     cameras: Camera
@@ -102,7 +102,7 @@ class Photos:
 
 
 def load_photos(path: str | Path, *, fit_masks: bool = False) -> Photos:
-    """Read the photos of a capture folder, which need not have a body.npz. fit_masks: see
+    """Read the photos of a capture folder. The folder need not have a body.npz. fit_masks: see
     `read_photos`.
 
     Raises: CaptureError, one line naming file and field.
@@ -130,7 +130,8 @@ def read_description(file: Path) -> dict[str, Any]:
     """Read capture.json, and check its keys and the types of its values. The frames and matrices of
     the views are not checked.
 
-    The paths in it must stay inside the folder. Raises: CaptureError.
+    The paths in it must stay inside the folder. The limit `photos_outside` allows others for photos
+    and masks. Raises: CaptureError.
     """
     description = checked_json(
         file, missing="no such file: a capture is a folder with a capture.json"
@@ -170,7 +171,8 @@ def read_description(file: Path) -> dict[str, Any]:
 
 
 def _check_inside(file: Path, field: str, name: str, photo: bool = False) -> None:
-    """Check that a path that `file` names stays in its folder.
+    """Check that a path in `file` stays inside the folder of `file`. photo: see
+    `io.reading.inside`.
 
     Raises: CaptureError.
     """
@@ -184,8 +186,8 @@ def write_description(
     background: Background = "photo",
     calibrated: bool = True,
 ) -> None:
-    """Write a capture.json with these views, which have the keys of the format. It names body.npz
-    as the file of the body.
+    """Write a capture.json with these views. It names body.npz as the file of the body. views: each
+    has the keys of the format.
     """
     description: dict[str, Any] = {
         "format": FORMAT,
@@ -199,10 +201,10 @@ def write_description(
 
 
 def _is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
-    """Returns whether the cameras of a capture were calibrated. They were if the capture does not
-    say otherwise.
+    """Returns whether the cameras of a capture were calibrated. This is assumed unless the capture
+    says otherwise.
 
-    In older captures a file that `humangs start` wrote beside capture.json may say this.
+    In older captures, the file `START_MARK` beside capture.json may say that they were not.
     """
     if "calibrated" in description:
         return description["calibrated"]
@@ -218,8 +220,8 @@ def _is_calibrated(folder: Path, description: dict[str, Any]) -> bool:
 def check_keys(
     mapping: Iterable[str], known: set[str], required: set[str], file: Path, prefix: str = ""
 ) -> None:
-    """Raise CaptureError for keys that are unknown or missing. Most unknown keys are misspelt
-    optional ones, which would otherwise have no effect.
+    """Raise CaptureError for keys that are unknown or missing. Most unknown keys are optional keys
+    with a spelling mistake. Without the error, they would have no effect.
     """
     for key in mapping:
         if key not in known:
@@ -247,7 +249,7 @@ def read_frames_and_matrices(
     """Returns the frame of each view of a description, and the matrices K and cam_from_world as
     they are in the file.
 
-    poses: the number of frames. A view may leave its frame out if there is one frame. Raises:
+    poses: the number of poses. If there is only one pose, a view may leave its frame out. Raises:
     CaptureError.
     """
     frames, matrices = [], []
@@ -278,10 +280,11 @@ def read_photos(
 ) -> Photos:
     """Read the photos and cameras that a checked capture.json describes.
 
-    Arguments: chosen: the views to read, in this order; None: all. poses: the number of frames;
-    None: one more than the last frame that a view names. fit_masks: whether masks that are too
+    Arguments: chosen: the views to read, in this order; None: all. poses: the number of poses;
+    None: one more than the largest frame number of the views. fit_masks: whether masks that are too
     large or too small are moved to the edges in the photos (`data.masks`), with a line in the log.
-    Only masks in separate files, of photos that show a background, are moved. Raises: CaptureError.
+    A mask is moved only if it is a separate file and its photo shows a background.
+    Raises: CaptureError.
     """
     file, views = folder / "capture.json", description["views"]
     # without the number of poses, the views say it; a huge frame number is refused
@@ -335,8 +338,8 @@ def read_photos(
 
 
 def unknown_in_capture(folder: Path) -> Bool[np.ndarray, "v h w"] | None:
-    """Read where something in front may hide the person in each photo of a capture folder, which
-    may have no masks yet; None: nowhere.
+    """Returns the pixels of each photo of a capture folder where something in front may hide the
+    person, (v, h, w); None if there are none. The folder may have no masks yet.
 
     Raises: CaptureError.
     """
@@ -348,8 +351,9 @@ def unknown_in_capture(folder: Path) -> Bool[np.ndarray, "v h w"] | None:
 def _read_unknown(
     folder: Path, views: Sequence[dict[str, Any]], size: tuple[int, int]
 ) -> Bool[np.ndarray, "v h w"] | None:
-    """Read where something in front may hide the person in each photo. Returns None if no view
-    names such an image, or if no pixel in these images reaches `LEAST_UNKNOWN`.
+    """Returns the pixels of each photo where something in front may hide the person, (v, h, w).
+    Returns None if no view names an image of unknown pixels, or if no pixel of these images reaches
+    `LEAST_UNKNOWN`. size: height and width of the photos.
     """
     unknown = np.zeros((len(views), *size), bool)
     for i, view in enumerate(views):
@@ -367,8 +371,8 @@ def _check_orientations(
     height: int,
     warns: bool,
 ) -> None:
-    """Check photos with an EXIF orientation, since photos are read as they are stored. If `warns`,
-    a warning names such photos.
+    """Check photos with an EXIF orientation, because photos are read as they are stored. If `warns`
+    is True, a warning names the first of them.
 
     Raises: CaptureError if K belongs to the turned photo, see `OFF_CENTER`.
     """
@@ -397,8 +401,8 @@ def _check_orientations(
 
 
 def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) -> None:
-    """Raise CaptureError if a description names one photo in too many views. With `together`, also
-    if it has too many photos, or too many pixels in all. No pixels are read.
+    """Raise CaptureError if a description has too many views for the number of its photos. With
+    `together`, also if it has too many views, or too many pixels in all. No pixels are read.
 
     together: whether all photos will be in memory at one time. Their size is taken from the first
     photo, since all must have one size.
@@ -414,8 +418,8 @@ def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) 
 
 
 def check_repeats(file: Path, photos: Sequence[Path]) -> None:
-    """Raise CaptureError if views of a file name the same photo too often. Links to a photo count
-    as that photo.
+    """Raise CaptureError if there are too many views for the number of different photos (the limit
+    `views_per_photo`). Links to a photo count as that photo. photos: the photo of each view.
     """
     found = set()
     for photo in photos:
@@ -432,8 +436,9 @@ def check_repeats(file: Path, photos: Sequence[Path]) -> None:
 def _read_images(
     folder: Path, views: Sequence[dict[str, Any]], on_white: bool, fit_masks: bool
 ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
-    """Read the images of all views, on white where there are masks, and the masks. All must have
-    one size. The second result is None if there are no masks, or only opaque alpha channels.
+    """Read the images and the masks of all views. All must have one size. If there are masks, the
+    images are put on white. The second result is None if there are no masks, or only opaque alpha
+    channels.
 
     on_white: whether images that have a mask file are on white already. fit_masks: see
     `read_photos`. Raises: CaptureError.
@@ -508,10 +513,11 @@ def read_view(
 
 
 def read_mask(file: Path, owner: str, width: int, height: int) -> Float[np.ndarray, "h w"]:
-    """Read a mask, see `io.images.read_grey`. owner: what errors call the image of this width and
-    height.
+    """Read a mask, see `io.images.read_grey`. It must have this width and height. owner: what
+    errors call the image that has this size.
 
-    Raises: CaptureError, also for another size, and for labels in place of coverage from 0 to 255.
+    Raises: CaptureError, also for a mask of another size, and for a mask that holds labels in place
+    of coverage from 0 to 255.
     """
     mask = read_checked(read_grey, file)
     if mask.shape != (height, width):
@@ -549,8 +555,8 @@ def on_white_background(
 def cut_out(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Returns the person of a photo over white, with the background's share of the colors removed
-    along the rim (`clean_rims`).
+    """Returns the photo over white. Along the rim of the person, the background's share is removed
+    from the colors first (`clean_rims`).
     """
     return on_white_background(clean_rims(image, mask), mask)
 
@@ -559,7 +565,8 @@ def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:
     """Returns a unique name for each path, made of letters, digits, '.', '_' and '-'.
 
     A name is the file name without suffix. If two names are equal, all names get their folders in
-    front. If two are still equal, all names get the numbers of their paths in front.
+    front. If two are still equal, all names also get their position in `paths` in front (000, 001
+    and so on).
     """
 
     def plain(name, i):

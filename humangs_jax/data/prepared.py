@@ -54,7 +54,8 @@ class PreparedCapture:
     body: BodyModel | None = None
     """The body that carries the Gaussians, with a skirt where the photos show one.
 
-    None if the capture was prepared without a network. That is enough for `refine`.
+    None if the capture was prepared without a network, and after `select` and `resized`. `refine`
+    needs no body.
     """
     displacement: Float[np.ndarray, "n 3"] | None = None
     """The displacements of the vertices of the shaped `body` in the T-pose, (n, 3), metres. None:
@@ -84,15 +85,15 @@ class PreparedCapture:
         return self.up != "y"
 
     def select(self, views: Sequence[int] | Int[np.ndarray, " any"]) -> "PreparedCapture":
-        """Returns the capture with some of the views to use, in this order. The body is left out,
-        because it depends on the views.
+        """Returns a prepared capture that uses only these views of `capture`, in this order. The
+        body is left out, because it depends on the views.
         """
         chosen = self.capture.select(views)
         return PreparedCapture(self.given, chosen, self.left_out, self.up, chosen=True)
 
     def resized(self, longest: int) -> "PreparedCapture":
-        """Returns the capture with photos whose longest side has `longest` pixels. The body is left
-        out, because it depends on the photos.
+        """Returns a prepared capture whose photos have `longest` pixels along their longest side.
+        The body is left out, because it depends on the photos.
         """
         smaller = self.capture.resized(longest)
         return PreparedCapture(self.given, smaller, self.left_out, self.up, self.chosen)
@@ -132,19 +133,19 @@ def prepare_capture(
     *,
     views: int | str | None = None,
 ) -> PreparedCapture:
-    """Decide which photos are used and how, once for `reconstruct`, `refine` and `check_capture`.
+    """Decide which photos are used, and how. `reconstruct`, `refine` and `check_capture` can then
+    share the result.
 
-    What is prepared is not prepared again. A `PreparedCapture` loses views if `views` asks for
-    fewer, and gets the body for `config` if it was prepared for another network or for none.
-    Otherwise it is returned as it is.
+    A `PreparedCapture` is not prepared again. If `views` asks for fewer views, it loses some. If it
+    has no body for the network of `config`, it gets one. Otherwise it is returned as it is.
 
     Args:
         capture: photos, cameras, poses, and masks if there are some.
         config: the configuration of the network that will read the photos. None: the body is not
             prepared.
         views: the largest number of photos that are used. The photos that together show the body
-            best are chosen. "auto": photos are chosen as long as each adds to what the others show.
-            None: all.
+            best are chosen. "auto": photos are chosen until a further one would add little
+            (`view_choice.LEAST_GAIN`). None: all.
 
     Returns:
         The prepared capture.

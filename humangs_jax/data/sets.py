@@ -1,10 +1,10 @@
-"""A set of many items that is made bit by bit. It is one folder, with a manifest that says what the
-set is made with, and with a folder for each finished item.
+"""A set of many items that is made bit by bit. It is one folder. A manifest in it says what the set
+is made with. Each finished item has a folder or a file in it.
 
 The same call continues an interrupted set: finished items are kept, and other settings are refused.
-Several processes may make parts of one set at the same time. Each ends by writing the manifest of
-what is there. A name alone does not tell what an item was made from. So code that keeps finished
-items compares contents, too (`avatar.recorded_source`, `files_key`).
+Several processes may make parts of one set at the same time. A name alone does not tell what an
+item was made from. So code that keeps finished items compares contents, too
+(`avatar.recorded_source`, `files_key`).
 """
 
 import functools
@@ -49,7 +49,8 @@ LOOK = 1 << 16
 def read_manifest(folder: Path, kind: SetFormat) -> dict[str, Any]:
     """Read the manifest of a set.
 
-    Raises: CaptureError if there is none of this kind.
+    Raises: CaptureError if there is no manifest of this kind and version, or if its settings are
+    missing.
     """
     file = Path(folder) / MANIFEST
     content = checked_json(file)
@@ -72,8 +73,9 @@ def begin_set(
     """Start a set in a folder, or check that the set in it can be continued.
 
     Arguments: made_with: what the whole set is made with; its entry `SETTINGS` is a dictionary.
-    alone: whether a new set needs an empty folder. Raises: CaptureError for a set that was made
-    with something else; ValueError if `alone` and the folder of a new set is not empty.
+    alone: whether a new set needs an empty folder.
+    Raises: CaptureError if the folder has a set of another kind, or one that was made with
+    something else. ValueError if `alone` is True and the folder of a new set is not empty.
     """
     if not (folder / MANIFEST).is_file():
         if (
@@ -106,10 +108,10 @@ def _flat(content: Mapping[str, Any], keys: Mapping[str, Any]) -> dict[str, Any]
 
 
 def files_key(root: Path, files: Iterable[Path]) -> str:
-    """Returns a checksum of the names of files below `root`, their sizes and their first `LOOK`
-    bytes. Some of the files may be missing.
+    """Returns a checksum of files: of their paths relative to `root`, their sizes and their first
+    `LOOK` bytes. Files that do not exist are left out.
 
-    It tells data sets apart without reading all of their photos.
+    The checksum tells data sets apart without reading all of their photos.
     """
     texts = []
     for file in sorted(files):
@@ -135,8 +137,8 @@ def write_manifest(
 
 
 def finished(folder: Path, mark: str) -> list[str]:
-    """Returns the names of the folders that hold the file `mark`. A folder with this file is
-    complete.
+    """Returns the sorted names of the subfolders that hold the file `mark`. A subfolder with this
+    file is complete.
     """
     return sorted(
         path.parent.name
@@ -151,14 +153,14 @@ def made(
     workers: int,
     load: Callable[[], object],
 ) -> Iterator[tuple[K, Exception | None]]:
-    """Run tasks in parallel. Yields (name, error) for each task as it ends. The error is None, or
-    the ValueError, ArithmeticError or LookupError that the task raised. Any other error, such as an
-    OSError of a full disk, ends all tasks and is raised.
+    """Run tasks, in parallel if there are several workers. Yields (name, error) for each task as it
+    ends. The error is None, or the ValueError, ArithmeticError or LookupError that the task raised.
+    Any other error, such as an OSError because the disk is full, ends all tasks and is raised.
 
-    Arguments: work: called as work(what `load` has returned, *arguments of the task). tasks: the
-    arguments by name. workers: the number of processes, which use the CPU; `load` is called once in
-    each. With several processes all arguments are pickled, and the calling script has to be guarded
-    by `if __name__ == "__main__"`.
+    Arguments: work: called as work(loaded, *arguments), with what `load` has returned and the
+    arguments of the task. tasks: the arguments by name. workers: the number of processes. Several
+    processes use the CPU only. load: called once in each process. With several processes all
+    arguments are pickled, and the calling script has to be guarded by `if __name__ == "__main__"`.
     """
     once = functools.partial(_attempt, work)
     if workers > 1 and len(tasks) > 1:

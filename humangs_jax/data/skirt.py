@@ -9,9 +9,9 @@ smoothly between them. A row of the skirt follows the outer halves of both legs,
 between them. From there the vertices are displaced along their normals to the edges of the masks,
 as the body is (`data.vertex_offsets`).
 
-The photos show a skirt where points between the legs, but beside both of them, lie inside the
-masks. The skirt ends above the first row whose points do not. If no photo shows the legs apart,
-there is no skirt. All of this runs on the host, by numpy and scipy.
+Points between the legs that a photo shows beside both legs are compared with the masks. If they lie
+inside the masks, there is a skirt. It ends above the first row whose points do not. If no photo
+shows such points, there is no skirt. All of this runs on the host, by numpy and scipy.
 """
 
 import jax
@@ -47,7 +47,9 @@ body itself surrounds both legs.
 BOTTOM = 0.97
 """The lowest height where a skirt may end, in the measure of `TOP`."""
 ROWS = 28
-"""The number of rows of a skirt. It is the same for all, so that all skirts share one program."""
+"""The number of rows of a skirt. All skirts have this number, so that they share one compiled
+program.
+"""
 GAP = 11
 """Number of vertices of a row in each of the two gaps between the legs, in front and behind."""
 HALF = 13
@@ -56,7 +58,7 @@ SKIRT_VERTICES = ROWS * 2 * (GAP + HALF)
 """Number of vertices of a skirt. They are the last ones of a body that has a skirt."""
 BESIDE = 0.02
 """A point between the legs counts if it is farther than this from the skin of both legs in the
-photo, metres. Trousers may reach this far from the skin.
+photo, metres. Trousers may stand off from the skin by this much.
 """
 SHOWN = 0.8
 """A row is part of a skirt if at least this share of its counted points is inside the masks."""
@@ -67,11 +69,13 @@ LEAST_ROWS = 4
 the skin of both legs. Wide trousers have fewer, and would look worse with a skirt.
 """
 CLEAR = 0.06
-"""Least distance from the skin of both legs at which a point is certainly cloth of a skirt, metres,
-see `LEAST_ROWS`.
+"""A point that is farther than this from the skin of both legs is certainly cloth of a skirt,
+metres, see `LEAST_ROWS`.
 """
 LONG_CLEAR = 0.1
-"""Least distance in place of `CLEAR` if no photo shows the legs apart below the hem, metres."""
+"""Distance that is used in place of `CLEAR` if the photos show no end of the cloth above `BOTTOM`,
+metres.
+"""
 REACH = OffsetFitConfig(outwards=0.22, smoothness=0.06, inset=(0.0, 0.03), iterations=3)
 HELD = 1e4
 """Weight that keeps the body's vertices where they are in the fit of the skirt."""
@@ -84,7 +88,7 @@ def add_skirt(
     photos show no skirt, or if the body has a map of its surface.
 
     Arguments: body: one of `data.views.gaussian_body`; its vertices come first in the result.
-    capture: has masks. displacement: of the vertices of `body`, metres.
+    capture: has masks. displacement: that of the vertices of `body`, (n, 3), metres.
     """
     # a map of the surface has no place for it
     if body.texels is not None:
@@ -172,7 +176,7 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
     """Returns the body with a tube around its legs, from `TOP` down to `hem`, in the measure of
     `TOP`. The tube's vertices come after those of the body.
 
-    Raises: ValueError if the body has no legs that hang in the T-pose.
+    Raises: ValueError if the body has no legs that hang in the T-pose, or as `_farthest`.
     """
     # each vertex of the tube combines vertices of the body, and so does all that belongs to it
     combined = _tube(body, np.linspace(TOP, hem, ROWS))

@@ -13,7 +13,7 @@ BINARIES = {
     b"MATLAB 5": "a file of MATLAB",
     b"\x80": "a pickle",
 }
-"""Beginnings of files that somebody may take for a calibration, and the kinds of these files."""
+"""First bytes of files that somebody may take for a calibration -> the kind of the file."""
 HEAD = 4096
 """The number of bytes at the beginning of a file that are read."""
 INTRINSICS = (
@@ -24,7 +24,7 @@ INTRINSICS = (
     "Camera_Matrix",
     "intrinsic_matrix",
 )
-"""Keys by which programs write the lens of one camera alone."""
+"""Keys under which programs write the lens of a single camera."""
 CONVERTED = {
     ("<document", "<chunk"): "cameras of Metashape (File > Export > Export Cameras > Colmap)",
     ("#name,x,y,alt",): "cameras of RealityScan (export the registration as COLMAP)",
@@ -39,7 +39,7 @@ a format that is read.
 POSE = re.compile(r"extrinsics?|rotation|translation|[rt]vecs?|[RT]", re.IGNORECASE)
 """Matches the keys of the place and the rotation of a camera."""
 PARTS = ("rows", "cols", "dt", "data")
-"""Keys inside of a matrix of OpenCV, which tell nothing about a file."""
+"""Keys inside of OpenCV's matrices. They do not tell what kind of file it is."""
 KEY = re.compile(r"""^[ \t]*["']?([A-Za-z_][\w .-]*?)["']?[ \t]*[:=]""", re.MULTILINE)
 """A key of JSON, YAML or TOML at the beginning of a line."""
 KEYS_SHOWN = 6

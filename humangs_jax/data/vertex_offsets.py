@@ -7,10 +7,10 @@ gives all vertices moves t along their normals. It minimizes this sum over the s
 
     sum over photos of (t - target)^2 + (WEAKNESS + held) t^2 + smoothness^4 (Laplacian t)^2
 
-So a section between two photos becomes round. `held` keeps hands and head where they are. Vertices
-that are still outside a mask then move inwards. Clothes become part of the body (as in "SMPL+D",
-https://arxiv.org/abs/1803.04758). All of this runs on the host, by numpy and scipy: nothing is
-compiled.
+So the surface between the places that two photos show becomes round. `held` keeps hands and head
+where they are. At the end, vertices that are still outside a mask move inwards. Clothes become part
+of the body (as in "SMPL+D", https://arxiv.org/abs/1803.04758). All of this runs on the host, by
+numpy and scipy: nothing is compiled.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from humangs_jax.io.images import resized
 STEP = 0.0025
 """Distance between the points along a normal at which a mask's edge is looked for, metres."""
 WEAKNESS = 0.002
-"""Weight that keeps a vertex where it is. Each photo that shows the vertex on the silhouette has
+"""Weight that keeps a vertex where it is. A photo that shows the vertex on the silhouette has
 weight 1.
 """
 HELD = 20.0
@@ -56,7 +56,7 @@ DRAWN = 0.5
 """Silhouettes are drawn larger than they are by this much, pixels."""
 WRAP = 0.07
 """Largest move of the last step, metres. In the last step, vertices outside a mask move inwards
-until they are inside all masks by the least inset.
+until they are inside all masks by at least the first number of the inset.
 """
 WRAP_ROUNDS = 6
 """How many times the moves of the last step (see `WRAP`) are averaged over neighbouring
@@ -162,15 +162,16 @@ def fit_vertex_offsets(
     always: bool = True,
 ) -> Float[np.ndarray, "n 3"]:
     """Returns displacements of the vertices of a person's shaped body in the T-pose, (n, 3),
-    metres. They make the body fill the masks. Their lengths are bounded.
+    metres. They make the body fill the masks. Each step of the fit limits them (`OffsetFitConfig`,
+    `WRAP`).
 
-    Displacements are 0 if the masks say nothing, or if the masks are not near the body.
+    Displacements are 0 if all masks are empty, or if the masks are not near the body.
 
     Arguments: body: the capture's body, or one of `data.views.gaussian_body`. capture: has masks;
-    frames and worlds may be any. inset: the least and the most that the surface may lie inside the
-    masks, metres. always: whether a body that fits the masks already is displaced, too, see
-    `MISFIT`. If not, its displacements are 0, because they would gain less than the network's own
-    clothes lose.
+    its views may show any frames, and any axis may be up. inset: the least and the most that the
+    surface may lie inside the masks, metres. always: whether a body that fits the masks already is
+    displaced, too, see `MISFIT`. If not, its displacements are 0: displacing such a body would make
+    the clothes that the network adds worse.
     """
     assert capture.masks is not None
     rest = shaped(body, capture.betas)
@@ -280,7 +281,8 @@ def _share_outside(
     views: list[MaskedView], rest: Float[np.ndarray, "n 3"], free: Bool[np.ndarray, " n"]
 ) -> float:
     """Returns the share of the free vertices that are more than `OUTSIDE` outside of a mask. If the
-    share of the vertices outside by any distance is less than `MISFIT`, this share is returned.
+    share of the free vertices that are outside by any distance is less than `MISFIT`, this larger
+    share is returned, because it is faster to compute.
     """
     if not free.any():
         return 0.0
@@ -330,9 +332,9 @@ def _targets(
 def _crossing(
     depths: Float[np.ndarray, "e r"], reach: Float[np.ndarray, " r"]
 ) -> tuple[Float[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
-    """Returns how far along each normal the edge of a silhouette is, metres, and whether it was
-    found. It is the edge nearest to the start: outwards from a start inside, inwards from a start
-    outside.
+    """Returns how far along each normal the edge of a silhouette is, metres, and whether an edge
+    was found. If the start is inside of the silhouette, the edge is looked for outwards, otherwise
+    inwards. The nearest edge counts.
 
     depths: signed distances to the edge at the places `reach` along each normal, positive inside;
     NaN where the photo shows nothing. reach: metres.
@@ -429,9 +431,9 @@ def _outside(
     inset: tuple[float, float],
     free: Bool[np.ndarray, " n"],
 ) -> PerVertex:
-    """Returns how far each vertex moves inwards so that all masks contain it, metres. Only free
-    vertices outside of a mask move, and vertices near them, because the moves are smoothed over the
-    mesh. The largest move is `WRAP`.
+    """Returns how far each vertex moves inwards, metres, so that vertices outside of a mask get
+    into all masks. The moves of these vertices are smoothed over the mesh, so vertices near them
+    move, too. Vertices that are not free get no move of their own. The largest move is `WRAP`.
     """
     reach = np.arange(0, WRAP + STEP / 2, STEP)
     inside = np.full((len(rest), len(reach)), np.inf)

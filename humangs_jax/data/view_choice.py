@@ -15,19 +15,22 @@ from humangs_jax.network.parts import subject_unit
 from humangs_jax.network.reader import project_vertices, visible_vertices
 
 SELECTION_SIZE = 128
-"""Side of the depth maps, pixels. It is enough to know which side of the body a photo shows."""
+"""Side of the images and depth maps by which photos are compared, pixels. This size suffices to
+tell which side of the body a photo shows.
+"""
 SELECTION_VERTICES = 2000
 """The number of vertices of the body on which photos are compared."""
 LEAST_GAIN = 0.03
-"""Least gain of a further photo, as a share of what the chosen photos show.
+"""Least gain of a further photo, as a share of the sum that the chosen photos reach (see
+`best_views`).
 
-It counts only if no number of photos is given.
+It is used only if no number of photos is given.
 """
 
 
 def best_views(capture: Capture, count: int | None) -> list[int]:
     """Returns the indices of the `count` photos that together show the body best, in ascending
-    order. If there are no more than `count`, all are returned.
+    order. If there are at most `count` photos, all are returned.
 
     The choice is greedy: each further photo is the one that adds most to a sum over the vertices.
     The term of a vertex is its area times the best `view_quality` among the chosen photos. The sum
@@ -37,7 +40,8 @@ def best_views(capture: Capture, count: int | None) -> list[int]:
 
     Arguments:
         capture: photos that all show the person.
-        count: None: no further photo is chosen once the best one adds less than `LEAST_GAIN`.
+        count: the number of photos. None: photos are chosen until the best further photo adds less
+            than `LEAST_GAIN`.
 
     Raises: ValueError for a count below 1.
     """
@@ -75,9 +79,10 @@ def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0
 def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
     """Returns how well every view shows every vertex, in [0, 1].
 
-    This is the cosine between normal and line of sight times the pixels per metre, divided by the
-    largest such product of all views and vertices. It is 0 where the vertex is hidden or outside of
-    the mask.
+    The quality is a product, divided by its largest value over all views and vertices. The product
+    is the cosine of the angle between the normal and the direction to the camera, times the focal
+    length over the depth. It is 0 if the vertex is hidden, outside of the photo or outside of the
+    mask.
     """
     config = presets.small().with_conventions(pixels="person")
     inputs = prepare_inputs(body, views, config)

@@ -1,5 +1,5 @@
-"""The photos of one subject with the body parameters of each, and the network's inputs that are
-computed from them.
+"""The photos of one subject with the body parameters of each photo. Also computes the network's
+inputs from these.
 """
 
 import dataclasses
@@ -65,7 +65,7 @@ class SubjectViews:
     """
     depths: Float[Array, "v h w"] | None = None
     """The mean depth (z in the camera's axes) of the person in each pixel, (v, h, w), metres. It
-    counts only where the mask is not 0. 0: unknown. None: unknown everywhere.
+    counts only where the mask is not 0. A depth of 0 means unknown. None: unknown everywhere.
     """
     displacement: Float[Array, "n 3"] | None = None
     """The displacement of the vertices of the shaped body in the T-pose, (n, 3), metres
@@ -79,7 +79,8 @@ class SubjectViews:
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
     """Returns `count` views: the given ones, then copies of the last one as padding. So subjects
-    with different numbers of views can share a batch. `depths` and `unknown` are not padded.
+    with different numbers of views can share a batch. `depths` and `unknown` stay as they are,
+    without padding.
 
     Raises: ValueError if there are no views, or more than `count`.
     """
@@ -97,16 +98,17 @@ def pad_views(views: SubjectViews, count: int) -> SubjectViews:
 @checked_arguments
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     """Returns the body whose vertices carry the Gaussians. It has the mesh that the weights need:
-    decimated, then with long edges split. It has a map of its surface if the network works on one.
+    the body is decimated, then long edges are split. It has a map of its surface if the network
+    works on such a map.
 
     The result's `relative_vertex_spacing` is relative to the mesh that the weights were trained
     with. It is None, which stands for 1, unless `runtime.max_edge_length` asks for more vertices or
     `runtime.body_vertices` for fewer.
 
-    The last four results are kept, because making one takes as long as a small network does on a
+    The last four results are kept, because making one takes as long as running a small network on a
     CPU. A body that `has_mesh_of` accepts is returned as it is.
 
-    Raises: ValueError if `runtime` has both settings.
+    Raises: ValueError if `runtime` has both `max_edge_length` and `body_vertices`.
     """
     asked = config.runtime
     if None not in (asked.body_vertices, asked.max_edge_length):
@@ -165,8 +167,9 @@ def _remeshed(
     longest: float | int | None,
     wanted: Any,
 ) -> tuple[BodyModel, sparse.csr_array]:
-    """Returns the body that carries the Gaussians, and a matrix (m, n) that takes a linear quantity
-    of the given body's n vertices to its m vertices.
+    """Returns the body that carries the Gaussians, and a matrix (m, n). The matrix takes values at
+    the n vertices of the given body, such as displacements, to the m vertices of the result.
+    Midpoints of edges get the mean of the ends.
     """
     body = key.body
     weights = sparse.eye_array(len(body.template), format="csr")
@@ -198,8 +201,9 @@ def _remeshed(
 def on_gaussian_body(
     displacement: Float[np.ndarray, "n 3"], body: BodyModel, config: HumanGSConfig
 ) -> Float[Array, "m 3"]:
-    """Returns a displacement of a body's vertices as a displacement of the vertices of its
-    `gaussian_body`, metres. Midpoints of edges move by the mean of the ends.
+    """Returns the displacement of the vertices of a body's `gaussian_body`, (m, 3), metres.
+    displacement: that of the body's own vertices, (n, 3), metres. Midpoints of edges move by the
+    mean of the ends.
     """
     if has_mesh_of(body, config):
         return from_host(displacement)
@@ -210,8 +214,8 @@ def on_gaussian_body(
 def subject_rest(
     body: BodyModel, betas: Float[Array, " s"], displacement: Float[Array, "n 3"] | None
 ) -> RestBody:
-    """Returns the person's body in the T-pose, with displaced vertices. The displacement (metres)
-    does not move the joints.
+    """Returns the person's body in the T-pose, with displaced vertices. Joints are not moved.
+    displacement: (n, 3), metres; None: there is none.
     """
     rest = shape_body(body, betas)
     if displacement is None:
@@ -310,8 +314,8 @@ def cropped(capture: Capture, size: int) -> Capture:
     resized to `size` pixels. Returns the capture as it is if there are no masks, if a mask is
     empty, or if no square would be smaller than the photos' longer side.
 
-    Pixels beyond a photo's edges become unknown if the person touches the edge of any photo, or if
-    the capture has unknown pixels.
+    Pixels of a square beyond its photo become unknown if the person touches the edge of any photo,
+    or if the capture has unknown pixels.
     """
     boxes = _crop_boxes(capture.masks)
     if boxes is None or capture.masks is None:
@@ -339,8 +343,8 @@ def _squares(
     boxes: Sequence[tuple[int, int, int]],
     size: int,
 ) -> tuple[Float[np.ndarray, "v size size 3"], Float[np.ndarray, "v size size"] | None, Camera]:
-    """Returns photos, masks and cameras, each cut to the square (left, top, side) of its box and
-    resized to `size` pixels. Photos are white beyond their edges.
+    """Returns photos, masks and cameras, each cut to its square (left, top, side) in `boxes` and
+    resized to `size` pixels. Beyond the photo a square is white, and 0 in the mask.
     """
 
     def cut(array, fill):
@@ -377,12 +381,12 @@ def _window(
 
 
 def world_up(roots: Float[np.ndarray, "v 3"], cameras: Camera) -> str:
-    """Returns the axis that points up in the world of some views, such as "x" or "-z"; "y" where
-    the axis is not certain.
+    """Returns the axis that points up in the world of some views, such as "x" or "-z"; "y" if the
+    axis is not certain.
 
-    Captures should have y up. The network has seen no world with another axis up, and an avatar's
-    light comes from a world with y up. Another axis counts as up only if both the person and the
-    cameras stand along it, because a person alone may lie.
+    Captures should have y up: the network was trained in such worlds, and the light of an avatar
+    needs such a world. Another axis counts as up only if both the person and the cameras stand
+    along it, because the person may be lying down.
 
     roots: the rotation of the person's root joint in each view, axis-angle, radians.
     """
@@ -428,7 +432,8 @@ def to_network_views(
     square, or cropped, and resized to `size` pixels. The cameras are changed accordingly. Unknown
     pixels are not passed on.
 
-    Without masks, all masks are 0, and only what the posed body covers will count as foreground.
+    If the capture has no masks, all masks in the result are 0. Only what the posed body covers then
+    counts as foreground.
 
     crop: whether photos are cut to squares around the person. This is not done where `_crop_boxes`
     returns None. displacement: the displacement of the body that carries the Gaussians, see

@@ -86,7 +86,7 @@ from humangs_jax.io.reading import (
 PARAMETERS = "smpl_params.npz"
 """File with the poses of a subject."""
 MISSING = "missing_img_files.txt"
-"""File that lists images that are missing."""
+"""File in which the authors list images that are missing."""
 ON_PERSON = 128.5 / 255
 """A pixel is on the person if its mask value, in [0, 1], is above this. As bytes, these are the
 values above 128.
@@ -231,8 +231,9 @@ def _video_subject(
 
     photos, masks: for each camera a mapping from frame to whatever `read` takes. read: called with
     a photo and its mask; returns the image on white and the mask as 0 and 1. listed: the (camera,
-    frame) pairs that the authors list as missing. digits: the digits of the frame in the name of a
-    view. Raises: CaptureError if there is no photo.
+    frame) pairs that the authors list as missing. digits: the number of digits of the frame in the
+    name of a view.
+    Raises: CaptureError if no photo is left.
     """
     count = len(parameters.translations)
     missing = {"listed as missing": 0, "no photo": 0, "no mask": 0, "no pose": 0}
@@ -294,7 +295,8 @@ def _folder_subject(
 def on_white(
     photo: Path, mask: Path
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """Returns a photo, white where its mask is at most 128, and the mask as 0 and 1.
+    """Returns a photo and its mask as 0 and 1. The mask is 1 where its file has more than 128.
+    Elsewhere the photo becomes white.
 
     Raises: CaptureError naming the file.
     """
@@ -384,9 +386,9 @@ find_avatarrex, open_avatarrex = (
 # --------------------------------------------------------------------------------------------------
 
 CALIBRATION = "calibration.csv"
-"""File with the cameras of one size of images."""
+"""File with the cameras, in the folder of each size of the images."""
 SCALES = ("4x", "2x", "1x")
-"""The folders of images of one size, smallest images first."""
+"""The names of folders, one for each size of the images, smallest images first."""
 COLUMNS = ["w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"]
 
 

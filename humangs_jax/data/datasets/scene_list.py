@@ -11,9 +11,9 @@ the body of each frame as arrays.
 Paths are relative to the list. Images are square, on white. The arrays are in the units of the
 scene. Except for pose correctives, `v_posed` is `v_cano` moved by `joint_transforms`.
 
-The reader recovers unit, shape and pose from the arrays, so that lists of other programs need
-nothing more, and converts cameras to metres. We also write `mask_path`. Where it is missing, the
-person is what is not white.
+The reader recovers unit, shape and pose from the arrays, and converts cameras to metres. So lists
+of other programs need nothing more. We also write `mask_path`. If it is missing, the alpha channel
+is the mask; without one, all pixels that are not white show the person.
 """
 
 import functools
@@ -51,8 +51,9 @@ from humangs_jax.io.reading import shown
 
 LISTS = ("train.json", "test.json")
 WHITE = 250 / 255
-"""Where there is no mask, a pixel belongs to the person if one of its channels is below this. White
-pixels may be a little below 1, since 8-bit JPEG images ripple by a few levels.
+"""If there is neither a mask nor an alpha channel, a pixel belongs to the person if one of its
+channels is below this. White pixels may be a little below 1, since JPEG compression changes them by
+a few of 255 levels.
 """
 KEPT_FRAMES = 64
 """Number of poses of a scene that are kept in memory."""
@@ -72,7 +73,7 @@ class SceneFrame(NamedTuple):
     arrays: str
     """The path of the arrays of the body that the view shows."""
     mask: str | None = None
-    """The path of the mask."""
+    """The path of the mask; None: the list names none."""
 
 
 def find_scene_list(path: str | Path) -> tuple[Path, ...]:
@@ -121,7 +122,7 @@ def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
 def open_scene_list(
     path: str | Path, body: FileBody, size: int | None = None
 ) -> tuple[Person, ...]:
-    """Returns the people of a list. Each is opened when it is first asked for.
+    """Returns the people of a list. Each person is opened at the first use.
 
     size: the side of the stored squares, pixels. None: the longer side of the first image that
     exists among the first images of the scenes, or `STORED_SIZE` if none of these exists.

@@ -1,9 +1,9 @@
-"""One person of a data set, and the body model of the data set with its file and parameters.
+"""One person of a data set, and the body model that the person's parameters belong to.
 
 A view is one photo: a camera at one frame. Opening a subject lists folders and reads calibration
-and body parameters, so that a sequence of 5,000 frames opens in well under a second. Photos come on
-white, padded to a centred square and resized. Values of files are checked one by one
-(`open_arrays`, `checked_numbers`): a fault is a `CaptureError` that names file and key.
+and body parameters, so that a sequence of 5,000 frames opens in well under a second. Photos are put
+on white, padded to a centred square and resized. Values of files are checked one by one
+(`open_arrays`, `checked_numbers`). A fault is a `CaptureError` that names file and key.
 """
 
 import concurrent.futures
@@ -169,7 +169,7 @@ def coefficients(
     """Returns coefficients for all directions of the body: shape, then expression. Coefficients
     that the file does not have are 0.
 
-    Raises: CaptureError for more numbers than the body has directions, unless they are 0, and for a
+    Raises: CaptureError if a coefficient is not 0 and the body has no such direction, and for a
     body with other directions than SMPL-X.
     """
     if not any(name.startswith("shape_") for name in body.shape_names):
@@ -267,8 +267,8 @@ def recover_pose(
     file: object,
 ) -> tuple[Float[np.ndarray, "j 3"], Float[np.ndarray, "3"]]:
     """Returns the rotations (axis-angle, radians) and the translation (metres) of a person.
-    transforms: the `joint_transforms` of a file, which take the T-pose to the pose, both scaled by
-    `scale`.
+    transforms: the `joint_transforms` of a file, (j, 4, 4). They take the T-pose to the pose. Their
+    lengths are in units of the scene. scale: units of the scene per metre.
 
     Raises: CaptureError if the linear part of a transform is no rotation.
     """
@@ -307,7 +307,9 @@ class Subject:
     name: str
     """The name in errors and manifests."""
     K: Float[np.ndarray, "v 3 3"]
-    """The camera matrix of each photo as it is, (v, 3, 3), pixels, with pixel centres at +0.5."""
+    """The camera matrix of each photo before it is padded and resized, (v, 3, 3), pixels, with
+    pixel centres at +0.5.
+    """
     cam_from_world: Float[np.ndarray, "v 4 4"]
     """From the world to the camera, (v, 4, 4), metres, OpenCV axes."""
     sizes: Int[np.ndarray, "v 2"]
@@ -319,9 +321,11 @@ class Subject:
     view_name: Callable[[int], str]
     """Returns the name of a view, such as "cam03_00000120"."""
     read: Callable[[int], tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]]
-    """Reads a view: returns the image on white (h, w, 3) and the mask (h, w), both in [0, 1]."""
+    """Takes the index of a view; returns the image on white, (h, w, 3), and the mask, (h, w), both
+    in [0, 1].
+    """
     parameters: Callable[[Sequence[int]], BodyParameters]
-    """Returns the shape, and the poses of the frames in its argument."""
+    """Takes the numbers of frames; returns the shape, and the poses of these frames."""
     missing: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """The number of photos that are left out, by the reason."""
 
@@ -366,8 +370,8 @@ class Subject:
     def tried(
         self, views: Sequence[int] | Int[np.ndarray, " any"], size: int
     ) -> list[Photo | Exception]:
-        """Read several views in parallel, see `photo`. A view that cannot be read gives its error
-        in place of a photo.
+        """Read several views in parallel, see `photo`. If a view cannot be read, the list has the
+        error in place of the photo.
         """
 
         def photo(view: int) -> Photo | Exception:
@@ -429,9 +433,7 @@ class Subject:
 
 @dataclasses.dataclass(eq=False)
 class Person:
-    """A subject that is opened when it is first asked for. It is a
-    `loading.captures.StoredPerson`.
-    """
+    """A subject that is opened at its first use. It is a `loading.captures.StoredPerson`."""
 
     name: str
     """The name of the subject."""
@@ -478,7 +480,7 @@ class Person:
 
 def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tuple[Person, ...]:
     """Returns the people of a data set that has photos, in any layout of `data.formats.DATASETS`.
-    Each person is opened when it is first asked for.
+    Each person is opened at the first use.
 
     Arguments: size: the side of the stored squares, pixels. None: for a scene list see
     `open_scene_list`, else `STORED_SIZE`.

@@ -12,8 +12,8 @@ Three kinds of fits exist; the keys and the length of the hand poses tell which 
     C      scale, transl       45 axis-angle                      neutral   (V + transl) scale
 
 In all of them hand poses are relative to the mean hand (flat_hand_mean False). mesh_smplx.obj is
-the fitted body as the authors posed it: the error of our body against it says whether fit, kind and
-model file belong together.
+the fitted body as the authors posed it. The distance of our body from this mesh shows whether fit,
+kind and model file belong together.
 """
 
 import dataclasses
@@ -50,8 +50,8 @@ FIT_MESH = "mesh_smplx.obj"
 """File of the mesh of the fitted body."""
 TOLERANCE = 2e-3
 """The largest mean distance of a fit's vertices from mesh_smplx.obj, metres of the body. Rounding
-of OBJ files is far below. Another gender moves vertices by centimetres, and a wrong hand convention
-moves the fingers by as much.
+in OBJ files causes far less. The model of another gender moves vertices by centimetres, and a wrong
+hand convention moves the fingers by centimetres.
 """
 
 
@@ -62,7 +62,7 @@ class Fit:
     file: Path
     """The file of the fit."""
     kind: Kind
-    """Which of the three kinds of fits it is, see the module."""
+    """Which of the three kinds of fits it is, see the docstring of the module."""
     parameters: BodyParameters
     """The parameters of the one pose."""
     scale: float
@@ -199,8 +199,8 @@ def fit_error(fitted: PosedPerson, mesh: Float[np.ndarray, "n 3"], fit: Fit) -> 
     """Returns the mean and the largest distance between the vertices of the fitted body and
     mesh_smplx.obj, metres of the body.
 
-    Raises: CaptureError, saying the error, if the mean is above `TOLERANCE` or the numbers of
-    vertices differ.
+    Raises: CaptureError if the numbers of vertices differ, or if the mean is above `TOLERANCE`; it
+    then names both distances.
     """
     file = fit.file.with_name(FIT_MESH)
     if len(mesh) != len(fitted.vertices):

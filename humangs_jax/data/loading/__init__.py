@@ -4,9 +4,9 @@ that resumes sees the same batches.
 A `Source` gives examples by number. `CaptureSource` has people on disk (capture folders, written
 synthetic sets, data sets), `GeneratedSource` people who are made on the fly from keys, and
 `Mixture` several sources by weight. `Loader` makes batches of the examples of one source. Each
-process makes the rows of its devices, some batches ahead of the loop. Several threads make examples
-in order, and one thread prepares the batches that are asked for next. Threads suffice, because
-decoding and jitted functions release the interpreter's lock.
+process makes the rows of its devices, some batches ahead of the loop. Several threads make the
+examples. One thread stacks them and puts the batches on the devices, in their order. Threads
+suffice, because decoding and jitted functions release the interpreter's lock.
 """
 
 import collections
@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 AHEAD = 2
-"""The number of batches that are prepared while one is worked on."""
+"""The number of further batches that are prepared while the loop works on one batch."""
 
 
 @dataclasses.dataclass
@@ -46,7 +46,7 @@ class Waiting:
     seconds: float = 0.0
     """The total, seconds."""
     first_seconds: float = 0.0
-    """The part of the total for the first item, seconds."""
+    """How long the loop waited for the first item, seconds. The total includes this time."""
     items: int = 0
     """How many items the loop waited for."""
 
@@ -118,8 +118,8 @@ class Loader:
         """Returns the batch of a step on the devices: an `Example` with a leading batch axis on
         every leaf.
 
-        With a sharding, the leaves are global arrays; without one, they hold the rows of this
-        process.
+        With a sharding, the leaves are global arrays. Without one, they are on the default device
+        and hold all rows.
         """
         return self._place([self.example_at(step, row) for row in self.rows])
 
@@ -129,9 +129,9 @@ class Loader:
         """Yields (step, batch) for start <= step < stop. Meanwhile threads make `AHEAD` further
         batches and put them on the devices.
 
-        Errors of the threads are raised here, in their turn. Closing the generator (or leaving the
-        loop over it) ends the threads. waiting: the time for which the loop waited for batches is
-        added to it.
+        An error in a thread is raised here when its batch is due. Closing the generator (or leaving
+        the loop over it) ends the threads. waiting: the time for which the loop waited for batches
+        is added to it.
         """
         rows, begun = self.rows, collections.deque[list[Future]]()
         # one thread places batches on the devices, so that they get there in order

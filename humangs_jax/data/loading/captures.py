@@ -57,16 +57,18 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
 def read_summary(
     path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY
 ) -> StoredSubject:
-    """Returns all of a capture but its pixels, with its parameters for `body`. The arrays of images
-    and masks have the right height and width, but 0 views.
+    """Returns everything of a capture but its pixels. The arrays of images and masks have the right
+    height and width, but 0 views.
 
-    Images are opened and their sizes compared. PNG files are checked by their checksums, others by
-    decoding them.
+    Images and masks are opened, and their sizes are compared. PNG files are checked by their
+    checksums, other files by decoding them.
 
-    Arguments: body_file: the file that `body` comes from, see `Capture`.
+    Arguments: body: the body that the capture must have. body_file: the file that `body` comes
+    from, see `Capture`.
 
-    Raises: ValueError naming file and field. A capture without masks is refused, because training
-    needs them. A capture with another body is refused, too.
+    Raises: CaptureError naming file and field. A view with neither a mask nor an alpha channel is
+    refused, because training needs to know where the person is. A capture with another body is
+    refused, too.
     """
     folder = Path(path)
     file = folder / "capture.json"
@@ -131,9 +133,9 @@ class StoredPerson(Protocol):
         ...
 
     def summary(self) -> StoredSubject:
-        """Returns all of the person but pixels, perhaps without poses.
+        """Returns everything of the person but the pixels. Poses may be missing, too.
 
-        Raises: ValueError or OSError if it cannot be used.
+        Raises: ValueError or OSError if the person cannot be used.
         """
         ...
 
@@ -148,7 +150,7 @@ class StoredPerson(Protocol):
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
         """Returns a subject with at least the poses that its views show. subject: some views of the
-        summary, perhaps without poses.
+        summary; its poses may be missing.
 
         Raises: as `summary`.
         """
@@ -167,7 +169,7 @@ class CaptureFolder:
     """The file that the body model was read from."""
 
     def summary(self) -> StoredSubject:
-        """Returns all of the capture but its pixels, see `read_summary`."""
+        """Returns everything of the capture but its pixels, see `read_summary`."""
         return read_summary(self.name, self.body, self.body_file)
 
     def decode(
@@ -188,11 +190,11 @@ class CaptureFolder:
 
 class PeopleCache:
     """The people of a source on disk. Each is checked when it is first asked for. Images are
-    decoded when they are needed, and kept as bytes until they take `limit_bytes`. Several threads
-    may ask at once.
+    decoded when they are needed, and kept as bytes, up to `limit_bytes` for all people together.
+    Several threads may ask at once.
 
-    broken: by name, the first fault that was found in a person, in the order in which faults were
-    found.
+    broken: the first fault that was found in a person, by the person's name. The names are in the
+    order in which faults were found.
     """
 
     def __init__(self, people: Sequence[StoredPerson], limit_bytes: int = 4 << 30):
@@ -257,8 +259,8 @@ class PeopleCache:
         return person.posed(summary._replace(images=images, masks=masks, **of_views))
 
     def note(self, index: int, problem: str) -> None:
-        """Record what is wrong with person `index` in `broken`. The first problem of a person is
-        kept and logged. Other views of the person are still used.
+        """Record in `broken` what is wrong with person `index`. Only the first problem of a person
+        is kept and logged. Other views of the person are still used.
         """
         name = self.name(index)
         with self._lock:
@@ -271,10 +273,10 @@ class PeopleCache:
             )
 
     def report(self, index: int, problem: str) -> None:
-        """Leave person `index` out from now on. The problem must depend on the files alone, so that
-        the order stays reproducible.
+        """Record a problem as `note` does, and leave person `index` out from now on. The problem
+        must depend on the files alone, so that the order of examples stays reproducible.
 
-        Raises: ValueError, naming the last problem, once everybody is left out.
+        Raises: ValueError, which names this problem, if now everybody is left out.
         """
         self.note(index, problem)
         with self._lock:
@@ -364,11 +366,14 @@ class CaptureSource:
         return str(self._found(seed, index, input_count)[0])
 
     def unusable(self) -> dict[str, str]:
-        """Returns the names of the people that cannot be used, each with the reason. Files may be
-        wrong, or there may be too few views for the largest number of input views, or too small
-        photos.
+        """Returns the names of the people that cannot be used, each with the reason: their files
+        are wrong, they have too few views (see `sample_views`), or their photos are too small or
+        not square.
 
-        No decoded photo is kept. Raises: ValueError if the files of all people are wrong.
+        No decoded photo is kept. Faults of single photos that were found before are in the result,
+        too.
+
+        Raises: ValueError if the files of all people are wrong.
         """
         problems = {}
         for i in range(len(self.cache)):
@@ -386,7 +391,7 @@ class CaptureSource:
     ) -> tuple[list[int], list[int]]:
         """Returns the numbers of the input and target views of one person.
 
-        Raises: ValueError if there are too few views, or their photos are too small.
+        Raises: ValueError if there are too few views, or if the photos are too small or not square.
         """
         views = sample_views(generator, summary, input_count, self.sampling)
         for size in (self.input_size, self.target_size):

@@ -21,8 +21,8 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import resized
 
 WINDOW = (25, 59)
-"""Least and greatest distance between the two ends of a window, for the rule "window". The
-distances are numbers of views, for a subject that has `WINDOW_OF` views.
+"""Least and greatest distance between the two ends of a window, as numbers of views, for a subject
+that has `WINDOW_OF` views. See the rule "window" of `ViewSampling`.
 """
 WINDOW_OF = 60
 
@@ -32,12 +32,12 @@ class ViewSampling:
     """Which views of a subject are input and which are targets."""
 
     input_counts: tuple[Count, ...] = (4,)
-    """Numbers of input views. Each step draws one of them; each is compiled once."""
+    """Numbers of input views. Each step draws one of them; the step is compiled once for each."""
     target_count: Count = 3
     """The number of target views."""
     jitter: Spread = 0.7
-    """Largest random change of an input's azimuth, as a share of half the spacing. Without it,
-    inputs stand evenly around the subject.
+    """Largest random change of an input's azimuth, as a share of half the angle between
+    neighbouring inputs. At 0, inputs stand evenly around the subject.
     """
     scattered_share: Share = 0.2
     """The share of examples whose inputs stand at random azimuths, not evenly around the
@@ -53,14 +53,15 @@ class ViewSampling:
     "random": inputs stand around the subject. Targets are drawn from all other views, of any pose.
 
     "window": the rule of the release. A random window in the order of the views is drawn. For a
-    subject with 60 views, its two ends are 25 to 59 views apart, and in proportion for others. The
-    two ends are taken first, then random views between them. The views that are taken first are
-    inputs, the others are targets. jitter, scattered_share and mixed_pose_share are not used.
+    subject with 60 views, its two ends are 25 to 59 views apart; for other numbers of views in
+    proportion. The two ends are taken first, then random views between them. The views that are
+    taken first are inputs, the others are targets. jitter, scattered_share and mixed_pose_share are
+    not used.
     """
 
 
 class StoredSubject(NamedTuple):
-    """A decoded capture as bytes on the host."""
+    """A capture on the host. Images and masks are bytes; in a summary they hold no views."""
 
     images: UInt8[np.ndarray, "v h w 3"]
     """The photos on white, (v, h, w, 3)."""
@@ -105,7 +106,7 @@ class StoredSubject(NamedTuple):
 
 @pytree_dataclass
 class Example:
-    """One subject to learn from: input views and target views, possibly at another image size."""
+    """One subject to learn from. Targets may have another image size than inputs."""
 
     inputs: SubjectViews
     """The views that the network sees."""
@@ -167,8 +168,9 @@ def sample_views(
 ) -> tuple[list[int], list[int]]:
     """Returns the indices of the input views and of the target views, which are disjoint.
 
-    Raises: ValueError if the subject has too few views for the largest of the input counts, even if
-    `input_count` is smaller. Whether a subject is usable does then not depend on the step.
+    Raises: ValueError if the subject has fewer views than the largest of the input counts plus the
+    targets, even if `input_count` is smaller. So whether a subject is usable does not depend on the
+    step.
     """
     count, needed = len(subject.frames), max(sampling.input_counts) + sampling.target_count
     if count < needed:
@@ -341,14 +343,15 @@ def source_at(seed: int, index: int, counts: Int[np.ndarray, " sources"]) -> tup
 class Mixture:
     """Sources mixed by weight, see `source_at`.
 
-    Raises: ValueError if there are not as many weights as sources, if a weight is not positive, or
-    if the sources have different `input_counts`, since all examples of a step have one.
+    Raises: ValueError if there are not as many weights as sources, or for weights that
+    `block_counts` refuses. Also if the sources have different `input_counts`, since all examples of
+    a step have the same number of inputs.
     """
 
     sources: tuple[Source, ...]
     """The sources."""
     weights: tuple[float | int, ...]
-    """A positive number for each source, relative to each other."""
+    """A positive weight for each source. Only the ratios between weights matter."""
 
     def __post_init__(self):
         if len(self.sources) != len(self.weights):

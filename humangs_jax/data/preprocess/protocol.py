@@ -45,8 +45,8 @@ VERTICAL_FOV = np.deg2rad(60.0)
 ELEVATIONS = (-5.0, 15.0)
 """Range of the elevations of the cameras, degrees. They are drawn uniformly."""
 FACTORS = (1.0, 1.75)
-"""Range of the distances of the cameras from the scan, in bounding radii, as the paper has it. They
-are drawn uniformly.
+"""Range of the distances of the cameras from the origin, in bounding radii of the scan, as the
+paper has it. They are drawn uniformly.
 
 At a field of view of 60 degrees, distances below 1.7 cut heads and feet.
 """
@@ -79,8 +79,8 @@ EVERY = 10
 def smallest_rotation(
     start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3 3"]:
-    """Returns the smallest rotation that takes the direction of `start` to the direction of `end`,
-    (3, 3).
+    """Returns the rotation by the smallest angle that takes the direction of `start` to the
+    direction of `end`, (3, 3).
 
     Raises: ValueError if a vector is zero.
     """
@@ -98,7 +98,7 @@ def _box_middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
 def moved(
     matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Returns points after a rigid transform."""
+    """Returns points moved by a rigid transform. matrix: the transform, (4, 4)."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 

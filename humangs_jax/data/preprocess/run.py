@@ -97,7 +97,7 @@ class PreprocessConfig:
     size: int = SIZE
     """The side of the square images, pixels."""
     views: int = VIEWS
-    """Views of each scan."""
+    """The number of views of each scan."""
     factors: tuple[float, float] = FACTORS
     """The range of the cameras' distance from a scan, in bounding radii."""
     supersample: int = 3
@@ -117,7 +117,7 @@ class PreprocessConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """The numbers of what was made and skipped, and of what a set holds after a run."""
+    """What a run has made and skipped, and what the set holds after it."""
 
     out: Path
     """The folder of the set."""
@@ -150,9 +150,10 @@ def preprocess(
 ) -> Report:
     """Make or continue a set. Returns what was made and what the set holds.
 
-    Arguments: source: the data set; of "thuman" the folder that holds model/ and smplx/. body_file:
-    the model of its fits. shard: (i, n): only the i-th of n parts, counted from 0, is made.
-    workers: the number of processes that make scans; videos are made in this one.
+    Arguments: source: the data set; for "thuman" the folder that holds model/ and smplx/.
+    body_file: the model of the data set's fits. shard: (i, n): only the i-th of n parts, counted
+    from 0, is made. workers: the number of processes that make scans. Videos are made in the
+    calling process.
     Raises: ValueError for a wrong shard, if `out` lies in the data set or holds another set, if
     there is nobody, if a finished scene was made from other files, or, at the end, if nobody could
     be made.
@@ -380,7 +381,7 @@ class Content:
     views: Iterator[View]
     """The views in the scene's world (after the transform), lengths in units of the scene."""
     known: dict[str, Any]
-    """Entries of the manifest; complete when the views have run out."""
+    """Entries of the manifest. They are complete once all of `views` have been taken."""
 
 
 def _make_scan(
@@ -538,9 +539,8 @@ def _write_scene(
 def _write_capture(
     folder: Path, target: Path, content: Content, views: Sequence[View], body: FileBody
 ) -> None:
-    """Write body.npz and capture.json of a scene as a capture: lengths in metres, poses and cameras
-    in the aligned world. folder: where the files are written. target: the folder that they will be
-    in.
+    """Write body.npz and capture.json of a scene. Lengths are in metres, and poses and cameras in
+    the aligned world. folder: where the files are written. target: the folder that they will be in.
     """
     matrix = content.transform.copy()
     matrix[:3, 3] /= content.scale
