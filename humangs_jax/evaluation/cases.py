@@ -1,4 +1,4 @@
-"""The people that an evaluation compares, from captures or a `Source`, and the methods that predict
+"""The people of an evaluation, from captures, data sets or a `Source`, and the methods that predict
 their views. The simplest method comes last.
 """
 
@@ -36,8 +36,8 @@ from humangs_jax.network.weights import load_weights
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 HELD_OUT = "held_out"
-"""The name of a folder in a capture folder. It holds a second capture, whose views are no inputs.
-`humangs synth` writes such folders.
+"""The name of a folder in a capture folder. It holds a second capture of the person, whose views
+are never inputs. `humangs synth` writes such folders.
 """
 DEFAULT_INPUTS = 4
 MOST_TARGETS = 2000
@@ -93,7 +93,7 @@ class Predicted(NamedTuple):
     alpha: Float[np.ndarray, "v h w"] | None
     """Coverage by the person in these images, (v, h, w); None: not known."""
     views: tuple[int, ...]
-    """The numbers of these views in the case."""
+    """The numbers of these views in the truth of the case."""
     missing: tuple[str, ...] = ()
     """The files that were not found."""
 
@@ -126,8 +126,8 @@ def find_people(
         indices: the inputs and targets of each person of captures and data sets, in place of
             `inputs`.
         reconstructs: whether the method needs inputs. If it does not, and neither `inputs` nor
-            `indices` is given, it is compared with all views of a capture that has no folder
-            held_out.
+            `indices` is given, all views are compared. A capture with a folder held_out is an
+            exception: only the views in that folder are compared.
 
     Raises: ValueError, which names what is wrong; TypeError for cases that are no `Case`;
     CaptureError when a capture is loaded.
@@ -239,8 +239,9 @@ def choose_views(
     cam_from_world: Float[np.ndarray, "v 4 4"],
     choice: Choice = ANY,
 ) -> tuple[list[int], list[int]]:
-    """Returns the numbers of the views that are inputs, and of the views to compare with. name: the
-    name of the person, as `Choice.indices` has it.
+    """Returns the numbers of the views that are inputs, and of the views to compare with. There are
+    no inputs if the method needs none and `choice` asks for none. name: the name of the person, as
+    `Choice.indices` has it.
 
     Raises: ValueError, which names the person.
     """
@@ -268,8 +269,9 @@ def spread_views(
     name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int
 ) -> list[int]:
     """Returns the numbers of `count` views that show the first view's frame, in ascending order.
-    The views of this frame are sorted by their azimuth around the person, beginning with the first
-    view. In this order, views at even distances are taken, again beginning with the first.
+    The views of this frame are sorted by their azimuth around the middle of the cameras, beginning
+    with the first view. From this order, `count` views at even distances are taken, again beginning
+    with the first.
 
     Raises: ValueError if too few views show this frame.
     """
@@ -340,11 +342,11 @@ def predict_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Pr
 
 
 def _avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
-    """Returns the method that draws one avatar, or the avatar PERSON.npz of a folder. For people
-    without such a file, there are no images, and the file is listed as missing.
+    """Returns the method that draws one avatar, or for each person the avatar PERSON.npz of a
+    folder. If a person has no such file, there are no images, and the file is listed as missing.
 
     Raises: ValueError for one avatar and several people, and as `Avatar.load`; FileNotFoundError if
-    there is no such file.
+    the file of one avatar does not exist.
     """
     folder = None
     if not isinstance(avatar, Avatar):
@@ -393,8 +395,9 @@ def predictions_method(folder: str | Path, people: int) -> Method:
 
     VIEW is the file name of the true photo without its suffix, or view_NNN as `humangs render`
     numbers them. An alpha channel is the coverage, and its image is put on the background. An image
-    without alpha is taken to be on the protocol's background already. Raises: FileNotFoundError if
-    the folder does not exist.
+    without alpha is taken to be on the protocol's background already.
+
+    Raises: FileNotFoundError if the folder does not exist.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -472,8 +475,8 @@ def choose_method(
     predictions: str | Path | None = None,
     method: Method | None = None,
 ) -> tuple[str, Method]:
-    """Returns the name, for reports, of the method that is asked for, and the method itself. The
-    shipped weights are used if nothing is given.
+    """Returns the method that is asked for, after its name for reports. If nothing is given, the
+    shipped weights are used.
 
     Raises: ValueError if more than one is given.
     """

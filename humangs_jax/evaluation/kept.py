@@ -34,8 +34,8 @@ tells people apart.
 """
 
 CaseKey = Callable[[Case], str]
-"""A function that takes a case, and returns a key of what the prediction of this case alone depends
-on, besides the case: an avatar or images. The key is "" if there is nothing of this kind.
+"""A function that takes a case, and returns a key of the files from which only this case is
+predicted: an avatar or images. The key is "" if there are no such files.
 """
 
 
@@ -43,7 +43,7 @@ class KeptScores:
     """Keeps the scores of an evaluation in a folder.
 
     method: returns a key for each case, see `CaseKey`. ordered: whether the results of a person
-    also depend on the people before, as they do if a page with the worst images is made.
+    also depend on the people before. They do if a page with the worst images is made.
     Raises: CaptureError if the folder has scores that were made with other settings.
     """
 
@@ -115,7 +115,7 @@ def _capture_key(capture: Capture) -> str:
 
 
 def indices_key(indices: Mapping[str, Any] | None) -> str | None:
-    """Returns a short checksum of the choice of inputs and targets; None if there is none."""
+    """Returns a short checksum of the choice of inputs and targets; None if nothing was chosen."""
     if indices is None:
         return None
     plain = {

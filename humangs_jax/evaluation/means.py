@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Row = dict[str, float | None]
-"""Scores by name; None for what is missing."""
+"""Scores by name; None for a missing score."""
 CONFIDENCE = 0.95
 """The probability with which an interval contains the true mean."""
 RESAMPLES = 2000

