@@ -1,9 +1,9 @@
 """Compares the posed body with the masks, to find out which views show the person.
 
 A mask that is empty, or nowhere near the body, does harm. The photo of this view is white where the
-body is. The network takes this for the person, and refinement makes the avatar transparent there.
-So such views are left out wherever photos are used, and a warning names them. All of this runs on
-the host, by numpy: nothing is compiled.
+body is. The network takes this white for the person's color, and refinement makes the avatar
+transparent there. So such views are left out wherever photos are used, and a warning names them.
+All of this runs on the host, by numpy: nothing is compiled.
 """
 
 import logging

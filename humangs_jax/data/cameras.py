@@ -151,13 +151,15 @@ class Calibration:
     mask_key: str | None = None
     """The key under which the file names masks; None if it does not."""
     upright: bool = False
-    """Whether the cameras belong to photos that were turned by their EXIF orientation. If False,
-    the sizes of photos and cameras decide this.
+    """Whether it is certain that the cameras belong to photos that were turned by their EXIF
+    orientation. If False, the sizes of photos and cameras decide.
     """
     estimated: bool = False
     """Whether the cameras were found from the person."""
     unit: float | None = None
-    """Metres per unit of the format; None where files may have any unit."""
+    """Metres per unit of length. None: the format states no unit, or its reader converts lengths to
+    metres.
+    """
 
     def with_cameras(self, kept: Sequence[int]) -> "Calibration":
         """Returns the calibration of the cameras with these indices, and of the points that they
@@ -192,8 +194,8 @@ class CalibrationFile:
     path: Path
     """The path of a file, or of the folder where a format has several files."""
     photo_size: Callable[[str], tuple[int, int]]
-    """Takes the name of a photo, and returns the photo's width and height. Readers call it if the
-    file does not say the size.
+    """Takes the name of a photo, and returns the photo's width and height. Some readers need it if
+    the file does not say the size.
     """
 
     @functools.cached_property
@@ -236,7 +238,7 @@ def read_calibration(
     path: Path, photo_size: Callable[[str], tuple[int, int]], any_lens: bool = False
 ) -> Calibration:
     """Read the calibration in a file or folder. Its content decides which of the `CAMERAS` formats
-    it has.
+    it has; formats of several files are known by the file names.
 
     photo_size: as in `CalibrationFile`. any_lens: whether to accept lenses whose photos this
     package cannot undistort.

@@ -224,9 +224,10 @@ def capture_from_arrays(
         body_file: where the model comes from. Default: the shipped body.
         displacement: (n, 3) metres, of the vertices of the shaped body in the T-pose, or None.
         calibrated: False if the cameras were found from the person. Refining the capture by its
-            masks may then move them farther than calibrated cameras.
+            masks may move such cameras farther than calibrated ones.
         unknown: (v, h, w), true where somebody or something in front may hide the person, or None.
-            The capture's masks are 0 there, and nothing is concluded from these pixels.
+            The capture's masks are 0 there, and nothing is concluded from these pixels. Needs
+            masks.
         source: what errors call the arrays.
 
     Returns:

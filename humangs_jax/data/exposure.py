@@ -265,8 +265,9 @@ def gains_between(
     groups: Int[np.ndarray, " v"],
     frames: Int[np.ndarray, " v"],
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns the gains of groups of views that have no point in common, from the colors of the
-    body's parts, (v, 3).
+    """Returns gains that make groups of views equal, (v, 3): a row for each view. The groups share
+    too few points to be compared by these. All views of a group have the same gains. The gains are
+    found from the colors of the body's parts.
 
     If two groups share a frame, all photos count as taken in one light. Gains are then 1 if the
     white balances hardly differ, see `OTHER_LIGHT`.

@@ -365,7 +365,7 @@ _OF_CAMERA = (
     *("camera", "cam_trans", "translation", "orig_cam"),
 )
 CAMERA_MOVES = ("cam_t", "pred_cam_t_full", "pred_cam_t", "camera", "cam_trans", "orig_cam")
-"""Keys of positions in the coordinates of a camera: its y axis points down."""
+"""Keys of positions in the coordinates of a camera, whose y axis points down."""
 _FOUND: dict[str, Any] = {"fps": DEFAULT_FPS, "also": ("-y",), "moves": _OF_CAMERA}
 """Fields of the formats of pose estimators. They write motions in the coordinates of a camera or in
 a world. In either, the y axis may point down.

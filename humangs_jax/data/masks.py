@@ -78,8 +78,8 @@ OF_TEXTURE = 1.0
 """Weight of the change of colors beside an edge, see `EDGE`."""
 SEEN_APART = 1.5
 """A sector votes for a move if its edge is at most this many units away from where the silhouette
-would move. An edge where the mask ends is looked for only if the mask is off by at least this many
-pixels of the image that is searched.
+would move to. An edge where the mask ends is looked for only if the mask is off by at least this
+many pixels of the image that is searched.
 """
 CLEAR = 1.3
 """Colors are not blurred by an edge that is at least this far away, pixels."""

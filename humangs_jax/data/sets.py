@@ -39,7 +39,7 @@ SYNTHETIC = SetFormat("humangs-synthetic", 2)
 DATA_SET = SetFormat("humangs-dataset", 1)
 """Scans or videos of a data set."""
 AVATARS = SetFormat("humangs-avatars", 2)
-"""Avatars of an evaluation."""
+"""Avatars that were reconstructed from several captures."""
 SCORES = SetFormat("humangs-scores", 1)
 """Scores of an evaluation."""
 LOOK = 1 << 16
@@ -126,8 +126,7 @@ def files_key(root: Path, files: Iterable[Path]) -> str:
 def write_manifest(
     folder: Path, kind: SetFormat, made_with: Mapping[str, Any], **found: Any
 ) -> dict[str, Any]:
-    """Write the manifest of a set, by renaming a finished file, so that it is never half written.
-    found: what is in the set.
+    """Write the manifest of a set. Nobody sees it half written. found: what is in the set.
 
     Returns the content of the manifest.
     """

@@ -15,7 +15,7 @@ BINARIES = {
 }
 """First bytes of files that somebody may take for a calibration -> the kind of the file."""
 HEAD = 4096
-"""The number of bytes at the beginning of a file that are read."""
+"""`binary_kind` reads this many bytes at the beginning of a file."""
 INTRINSICS = (
     "camera_matrix",
     "cameraMatrix",

@@ -98,7 +98,9 @@ class OffsetFitConfig:
     smoothness: float = 0.03
     """The length over which a move spreads to the vertices around it, metres."""
     inset: tuple[float, float] = (0.005, 0.025)
-    """The least and the most that the surface may lie inside the masks, metres."""
+    """The least and the largest distance from the edges of the masks inwards to the surface,
+    metres.
+    """
     iterations: int = 2
     """How many times edges are looked for and the surface is moved."""
 
@@ -168,10 +170,9 @@ def fit_vertex_offsets(
     Displacements are 0 if all masks are empty, or if the masks are not near the body.
 
     Arguments: body: the capture's body, or one of `data.views.gaussian_body`. capture: has masks;
-    its views may show any frames, and any axis may be up. inset: the least and the most that the
-    surface may lie inside the masks, metres. always: whether a body that fits the masks already is
-    displaced, too, see `MISFIT`. If not, its displacements are 0: displacing such a body would make
-    the clothes that the network adds worse.
+    its views may show any frames, and any axis may be up. inset: see `OffsetFitConfig`. always:
+    whether a body that fits the masks already is displaced, too, see `MISFIT`. If not, its
+    displacements are 0: displacing such a body would make the clothes that the network adds worse.
     """
     assert capture.masks is not None
     rest = shaped(body, capture.betas)

@@ -61,8 +61,8 @@ def best_views(capture: Capture, count: int | None) -> list[int]:
 
 def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0.0) -> list[int]:
     """Returns the indices of at most `count` rows of a matrix, in the order of their choice. Each
-    row is the one that raises the sum of the columns' maxima most. The choice stops when the next
-    row would raise the sum by less than `least` times the sum.
+    further row is the one that raises the sum of the columns' maxima most. The choice stops when
+    the next row would raise the sum by less than `least` times the sum.
     """
     chosen, best = list[int](), np.zeros(quality.shape[1])
     for _ in range(min(count, len(quality))):

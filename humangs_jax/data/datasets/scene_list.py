@@ -13,7 +13,8 @@ scene. Except for pose correctives, `v_posed` is `v_cano` moved by `joint_transf
 
 The reader recovers unit, shape and pose from the arrays, and converts cameras to metres. So lists
 of other programs need nothing more. We also write `mask_path`. If it is missing, the alpha channel
-is the mask; without one, all pixels that are not white show the person.
+is the mask; without one, the pixels that are not white, and those that they enclose, show the
+person.
 """
 
 import functools

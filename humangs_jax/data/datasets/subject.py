@@ -124,14 +124,16 @@ class BodyParameters(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosedPerson:
-    """The body of a person in one pose."""
+    """The body of a person in one pose. Lengths are in metres, or multiplied by the `scale` of
+    `posed_people`.
+    """
 
     rest: Float[np.ndarray, "n 3"]
-    """The vertices in the T-pose, (n, 3), metres."""
+    """The vertices in the T-pose, (n, 3)."""
     vertices: Float[np.ndarray, "n 3"]
-    """The posed vertices, (n, 3), metres."""
+    """The posed vertices, (n, 3)."""
     joints: Float[np.ndarray, "j 3"]
-    """The posed joints, (j, 3), metres."""
+    """The posed joints, (j, 3)."""
     joint_transforms: Float[np.ndarray, "j 4 4"]
     """From rest to posed for each joint, (j, 4, 4), translation included."""
 
@@ -147,7 +149,9 @@ def _posed(
 def posed_people(
     body: BodyModel, parameters: BodyParameters, scale: float = 1.0
 ) -> Iterator[PosedPerson]:
-    """Yields the body of a person in each pose, with all lengths times `scale`."""
+    """Yields the body of a person in each pose, with all lengths, in metres, multiplied by
+    `scale`.
+    """
     for rotations, translation in zip(parameters.rotations, parameters.translations, strict=True):
         rest, posed = _posed(
             body, *(jnp.asarray(x, jnp.float32) for x in (parameters.betas, rotations, translation))
@@ -351,7 +355,7 @@ class Subject:
         """Read one view. Returns the image on white and the mask, padded to a centred square and
         resized to `size` pixels.
 
-        Raises: ValueError naming the file.
+        Raises: ValueError naming the file or the view.
         """
         image, mask = self.read(view)
         width, height = self.sizes[view].tolist()

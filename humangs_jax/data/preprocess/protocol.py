@@ -3,8 +3,8 @@ float64). Also draws photos of a scan.
 
 Scans are aligned in two steps. First the middle of the raw scan's bounding box goes to the origin.
 Then the smallest rotation takes the direction from pelvis to neck of the fitted body to +y. Videos
-are first turned by this rotation for frame 0. Then the middle of the bounding box of frame 0's
-turned body goes to the origin.
+are aligned by the body of frame 0. First they are turned by the smallest rotation that does the
+same to this body. Then the middle of the bounding box of the turned body goes to the origin.
 
 Photos of a scan are drawn by our rasterizer, with several samples a pixel, and with a texture that
 is shrunk to the size of the samples. Color = texture (ambient + headlight |n . v|), where n is the

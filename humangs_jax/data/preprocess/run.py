@@ -99,7 +99,7 @@ class PreprocessConfig:
     views: int = VIEWS
     """The number of views of each scan."""
     factors: tuple[float, float] = FACTORS
-    """The range of the cameras' distance from a scan, in bounding radii."""
+    """The range of the cameras' distances, in bounding radii of a scan."""
     supersample: int = 3
     """Samples along each side of a pixel, for scans."""
     every: int = EVERY
