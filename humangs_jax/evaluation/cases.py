@@ -126,8 +126,9 @@ def find_people(
         indices: the inputs and targets of each person of captures and data sets, in place of
             `inputs`.
         reconstructs: whether the method needs inputs. If it does not, and neither `inputs` nor
-            `indices` is given, all views are compared. A capture with a folder held_out is an
-            exception: only the views in that folder are compared.
+            `indices` is given, all views of a capture or of a person of a data set are compared. A
+            capture with a folder held_out is an exception: only the views in that folder are
+            compared.
 
     Raises: ValueError, which names what is wrong; TypeError for cases that are no `Case`;
     CaptureError when a capture is loaded.
@@ -372,8 +373,8 @@ def _avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
 
 
 def _weights_method(variables: Variables, config: HumanGSConfig) -> Method:
-    """Returns the method that reconstructs an avatar from the inputs of a case. A network with a
-    driver is run again for every view.
+    """Returns the method that reconstructs an avatar from the inputs of a case and draws it. If the
+    network has a driver, the driver makes the images.
     """
 
     def method(case: Case, background: float) -> Predicted:
@@ -475,8 +476,8 @@ def choose_method(
     predictions: str | Path | None = None,
     method: Method | None = None,
 ) -> tuple[str, Method]:
-    """Returns the method that is asked for, after its name for reports. If nothing is given, the
-    shipped weights are used.
+    """Returns the name of the method that is asked for, as reports show it, and the method. If
+    nothing is given, the shipped weights are used.
 
     Raises: ValueError if more than one is given.
     """

@@ -6,7 +6,8 @@ continued.
                                    depend on
 
 The key of a person depends on names and on contents: photos, masks, cameras, poses and body, and
-the weights, avatar or images that are compared. Scores of other contents are never reused.
+the weights, avatar or images that are compared. Scores of other contents are not reused. See
+`method_key` for what is known of a function.
 """
 
 import inspect

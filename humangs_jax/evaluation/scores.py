@@ -298,8 +298,8 @@ def _patch_means(x: Float[Array, "h w"], side: int) -> Float[Array, "y x"]:
 
 @compiled()
 def _alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict[str, Scalar]:
-    """Returns the IoU and the semi-transparent foreground of a rendering's coverage, as iou and
-    semi_transparent.
+    """Returns iou and semi_transparent of a rendering's coverage, see `losses.silhouette_iou` and
+    `losses.semi_transparent`.
     """
     return {"iou": silhouette_iou(alpha, mask), "semi_transparent": semi_transparent(alpha, mask)}
 
