@@ -88,8 +88,8 @@ class FolderScan:
     photos: tuple[Path, ...]
     """The photos, sorted by path."""
     unused: tuple[Unused, ...] = ()
-    """The files and folders that are not used, sorted by path. Files that nobody takes for a photo
-    or a video are not among them.
+    """The files and folders that are not used, sorted by path. Videos are among them only if there
+    are photos. Files that nobody takes for a photo or a video are not among them.
     """
     masks: tuple[Path, ...] = ()
     """The masks of the photos, if each photo has a mask in its own folder. Otherwise this is empty,

@@ -58,7 +58,8 @@ def read_summary(
     path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY
 ) -> StoredSubject:
     """Returns everything of a capture but its pixels. The arrays of images and masks have the right
-    height and width, but 0 views.
+    height and width, but 0 views. Shape coefficients that the capture leaves out are 0. A
+    displacement is dropped.
 
     Images and masks are opened, and their sizes are compared. PNG files are checked by their
     checksums, other files by decoding them.

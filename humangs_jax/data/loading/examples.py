@@ -32,12 +32,12 @@ class ViewSampling:
     """Which views of a subject are input and which are targets."""
 
     input_counts: tuple[Count, ...] = (4,)
-    """Numbers of input views. Each step draws one of them; the step is compiled once for each."""
+    """Numbers of input views. Each step draws one of them; each is compiled once."""
     target_count: Count = 3
     """The number of target views."""
     jitter: Spread = 0.7
-    """Largest random change of an input's azimuth, as a share of half the angle between
-    neighbouring inputs. At 0, inputs stand evenly around the subject.
+    """Largest random change of an input's azimuth, as a share of half the spacing. Without it,
+    inputs stand evenly around the subject.
     """
     scattered_share: Share = 0.2
     """The share of examples whose inputs stand at random azimuths, not evenly around the
@@ -53,10 +53,9 @@ class ViewSampling:
     "random": inputs stand around the subject. Targets are drawn from all other views, of any pose.
 
     "window": the rule of the release. A random window in the order of the views is drawn. For a
-    subject with 60 views, its two ends are 25 to 59 views apart; for other numbers of views in
-    proportion. The two ends are taken first, then random views between them. The views that are
-    taken first are inputs, the others are targets. jitter, scattered_share and mixed_pose_share are
-    not used.
+    subject with 60 views, its two ends are 25 to 59 views apart, and in proportion for others. The
+    two ends are taken first, then random views between them. The views that are taken first are
+    inputs, the others are targets. jitter, scattered_share and mixed_pose_share are not used.
     """
 
 
