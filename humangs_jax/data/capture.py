@@ -480,7 +480,8 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
 
 
 def _check_before_writing(capture: Capture) -> None:
-    """Check a `Capture` that was made by hand for faults that reading would refuse.
+    """Check a `Capture` that may have been made by hand. Its faults are those that reading would
+    refuse, too.
 
     Raises: CaptureError.
     """

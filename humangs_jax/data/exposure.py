@@ -2,9 +2,10 @@
 
 Cameras with automatic exposure show one skin in several colors. A gain for each photo and channel
 makes the colors agree. A point of the body that two photos show should have the same color in both.
-Each pair of photos has a median: that of the ratios of the two colors, over all points that both
-photos show. The gains bring these medians as near to 1 as possible. The logarithms of the gains
-have the mean 0 over the photos. Gains of photos that share few points stay near 1.
+So for each pair of photos, the ratio of the two colors is found at all points that both show, and
+the median of these ratios is taken. The gains bring the medians as near to 1 as possible. The
+logarithms of the gains have the mean 0 over the photos. Gains of photos that share few points stay
+near 1.
 
 Photos of the front and of the back share no point of the body, nor do photos of the left and of the
 right side. Groups of photos that are linked by shared points are compared by the parts of the body:
