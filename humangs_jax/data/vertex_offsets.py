@@ -153,7 +153,10 @@ class MaskedView:
         within = (clip[..., 2] > 1e-3) & ((pixels > self.low) & (pixels < self.high)).all(-1)
         if self.hidden is not None:
             within &= at(self.hidden, pixels) < MASK_THRESHOLD
-        return pixels, np.linalg.norm(self.project[0, :3]) / depth, within
+        # the first row is the focal length times the camera's x axis, plus the principal point's x
+        # times the z axis, which does not count
+        x, z = self.project[0, :3], self.project[2, :3]
+        return pixels, np.linalg.norm(np.cross(x, z)) / depth, within
 
 
 def fit_vertex_offsets(

@@ -17,10 +17,12 @@ from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.vertex_offsets import (
     HELD_JOINTS,
     WRAP,
+    MaskedView,
     OffsetFitConfig,
     fit_vertex_offsets,
 )
 from humangs_jax.data.views import gaussian_body, on_gaussian_body, subject_rest
+from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.presets import tiny
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
@@ -105,6 +107,25 @@ def along_normals(body, capture, moved):
 def filled(body, dressed):
     """Returns the displacement that fills the masks."""
     return fit_vertex_offsets(body, dressed[0], inset=(0.0, 0.0))
+
+
+@pytest.mark.parametrize("principal", [20.0, -700.0])
+def test_a_metre_has_as_many_pixels_wherever_the_window_lies_in_the_photo(principal):
+    """principal: x of the principal point in the window, pixels."""
+    turn = np.asarray(quaternion.to_matrix(quaternion.normalize(jnp.asarray([1.0, 0.2, 0.5, 0.1]))))
+    K = np.asarray([[500.0, 0, principal], [0, 500, 20], [0, 0, 1]])
+    places = np.asarray([[0.1, 0.2, 3.0], [-0.3, 0.1, 4.0]])
+    view = MaskedView(
+        coverage=np.ones((40, 40)),
+        project=np.concatenate([K @ turn, np.zeros((3, 1))], axis=1),
+        linear=np.tile(turn.T, (2, 1, 1)),  # from the axes of the camera to those of the world
+        offset=np.zeros((2, 3)),
+        low=np.zeros(2),
+        high=np.full(2, 40.0),
+    )
+    pixels, per_metre, _ = view.seen(places)
+    beside = view.seen(places + np.asarray([1e-3, 0, 0]))[0]
+    np.testing.assert_allclose(1e3 * (beside - pixels)[:, 0], per_metre, rtol=1e-4)
 
 
 def test_a_coat_is_found(body, dressed, filled):
