@@ -91,10 +91,10 @@ def _shipped() -> dict[str, np.ndarray]:
 
 
 def _read_face(path: str | Path) -> dict[str, np.ndarray]:
-    """Returns the arrays of a face file by key. The key `rows` is added: the vertex and the shape
-    of each offset, (offsets, 2).
+    """Returns the arrays of a face file by key. The key `rows` is added: for each offset the
+    numbers of its vertex and of its blend shape, (offsets, 2).
 
-    Raises: FileNotFoundError; ValueError, which names the file, and the key if an array is missing
+    Raises: FileNotFoundError; FileError, which names the file, and the key if an array is missing
     or wrong.
     """
     with reading(path, "face file"):
@@ -105,7 +105,11 @@ def _read_face(path: str | Path) -> dict[str, np.ndarray]:
         if missing:
             raise InvalidFileError(f"key '{missing[0]}' is missing")
         # the offsets of all shapes, one shape after the other
-        names, count = arrays["names"], len(arrays["vertices"])
+        names = arrays["names"]
+        if names.ndim != 1 or names.dtype.kind != "U":
+            raise InvalidFileError("names: expected a list of texts")
+        check_indices("vertices", arrays["vertices"], (None,), 1 << 16)
+        count = len(arrays["vertices"])
         check_indices("counts", arrays["counts"], (len(names),), count + 1)
         check_array("offsets", arrays["offsets"], (3, count), -LARGEST, LARGEST)
         check_array("eye_turns", arrays["eye_turns"], (len(names), 2, 3), -LARGEST, LARGEST)
@@ -119,6 +123,7 @@ def _read_face(path: str | Path) -> dict[str, np.ndarray]:
         before = np.concatenate([[0], sums[ends[:-1] - 1]])
         shape = np.repeat(np.arange(len(names)), np.diff(ends, prepend=0))
         rows = np.stack([sums - before[shape], shape], axis=1)
+        check_indices("vertices", rows[:, 0], (count,), 1 << 16)
         # parts that photos hardly show
         check_indices("part_faces", arrays["part_faces"], (None, 4), 1 << 16)
         check_indices("lips", arrays["lips"], (4,), 1 << 16)

@@ -1,17 +1,23 @@
 """Expressions of bodies: the 52 shapes of the shipped one, SMPL-X's, and other resolutions."""
 
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from small import small_body
 
-from humangs_jax.body.expressions import Expressions, shipped_parts
+import humangs_jax
+from humangs_jax.body.expressions import Expressions, _read_face, shipped_parts
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import load_body, read_body, save_body
 from humangs_jax.body.model import BodyPose, pose_body, rest_pose, shape_body
 from humangs_jax.body.resolution import decimate, split_long_edges
 from humangs_jax.core.pytree import replace
+from humangs_jax.io.reading import FileError
 from humangs_jax.motion.face_tracks import ARKIT
+
+FACE = Path(humangs_jax.__file__).parent / "assets" / "face.npz"
 
 
 @pytest.fixture(scope="module")
@@ -125,3 +131,23 @@ def test_teeth_lie_behind_the_lips_and_the_lower_ones_follow_the_jaw(shipped):
     falls = parts.directions[lower][..., 1, jaw]
     assert falls.max() < 0 and falls.min() < -0.02
     assert not parts.directions[parts.parts == 0][..., jaw].any()  # the upper ones stay
+
+
+@pytest.mark.parametrize(
+    ("key", "wrong"),
+    [
+        ("vertices", lambda x: x.astype("U8")),
+        ("vertices", lambda x: x[:, None]),
+        ("vertices", lambda x: x.astype(np.int64) - 5),
+        ("vertices", lambda x: 1000 * x.astype(np.int64)),
+        ("names", lambda x: np.asarray("jawOpen")),
+        ("names", lambda x: np.arange(len(x))),
+        ("offsets", lambda x: x[:, 1:]),
+    ],
+)
+def test_a_wrong_array_of_a_face_file_is_named(key, wrong, tmp_path):
+    with np.load(FACE) as file:
+        arrays = dict(file)
+    np.savez(tmp_path / "face.npz", **arrays | {key: wrong(arrays[key])})
+    with pytest.raises(FileError, match=rf"face\.npz: .*{key}: expected"):
+        _read_face(tmp_path / "face.npz")
