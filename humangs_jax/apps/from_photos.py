@@ -631,8 +631,8 @@ class FromPhotos:
 
 
 def _bodies_to_masks(fitted: FittedCapture) -> list[RefinedCapture]:
-    """Refines the fitted body by the masks in two ways: first for loose clothes, then for tight
-    ones.
+    """Returns two refinements of the fitted body by the masks, each made from the fitted capture:
+    one for loose clothes and one for tight clothes, in this order.
     """
     capture = fitted.capture
     # calibrated cameras move where the keypoints have shown that they are off

@@ -221,11 +221,13 @@ def without_pixel_footprint(avatar: Avatar) -> Avatar:
 
 
 def with_pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Avatar:
-    """Returns the avatar with the low-pass of the photos that it will be fitted to. A Gaussian
-    keeps its own low-pass if that is for smaller pixels than the photos' pixels.
+    """Returns the avatar with the low-pass of the photos that it will be fitted to. The
+    `pixel_footprint` of each Gaussian becomes the smaller one of its own and of the photos' pixel
+    there (`pixel_sizes`). The scales stay.
 
-    The avatar looks as before. Where its own low-pass was larger, the difference is now an ordinary
-    part of the scales, which a fit can reduce. An avatar without a low-pass is changed as by
+    Where a Gaussian's own was larger, the difference is now an ordinary part of the scales, which a
+    fit can reduce. Images whose pixels are larger than the new `pixel_footprint` then show this
+    Gaussian fainter; all others show it as before. An avatar without a low-pass is changed as by
     `with_pixel_footprint`.
     """
     return replace(avatar, gaussians=_pixel_footprint_of(avatar, views))

@@ -247,6 +247,8 @@ def _plain_view(name: str, camera: Camera, rendering: Rendering) -> ExrView:
 def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
     """Returns the points of the world at given depths on the rays through the centres of the
     pixels, metres. depth: along the camera's axis, metres.
+
+    Raises: ValueError for another lens than a pinhole, and for a camera with distortion.
     """
     require_pinhole("unprojection", camera)
     K = np.asarray(camera.K, np.float64)

@@ -240,9 +240,11 @@ class Reconstruct:
         return captures
 
     def _begin_set(self, out: Path) -> None:
-        """Checks that the set in `out` was made with these settings, and records them if it is new.
+        """Checks that the set in `out` was made with these settings and this version of the
+        package, and records them if it is new. The fields `captures`, `out`, `batch`, `shard` and
+        `check` do not count.
 
-        Raises: CaptureError if it was made with other settings.
+        Raises: CaptureError if it was made with others, or if `out` has a set of another kind.
         """
         from humangs_jax import __version__
         from humangs_jax.data.sets import AVATARS, SETTINGS, begin_set

@@ -70,8 +70,8 @@ it covers less, most of the body would be a guess, and no holes are looked for.
 
 
 class _Photo(NamedTuple):
-    """A photo of at most `LONGEST` pixels, with the silhouette of the posed body. Its arrays are
-    (h, w).
+    """A photo whose longer side has at most `LONGEST` pixels, with the silhouette of the posed
+    body. Its arrays are (h, w).
 
     mask: where the person is seen. known: the pixels that are not unknown already. body: the
     silhouette. beside: the part of the mask that is farther than `LOOSE` from the silhouette.

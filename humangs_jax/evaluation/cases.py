@@ -240,11 +240,17 @@ def choose_views(
     cam_from_world: Float[np.ndarray, "v 4 4"],
     choice: Choice = ANY,
 ) -> tuple[list[int], list[int]]:
-    """Returns the numbers of the views that are inputs, and of the views to compare with. There are
-    no inputs if the method needs none and `choice` asks for none. name: the name of the person, as
-    `Choice.indices` has it.
+    """Returns the numbers of the views that are inputs, and of the views to compare with. name: the
+    name of the person, as `Choice.indices` has it.
 
-    Raises: ValueError, which names the person.
+    If there are `choice.indices`, they decide: a person without "context" there has no inputs.
+    Otherwise `choice.inputs` views are taken as in `spread_views` (None: `DEFAULT_INPUTS`), and all
+    others are compared. If `choice.inputs` is None and `choice.reconstructs` is False, there are no
+    inputs, and all views are compared.
+
+    Raises: ValueError, which names the person, if `indices` lacks the person, has no target, or has
+    a view that does not exist; if too few views show the first frame; or if no view is left to
+    compare with.
     """
     count, (inputs, indices, reconstructs) = len(frames), choice
     if indices is not None:

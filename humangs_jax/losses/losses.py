@@ -400,7 +400,9 @@ def mean_similarity(similarities: Float[Array, "y x c"], count: Int[Array, "2"])
 def structural_dissimilarity(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]
 ) -> Float[Array, "y x c"]:
-    """Returns (1 - SSIM) / 2 per pixel and channel, from 0 (equal images) to 1 (inverse images)."""
+    """Returns (1 - SSIM) / 2 for each channel and each place of the window inside of the image,
+    shaped as by `similarity_map`: from 0 (equal images) to 1 (inverse images).
+    """
     return 0.5 * (1 - similarity_map(predicted, target))
 
 

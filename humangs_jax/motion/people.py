@@ -326,13 +326,15 @@ def _tracked(image: Mapping[str, Any]) -> list[Person]:
 
 
 def _frames(files: Sequence[Path]) -> list[tuple[str, list[Person]]]:
-    """Returns the people of each frame: (name of the frame's file, people).
+    """Returns the people of each frame: (name of its first file, people).
 
     The names of files may end in two numbers, of the frame and of the person. This is assumed if
     all names have at least two numbers and the last but one is not the same in all. Otherwise a
-    file has all people of one frame.
+    file has all people of one frame. Files without people give a frame of nobody.
 
-    Raises: MotionError or InvalidFileError for a file that is no such frame.
+    Raises: FileNotFoundError or FileError for a file that cannot be read; MotionError if its
+    content is neither an object nor a list; InvalidFileError for too many people, or if the only
+    file is an object without people.
     """
     numbers = [_numbers(file) for file in files]
     apart = all(len(each) > 1 for each in numbers) and len({each[-2] for each in numbers}) > 1

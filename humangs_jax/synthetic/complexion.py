@@ -134,7 +134,8 @@ def _liner(rng: np.random.Generator, made_up: bool, male: bool) -> float:
 def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut) -> Material:
     """Makes the material of the skin, whose tones vary over the body.
 
-    It has lips, cheeks, brows, lids, nostrils, stubble, knuckles and freckles.
+    It paints lips, cheeks, brows, lids, nostrils, knuckles and the roots of the hair. Freckles,
+    signs of age and a beard's stubble are painted where `tones` and `haircut` have them.
     """
     cloud, blotches = Ripples(rng, 0.07), Ripples(rng, 0.25)
     # what is painted on the face: metres, or factors around 1

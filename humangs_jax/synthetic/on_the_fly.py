@@ -106,7 +106,9 @@ ON_THE_FLY = OnTheFlyConfig()
 
 @pytree_dataclass
 class Scene:
-    """What all views of an example share: a person in o poses, the dyes and the light."""
+    """What all views of an example share: a dressed person in o poses, the matrices that recolor
+    the person's pieces (dyes), and the light.
+    """
 
     person: Int[Array, ""]
     """Index of the person in the bank, ()."""

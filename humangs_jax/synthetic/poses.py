@@ -405,9 +405,11 @@ def _arm_capsules(build: kin.Build, positions: kin.Rotations, side: int) -> list
 def _clearance(
     build: kin.Build, capsules: list[_Capsule], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Returns the distance of an arm around each point from the nearest capsule (n,), metres.
+    """Returns for each point the gap between the nearest capsule and an arm whose axis goes through
+    the point, (n,), metres.
 
-    The radii of arm and capsule are subtracted; the distance is negative inside.
+    The gap is the distance of the point from the capsule's axis, minus both radii. It is negative
+    where arm and capsule overlap.
     """
     distances = []
     for a, b, radius in capsules:

@@ -175,9 +175,11 @@ class Surface:
         return dataclasses.replace(self, attributes={**self.attributes, **attributes})
 
     def painted(self, template: Points, cloth: Points, girth: float) -> "Surface":
-        """Returns the surface with template and cloth coordinates, each (n, 3).
+        """Returns the surface with the attributes `template`, (n, 3), and `cloth`, (n, 4).
 
-        girth: the radius that turns angles into metres; it becomes the fourth cloth coordinate.
+        template, cloth: coordinates of the vertices, (n, 3) each. girth: the radius, metres, by
+        which materials turn an angle around the part's axis into a length of cloth. It is appended
+        to `cloth` as a fourth column, the same for all vertices.
         """
         cloth = np.concatenate([cloth, np.full((len(cloth), 1), girth)], 1).astype(np.float32)
         return self.with_attributes(template=np.asarray(template, np.float32), cloth=cloth)

@@ -513,8 +513,10 @@ def recognizes_qualisys(source: CalibrationFile) -> bool:
 def read_qualisys(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """Reads the cameras of the file that have a transform.
 
-    Raises: CaptureError with the name of the camera and what is missing. InvalidFileError if the
-    XML declares entities.
+    Raises: CaptureError if a number of a camera is missing or wrong, or if no camera has a
+    transform. It names the camera by its place among those with a transform, from 0, and the
+    attribute. InvalidFileError if the XML declares entities or is too long. ParseError if the file
+    is no XML.
     """
     check_limit("slow_text_bytes", len(source.text), "characters of XML")
     if re.search(r"<!(DOCTYPE|ENTITY)", source.text):

@@ -240,8 +240,10 @@ def agreements(
         points, counts, weights = triangulate_robustly(seen)
 
         def near(keypoints, confidences):
-            """Returns the agreement of each view, (c,), if all of them had these keypoints, (k,
-            2).
+            """Returns how well each view would agree with the triangulated points if it had these
+            keypoints, (c,). Only points that are triangulated from at least two views count.
+
+            keypoints: (k, 2), pixels. confidences: (k,).
             """
             alike = replace(
                 seen,
