@@ -38,7 +38,7 @@ KEYS = (
     *("format", "names", "counts", "vertices", "offsets", "eye_turns"),
     *("lips", "inside_vertices", "part_faces", "parts"),
 )
-"""Keys that every face file has, such as `assets/face.npz`."""
+"""Keys of the arrays that every face file has. `assets/face.npz` is such a file."""
 
 
 @pytree_dataclass

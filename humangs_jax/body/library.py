@@ -193,7 +193,8 @@ def read_body(path: str | Path) -> BodyModel:
     """Returns the body model that `save_body` wrote.
 
     Raises: FileNotFoundError; ValueError, which names the file, if the file is no body file or is
-    damaged. If an array is missing or wrong, it also names the key.
+    damaged. If an array is missing or wrong, it also names the key, unless the array is a single
+    number.
     """
     with reading(path, "body file"):
         arrays, pickled = read_npz(path)
@@ -347,8 +348,9 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
     Arguments: shape_count, expression_count: how many of the file's directions to keep.
     `shape_directions` holds the shape directions, then the expression directions. Numbers are
     float32, or float64 under `jax.enable_x64`.
-    Raises: FileNotFoundError; ValueError, which names file and key, for anything that does not fit
-    the format.
+    Raises: FileNotFoundError; ValueError if the file cannot be read, if anything in it does not fit
+    the format, or if it has fewer directions than asked for. The message names the file, and the
+    key if the fault is in one.
     """
     with reading(path, "body model file"):
         file = ArrayFile.open(path, wanted=lambda key: not key.startswith("hands_"))

@@ -10,8 +10,8 @@ local rotation, J_j the rest joint and p its parent:
     W_j = W_p R_j,    t_j = t_p + W_p (J_j - J_p),    G_j = [W_j | t_j - W_j J_j + translation].
 
 Rotations turn about the joints in the rest pose, whose frames are all aligned with the world
-(SMPL's convention). Products ask for full precision: accelerators otherwise round float32 factors
-to 8 or 10 bits, millimetres here.
+(SMPL's convention). Products ask for full precision. Otherwise accelerators round float32 factors
+to 8 or 10 bits, which would move vertices by millimetres.
 
 Metres, y up, the person faces +z with the left side at +x. SMPL-X is one such model, the CC0 body
 shipped with the package another (`humangs_jax.body.library.load_body`).
@@ -70,6 +70,8 @@ def joint_transforms(
     The chain is composed by doubling: after each round a transform includes twice as many
     ancestors. Ten levels take four rounds, and the program compiles in a third of the time of one
     that goes level by level.
+
+    Raises: as `ancestors`.
     """
     local = quaternion.matrix_from_axis_angle(rotations)
     iterations = ancestors(parents)
@@ -409,7 +411,9 @@ def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
 def person_vertices(
     body: BodyModel, betas: Float[Array, " s_used"], pose: BodyPose
 ) -> Float[Array, "n 3"]:
-    """Returns the vertices of a person in a pose, (n, 3), metres."""
+    """Returns the vertices of a person in a pose, (n, 3), metres. Raises: as `shape_body` and
+    `pose_body`.
+    """
     return pose_body(body, shape_body(body, betas), pose).vertices
 
 

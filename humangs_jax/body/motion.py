@@ -17,9 +17,9 @@ from humangs_jax.geometry.axes import UPRIGHT, upright_matrix
 from humangs_jax.io.reading import check_limit
 
 PELVIS = np.array([0.0, -0.35, 0.0])
-"""Position of the root joint of SMPL-X and of the shipped body in T-pose, metres. Worlds are turned
-about this point. The root of another body lies elsewhere. Its motion is then shifted by a constant,
-and `grounded` removes this shift.
+"""Position of the root joint of SMPL-X and of the shipped body in T-pose, metres. `turned_upright`
+needs it, because translations are relative to it. The root of another body lies elsewhere. Its
+turned motion is then shifted by a constant, and `grounded` removes this shift.
 """
 
 
@@ -44,6 +44,8 @@ class Motion:
         expression_names: expressions of the face that will move (`avatar.expression_names`). The
         pose has a coefficient for each of them if the motion has any of them; otherwise its
         expression is None.
+
+        Raises: IndexError if the motion has no such frame.
         """
         faces = self.expressions_of(expression_names)
         expression = None

@@ -233,7 +233,9 @@ where a shape direction moves nothing.
 
 
 def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarray:
-    """Returns points on the faces, corners included, about `spacing` metres apart, (p, 3)."""
+    """Returns points on the faces, corners included, (p, 3). They are about `spacing` metres apart,
+    or farther on faces whose longest side is over 40 times as long.
+    """
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     # parts of a side, at most 40
@@ -523,8 +525,8 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
     This runs in numpy on the host. It takes about 0.1 s if the body holds its collapse order (the
     shipped one does), and seconds to find the order otherwise. The result holds its collapse order.
 
-    Raises: ValueError if vertex_count is not positive, is larger than the body, or is too small for
-    its topology.
+    Raises: ValueError if `vertex_count` is not positive, or larger than the body's number of
+    vertices, or so small that no allowed collapses lead to it.
     """
     return decimate_with_kept(body, vertex_count)[0]
 

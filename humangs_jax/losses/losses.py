@@ -86,8 +86,10 @@ def loss_terms(
     renderings must be drawn on the backgrounds of `images`. If `drawn` has no opacities, only terms
     that compare colors are returned.
 
-    depths: true z of the person, metres, see `surface_distance`. Raises: ValueError if a term has a
-    weight but what it needs is missing.
+    depths: true z of the person, metres, see `surface_distance`.
+
+    Raises: ValueError if a term has a weight but what it needs is missing, or if the images are too
+    small for `structural_scales` or for a network.
     """
     rgb, alpha, opacities = drawn.rendering.rgb, drawn.rendering.alpha, drawn.opacities
     structural = functools.partial(
@@ -187,7 +189,7 @@ def surface_distance(
     alpha and mask.
 
     It is 0 where the true depth is 0, which means unknown. It is at most `FAR_SURFACE`, because
-    across a silhouette the nearest surfaces are different limbs.
+    beside a silhouette the two surfaces may belong to different limbs.
     """
     known = target_depth > 0
     return alpha * mask * known * jnp.minimum(jnp.abs(depth - target_depth), FAR_SURFACE)
@@ -239,8 +241,8 @@ def psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Sca
 def masked_psnr(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], mask: Float[Array, "h w"]
 ) -> Scalar:
-    """Returns the PSNR over the pixels of a mask, dB. Each pixel counts by its coverage. The result
-    is `LARGEST_PSNR` if the mask is empty.
+    """Returns the PSNR over the pixels of a mask, dB. The error of each pixel is weighted by the
+    mask. The prediction is clipped to [0, 1]. The result is `LARGEST_PSNR` if the mask is empty.
     """
     errors = jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target), axis=-1)
     return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
@@ -373,7 +375,7 @@ def similarity_map(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], window: SsimWindow = GAUSSIAN
 ) -> Float[Array, "y x c"]:
     """Returns the SSIM per pixel and channel, (h - size + 1, w - size + 1, c). It is 1 where the
-    images agree.
+    images agree. Raises: as `blur`.
     """
     x, y = predicted - MIDDLE, target - MIDDLE
     moments = blur(jnp.concatenate([x, y, x * x, y * y, x * y], axis=-1), window)
@@ -388,8 +390,8 @@ def similarity_map(
 
 
 def mean_similarity(similarities: Float[Array, "y x c"], count: Int[Array, "2"]) -> Scalar:
-    """Returns the mean of the first count[0] rows and count[1] columns of a similarity map. Images
-    that were padded below and right need this.
+    """Returns the mean of the first count[0] rows and count[1] columns of a similarity map. This is
+    for images that were padded below and right.
     """
     inside = [jnp.arange(side) < n for side, n in zip(similarities.shape[:2], count, strict=True)]
     counted = jnp.where(inside[0][:, None] & inside[1], jnp.mean(similarities, axis=-1), 0.0)
@@ -401,7 +403,7 @@ def structural_dissimilarity(
     predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]
 ) -> Float[Array, "y x c"]:
     """Returns (1 - SSIM) / 2 for each channel and each place of the window inside of the image,
-    shaped as by `similarity_map`: from 0 (equal images) to 1 (inverse images).
+    shaped as by `similarity_map`: from 0 (equal images) to 1 (inverse images). Raises: as `blur`.
     """
     return 0.5 * (1 - similarity_map(predicted, target))
 

@@ -318,7 +318,7 @@ def lpips_distances(
     size: Int[Array, "2"] | None = None,
 ) -> Float[Array, " _"]:
     """Returns the distance of two images at each depth of the backbone, (depths,). vgg and alex
-    have five depths, squeeze has seven. The sum is `lpips`.
+    have five depths, squeeze has seven. The sum is `lpips`. Raises: as `lpips`.
     """
     maps = [lpips_features(weights, image, size) for image in (predicted, target)]
     return _distances(weights, *maps)
@@ -333,15 +333,17 @@ LpipsMaps = list[tuple[Float[Array, "_y _x _c"], Int[Array, "2"] | None]]
 def lpips_features(
     weights: Lpips, image: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
 ) -> LpipsMaps:
-    """Returns the features of an image that `lpips` compares. size: see `feature_maps`."""
+    """Returns the features of an image that `lpips` compares. size: see `feature_maps`. Raises: as
+    `feature_maps`.
+    """
     image = at_least_float32(image)
     maps = feature_maps(weights.backbone, BACKBONES[weights.net], _scaled(image), size)
     return [(_unit(at_least_float32(x)), own) for x, own in maps]
 
 
 def lpips_to(weights: Lpips, predicted: Float[Array, "h w 3"], target: LpipsMaps) -> Scalar:
-    """Returns the `lpips` distance between an image and another image, whose features are
-    `target`.
+    """Returns the `lpips` distance between an image and another image. target: the features of the
+    other image, as `lpips_features` returns them. Raises: as `feature_maps`.
     """
     return jnp.sum(_distances(weights, lpips_features(weights, predicted), target))
 
@@ -437,8 +439,10 @@ def perceptual_errors(
 def perceptual_loss(
     vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
 ) -> Scalar:
-    """Returns the published perceptual loss: the sum of `perceptual_errors`, each divided by its
-    entry of `DIVISORS`, divided by 255.
+    """Returns the published perceptual loss. Each of the `perceptual_errors` is divided by its
+    entry of `DIVISORS`. The loss is the sum of the quotients, divided by 255.
+
+    Raises: as `perceptual_errors`.
     """
     errors = perceptual_errors(vgg, predicted, target)
     return jnp.sum(errors / jnp.asarray(DIVISORS, errors.dtype)) / 255

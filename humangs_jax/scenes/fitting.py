@@ -62,7 +62,7 @@ class SceneFit(NamedTuple):
     gaussians: Gaussians
     """The Gaussians of the used slots."""
     steps: int
-    """The number of steps, including the steps of earlier calls that the checkpoint had."""
+    """The number of steps since the start, also those of earlier calls with the same checkpoint."""
     seconds: float
     """The time of this call, seconds."""
     psnr: float
@@ -92,7 +92,7 @@ def fit_scene(
         cameras: one for each image, in the same order, with or without lenses.
         points: points (n, 3) where Gaussians begin, as structure from motion finds them, or a pair
             (points, colors), or Gaussians. None or a pair without points: `SceneConfig.start`
-            random points where most cameras look.
+            random points, most of them where many cameras look.
         config: None: `SceneConfig()`.
         background: the color behind the scene: three numbers in [0, 1], a CSS name or "#rrggbb".
         checkpoint: path of a file. The state is written there each minute, at the end and at
@@ -107,13 +107,14 @@ def fit_scene(
 
     Raises:
         ValueError: images that do not fit their cameras, are not in [0, 1] or are too small for
-            SSIM; points that are not finite or not (n, 3), or more than the capacity; Gaussians
-            with deformations; a background whose name is no color.
+            SSIM; points or colors that are not finite or not (n, 3); an empty array of points; more
+            points or Gaussians at the start than the capacity; Gaussians with deformations; a
+            background that is no color.
         FileNotFoundError: a path of an image without a file.
         FileError: an image or a checkpoint that cannot be read, or a checkpoint of other photos,
             cameras, points, settings or another background.
         OSError: the checkpoint cannot be written.
-        TypeError: inside of `jit`, `vmap` and `grad`.
+        TypeError: an argument of another class; any call inside of `jit`, `vmap` and `grad`.
 
     Examples:
         >>> cameras = hg.load_cameras("garden/sparse/0")

@@ -42,8 +42,8 @@ SHARPNESS = 100.0
 value.
 """
 STEP = 0.1
-"""Distance between the nodes of the integral. The trapezoidal rule converges exponentially at this
-distance; tests compare it with the double sum.
+"""Distance between the nodes at which the trapezoidal rule evaluates the integral. Tests compare
+the result with the double sum.
 """
 REACH = 5.0
 """The upper end of the integral, where exp(-t^2) is below float32's rounding."""

@@ -28,8 +28,8 @@ PARALLEL = 1e-3
 is below this.
 """
 CANDIDATES = 16
-"""The number of random points among which the places of Gaussians are chosen, divided by the number
-of Gaussians.
+"""The number of random points for each Gaussian that begins at a random point. The places of all
+Gaussians are chosen among all these points.
 """
 SMALLEST = 1e-4
 """The least scale of a Gaussian at the start, as a share of the extent of the cameras. Without it,
@@ -85,6 +85,9 @@ def extent_of(views: Sequence[Camera]) -> Float[Array, ""]:
 def first_gaussians(points: Points, views: Sequence[Camera], config: SceneConfig) -> Gaussians:
     """Returns the first Gaussians of a scene. They have harmonics of the configured degree, unless
     the given Gaussians have harmonics already.
+
+    Raises: ValueError for points or colors that are not finite or not of shape (n, 3), and for an
+    empty array of points.
     """
     gaussians = points
     if not isinstance(gaussians, Gaussians):
@@ -100,7 +103,7 @@ def _points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the points and the colors of the first Gaussians, (n, 3) each.
 
-    Raises: ValueError for points or colors that are not finite or not of shape (n, 3).
+    Raises: as `first_gaussians`.
     """
     rng = np.random.default_rng(config.seed)
     if points is None or (isinstance(points, tuple) and len(points[0]) == 0):
@@ -158,7 +161,8 @@ def _middle(views: Sequence[Camera]) -> Float[np.ndarray, "3"]:
 
 def _at_points(points: np.ndarray, colors: np.ndarray, extent: float) -> Gaussians:
     """Returns round Gaussians at points. Their scales are `START_SHARE` times the mean distance to
-    the three nearest points, between `SMALLEST` times the extent and the extent.
+    the three nearest points, between `SMALLEST` times the extent and the extent. The extent takes
+    the place of that distance if there is only one point.
     """
     near = min(4, len(points))
     distances = np.full((len(points), 1), extent)

@@ -42,7 +42,7 @@ class SceneState:
     used: Bool[Array, " g"]
     """Which slots are Gaussians, (g,)."""
     moments: PyTree
-    """The moments of Adam, in the structure of the parameters."""
+    """The state of Adam: its number of steps, and the two moments of each parameter."""
     overflow: Int[Array, ""]
     """The number of (splat, tile) pairs that did not fit, in the worst step since the buffers were
     planned.

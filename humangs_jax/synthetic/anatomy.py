@@ -142,7 +142,7 @@ def limited(rotations: Rotations) -> Rotations:
 def excess(rotations: Rotations, joints: tuple[int, ...]) -> float:
     """Returns the largest angle by which one of some joints exceeds its limit, radians.
 
-    It is negative if all joints are within their limits.
+    It is at most 0 if all joints are within their limits.
     """
     return float(np.max(np.linalg.norm(rotations[list(joints)], axis=1) - LIMITS[list(joints)]))
 
@@ -215,8 +215,8 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -
     The rotation of the pelvis stays. pelvis: position of the pelvis joint (3,), metres; the ground
     is at y = 0.
 
-    Returns: the larger distance of an ankle from its place, metres. It is 0, but for rounding, if
-    both legs can reach.
+    Returns: the distance of the ankles from their places (the larger one of left and right),
+    metres. It is 0, but for rounding, if both legs can reach.
     """
     turn = rotation_matrix(rotations[Joint.PELVIS])
     missed = []

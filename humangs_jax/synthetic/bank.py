@@ -121,10 +121,10 @@ def bake_subject(
 def strongest_joints(
     weights: Float[np.ndarray, "n j"], count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keeps the `count` joints with the largest weights of each vertex.
+    """For each vertex, keeps the `count` joints that have the largest weights there.
 
     Returns: indices of the joints (n, k), strongest first, and their weights (n, k), scaled so that
-    the weights of a vertex sum to 1.
+    the weights of a vertex sum to 1. k is `count`, or the number of joints if that is smaller.
     """
     ids = np.argsort(-weights, axis=1, kind="stable")[:, :count]
     kept = np.take_along_axis(weights, ids, axis=1)
@@ -492,7 +492,7 @@ def _stacked(people: Sequence[dict[str, np.ndarray]], body: BodyModel, split: st
 def mirrored_joints(names: tuple[str, ...]) -> tuple[int, ...]:
     """Returns for each joint the index of the joint on the other side.
 
-    A joint in the middle has its own index.
+    A joint in the middle has its own index. Raises: ValueError if one of a pair is missing.
     """
     other = {"left": "right", "right": "left"}
     swapped = []

@@ -119,8 +119,8 @@ class Scene:
     vertices: Float[Array, "o n 3"]
     """Posed vertices of the dressed person, (o, n, 3), metres."""
     corners: Float[Array, "o f 15"]
-    """Values of the three corners of each face, (o, f, 15). Each corner has five: normal (3),
-    openness, and the share of the key light that arrives there.
+    """Values of the three corners of each face, (o, f, 15). Each corner has five numbers:
+    normal (3), openness, and the share of the key light that arrives there.
     """
     dyes: Float[Array, "m 3 3"]
     """Matrix that recolors each piece, (m, 3, 3), see `surroundings.dyes_from`."""
@@ -436,7 +436,8 @@ def _sample(
 
 
 def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
-    """Returns views of the same person with left and right exchanged. The cameras are batched.
+    """Returns views of a person with left and right exchanged. `displacement` and `unknown` stay as
+    they are.
 
     joints: for each joint, the index of the joint on the other side.
     """
@@ -534,7 +535,9 @@ class EachPerson:
     bank: PeopleBank
     """The people."""
     config: OnTheFlyConfig
-    """What each example shows."""
+    """What each example shows. The number of inputs that `example` is asked for takes the place of
+    `input_views`.
+    """
     input_counts: tuple[int, ...] = (4,)
     """Numbers of input photos that an example may have, as in `GeneratedSource`."""
     on_host: bool = False
@@ -573,7 +576,8 @@ def jitted_example(
 ) -> Example:
     """Calls `on_the_fly_example`, compiled once for each configuration and shape of the bank.
 
-    On a CPU it is compiled with `core.processes.CPU_COMPILER_OPTIONS`.
+    On a CPU it is compiled with `core.processes.CPU_COMPILER_OPTIONS`. Raises: as
+    `on_the_fly_example`.
     """
     return _compiled()(bank, key, config=config, person=person)
 
@@ -596,7 +600,9 @@ def on_the_fly_source(
 
     each_once: whether each person of the bank is shown once, in order; otherwise people are random.
     input_counts: numbers of input views, in place of `config.input_views`. A program is compiled
-    for each. on_host: see `GeneratedSource`.
+    for each number. on_host: see `GeneratedSource`.
+
+    Raises: ValueError if the bank is from no split, unless `each_once` is True.
     """
     if each_once:
         return EachPerson(bank, config, input_counts, on_host)

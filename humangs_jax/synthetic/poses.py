@@ -3,8 +3,9 @@
 Poses keep to the limits of the joints, and the person stands on the ground. A stance places the
 feet and the pelvis. For each arm many candidates are drawn, and the one with the least cost is
 kept. The cost is the distance of the wrist from a goal, plus penalties where forearm and hand come
-too near to trunk, head, legs or the other arm, or where the shoulder exceeds its limit. Hands blend
-a few gestures. `anatomy` has the joints, their limits and the conventions.
+too near to trunk, head, legs or the other arm, or where the shoulder exceeds its limit. Each hand
+is between the relaxed gesture and a random one. `anatomy` has the joints, their limits and the
+conventions.
 """
 
 import dataclasses
@@ -69,8 +70,8 @@ def take_stance(
 
     heading: turn of the person about y, radians.
 
-    Returns: the position of the pelvis (3,) over the ground at y = 0, and the larger distance by
-    which an ankle misses its place, both in metres.
+    Returns: the position of the pelvis (3,) over the ground at y = 0, and the distance of the
+    ankles from their places (the larger one of left and right). Both are in metres.
     """
     turn = kin.turned(y=heading) @ kin.turned(x=stance.tilt, z=stance.roll)
     rotations[Joint.PELVIS] = kin.rotation_vector(turn)
@@ -104,9 +105,9 @@ def _pair(
     """Draws two flat feet, left and right, each about as far from the middle as its hip.
 
     Lengths are in lengths of a leg, angles in radians. width: distance of a hip from the middle.
-    spread: range of the distance by which a foot is further from the middle. apart: range of the
-    shift of a foot forward or back. turn_out: range of the angle by which a foot is turned
-    outwards.
+    spread: range of the distance by which a foot is further from the middle than its hip. apart:
+    range of the shift of a foot forward or back. turn_out: range of the angle by which a foot is
+    turned outwards.
     """
     feet = []
     for sign in (1, -1):

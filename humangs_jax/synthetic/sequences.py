@@ -42,8 +42,8 @@ _FLAT_UNTIL = 0.55
 _SMOOTHING = 4
 """Number of frames on each side over which the height of the pelvis is smoothed."""
 _SPARE = 0.995
-"""Largest distance from hip to ankle for which the height of the pelvis is chosen, as a share of
-the leg's length.
+"""Largest distance from hip to ankle, as a share of the leg's length, that the choice of the
+pelvis's height allows.
 """
 _TRIES = 12
 """Largest number of times that an arm is drawn until it is clear of the body."""

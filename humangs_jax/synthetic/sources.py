@@ -22,7 +22,12 @@ def people_of_run(people: int, out: Path, body: BodyModel) -> SourceFactory:
     """Returns a function that makes a source of the first people of the training split. They are
     rendered anew for every step.
 
-    people: number of people. out: folder of the run, which keeps their bank.
+    people: number of people. out: folder of the run, which keeps their bank. body: the package's
+    body.
+
+    Raises: ValueError if `people` is less than 1 or more than the split has, if the body is not the
+    package's body, or if the bank in the folder cannot be read; OSError if the bank cannot be
+    written, or if a process that makes people is killed.
     """
     return on_the_fly_people(_bank(people, out, body))
 
@@ -33,10 +38,11 @@ def people_of_split(
     """Returns a function that makes a source of the first people of a split. They are rendered anew
     for every step.
 
-    people: number of people. size: side of the images, pixels. Textures are as fine as images of
-    this size need. each_once: see `on_the_fly_people`.
+    people: number of people. body: the package's body. size: side of the images, pixels. Textures
+    are as fine as images of this size need. each_once: see `on_the_fly_people`.
 
-    Raises: ValueError if the split has fewer people; KeyError if there is no such split.
+    Raises: ValueError if `people` is less than 1 or more than the split has, or if the body is not
+    the package's body; KeyError if there is no such split.
     """
     texture = 1024
     if size <= 64:

@@ -133,7 +133,7 @@ class Person:
     betas: Float[np.ndarray, " s"]
     """Shape coefficients of the body, (s,)."""
     male: bool
-    """Whether the person is dressed as a man."""
+    """Whether the person is a man. The odds of shape, colors, hair and clothes depend on it."""
     years: float
     """Age, years."""
     stature: float
@@ -149,7 +149,9 @@ class Person:
 
 
 def describe(seed: int, body: BodyModel) -> Person:
-    """Describes the person of a seed, without building any geometry."""
+    """Describes the person of a seed, without building any geometry. Raises: KeyError if the body
+    lacks a shape direction of the package's body, such as "age".
+    """
     rng = np.random.default_rng([seed, 0])
     male = bool(rng.random() < 0.5)
     years = float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS))
@@ -258,7 +260,7 @@ def check_body(body: BodyModel) -> None:
 def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> SyntheticSubject:
     """Builds the person of a seed.
 
-    person: the description that is built, for example one with other clothes. None: the description
+    person: the description to build from, for example one with other clothes. None: the description
     of the seed.
 
     Raises: ValueError if the body is not the package's body.

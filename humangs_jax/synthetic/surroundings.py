@@ -34,8 +34,8 @@ DISTANCE_FACTOR = (1.8, 2.2)
 _CLOSE_FACTOR = (0.8, 1.7)
 """Range of distances of close cameras, in bounding radii; they show parts of the person."""
 CLOSE_SPREAD = 0.85
-"""A close camera looks at a point between the middle of the person and the surface: at most this
-share of the way to the surface.
+"""A close camera looks at a point on the way from the middle of the person to the surface. The
+point is at most this share of the way from the middle.
 """
 CLEARANCE = 0.3
 """Least distance of a close camera from the surface, metres."""
@@ -494,10 +494,10 @@ def light_points(
 ) -> _Vectors:
     """Returns the colors (p, 3) of points on faces.
 
-    corners: values of the three corners of each point's face (p, 15). Each corner has five: normal
-    (3), openness, and the share of the key light that arrives. weights: the point's weights of the
-    three corners (p, 3). behind: whether the inner side of the face is seen (p,). albedo, slopes,
-    sheen: of the material at the point.
+    corners: values of the three corners of each point's face (p, 15). Each corner has five numbers:
+    normal (3), openness, and the share of the key light that arrives. weights: the point's weights
+    of the three corners (p, 3). behind: whether the inner side of the face is seen (p,). albedo,
+    slopes, sheen: of the material at the point.
     """
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
     blended = wa * corners[:, :5] + wb * corners[:, 5:10] + wc * corners[:, 10:]

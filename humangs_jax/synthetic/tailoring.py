@@ -46,7 +46,9 @@ NECKLINES = {
 distance from the axis of the neck beyond which shoulders are always covered, both in metres.
 """
 HEM_MARGIN = 0.012
-"""Skin is removed if it is further inside of a hem than this, metres in template coordinates."""
+"""Skin is removed if it is further inside of a hem than this, metres in template coordinates. Some
+garments have other margins.
+"""
 
 
 def neckline(template: Points, style: str, depth: float) -> Field:

@@ -367,8 +367,8 @@ def sewn(
 ) -> Callable[[Spots], Points]:
     """Returns a function that gives the colors (n, 3) of points of a garment.
 
-    The colors are those of the fabric with stitches, seams, prints, stripes, ribs and the trimmings
-    of `_SEWN_ON`.
+    The colors are those of the fabric with stitches at the hem, and with seams, ribs, a print,
+    stripes and trimmings of `_SEWN_ON` if the garment has them.
 
     hem: template height of the stitches at the hem. sleeve: |x| of the stitches at the cuffs. None:
     there are no cuffs and no ribs. seams: whether there are seams.

@@ -3,8 +3,8 @@
 out/manifest.json                    settings of the set and finished subjects, see `data.sets`
 out/SEED/                            a capture (docs/capture_format.md): views of one person in one
                                      or several poses
-out/SEED/held_out/                   a separate capture with the views that reconstruction may not
-                                     see
+out/SEED/held_out/                   if `Layout.held_out_views` is not 0: a separate capture with
+                                     the views that reconstruction may not see
 out/SEED/motion.npz                  if `Layout.frames` is not 0: the whole motion. The capture
                                      shows some of its frames
 out/SEED/scan/                       if `Layout.scan_texture` is not 0: the first pose as a lit,
@@ -71,8 +71,8 @@ CAPTURE = "capture.json"
 
 
 class Stream:
-    """Numbers of the random streams of a seed from which poses and cameras are drawn. Stream 0 and
-    the streams from 11 on are for the person and for banks of people.
+    """Numbers of the random streams of a seed from which poses, motions and cameras are drawn.
+    Stream 0 and the streams from 11 on are for the person and for banks of people.
     """
 
     POSES, CAMERAS, HELD_OUT_CAMERAS, CLOSE_CAMERAS, MOTION = range(1, 6)
@@ -134,6 +134,8 @@ def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = Non
 
     The lowest point, with shoes, is at a height of about 0 most of the time. kind: None for a
     random one.
+
+    Raises: as `sample_sequence`.
     """
     sequence = sample_sequence(
         np.random.default_rng([subject.seed, Stream.MOTION]), subject.build, frames, kind
@@ -173,7 +175,8 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
     folder stays as before.
 
     Raises: ValueError if the folder has files but no capture, if the body is not the package's
-    body, or if the size of the scan's texture is no multiple of 128; OSError.
+    body, if the layout has no views, or if the size of the scan's texture is no multiple of 128;
+    OSError.
     """
     subject = make_subject(seed, body)
     # poses are independent, or evenly spaced frames of one motion
@@ -238,10 +241,10 @@ def write_set(
 
     Returns: the folders.
 
-    Raises: ValueError if the people reach beyond the split, if `out` was written with other
-    settings, for another split or body or by another version of the generator, or at the end if
-    some people could not be made; OSError if nothing can be written there; KeyError if there is no
-    such split.
+    Raises: ValueError if `subjects` is less than 1 or the people reach beyond the split, if the
+    manifest in `out` cannot be read, if `out` was written with other settings, for another split or
+    body or by another version of the generator, or at the end if some people could not be made;
+    OSError if a file cannot be written or a process is killed; KeyError if there is no such split.
     """
     out, seeds = Path(out), seeds_of(split, first, subjects)
     # a set is made with one set of settings, which its manifest keeps
@@ -322,8 +325,8 @@ def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ..
     split: the split that all people must belong to if `root` is a synthetic set. None: any. It is
     ignored if `root` has no manifest, as with real captures, and for sets of `humangs preprocess`.
 
-    Raises: ValueError if a synthetic set has a person of another split, if its manifest cannot be
-    read, or if there is no capture.
+    Raises: ValueError if a synthetic set has a person of another split or of none, if its manifest
+    cannot be read, or if there is no capture.
     """
     root = Path(root)
     folders = find_captures(root)

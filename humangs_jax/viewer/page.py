@@ -103,8 +103,9 @@ def pack(
     for sliders of shape; None: there are no sliders. motion_name: name that the page shows.
 
     Raises: ValueError (one line) for numbers that are not finite or out of range, for an avatar
-    without Gaussians or vertices, or with more than 256 joints, for a motion of another number of
-    joints, or for a body that does not explain the avatar's vertices.
+    without Gaussians or vertices, or with more than 256 joints, and for a motion of another number
+    of joints. If there is a body, ValueError also if it does not explain the avatar's vertices, or
+    if the number of Gaussians is no multiple of the number of vertices.
     """
     # a page with wrong numbers would show nothing and not say why
     check_values(
@@ -456,9 +457,11 @@ def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
 
 
 def known_body(avatar: Avatar) -> BodyModel | None:
-    """Returns the shipped body that has the avatar's vertices, for sliders of shape. Returns None
-    if no shape of that body has these vertices, if joints or faces differ, or if refinement has
-    added Gaussians.
+    """Returns the shipped body, for sliders of shape. It has its own mesh or that of the shipped
+    weights: the one that the avatar has.
+
+    Returns None if the avatar has another mesh or other joints, if no shape of the body has the
+    avatar's vertices, or if refinement has added Gaussians.
     """
     if avatar.parents != PARENTS:
         return None

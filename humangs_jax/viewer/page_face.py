@@ -16,8 +16,8 @@ from humangs_jax.body.motion import Motion
 def pack_face(
     avatar: Avatar, motion: Motion | None, header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> Avatar:
-    """Adds the face to the header and to the arrays. Returns the avatar with its hidden Gaussians
-    after the others.
+    """Adds the face to the header and to the arrays. Returns the avatar without its face. There the
+    hidden Gaussians of the face are ordinary Gaussians after the others.
 
     face_rows uint16 (g,): the row of `face_directions` that each Gaussian follows, 65535 for none.
     face_directions int16 (e, rows, 3): how rows move with each expression, in metres, divided by
