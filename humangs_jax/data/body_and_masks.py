@@ -56,11 +56,12 @@ def report_left_out(names: Sequence[str], reasons: dict[int, str]) -> None:
 
 def views_without_person(capture: Capture) -> dict[int, str]:
     """Returns the indices of the views that do not show the person, each with the reason. Either
-    the mask is empty, or less than `LEAST_SHARE` of the body's points in the photo lies on the
-    mask. Points on unknown pixels do not count, unless nearly all points are on such pixels.
+    the mask is empty, or no point of the body is in the photo, or less than `LEAST_SHARE` of the
+    points in the photo lies on the mask. Points on unknown pixels do not count, unless nearly all
+    points are on such pixels. The result is empty if there are no masks.
 
-    A view is not in the result if its posed body has numbers that are not finite. The code that
-    poses the body reports this fault.
+    A view with a mask that is not empty is not in the result if its posed body has numbers that are
+    not finite. The code that poses the body reports this fault.
     """
     found = dict.fromkeys(empty_views(capture.masks), "the mask is empty")
     if capture.masks is None or len(found) == capture.view_count:
@@ -108,8 +109,8 @@ def surface_points(
     frames: Int[np.ndarray, " v"],
     count: int,
 ) -> dict[int, Float[np.ndarray, "count 3"]]:
-    """Returns, for each frame that a view shows, points spread evenly over the skin of the posed
-    body, (count, 3), metres. Pose correctives are left out.
+    """Returns, for each frame that a view shows, points on the skin of the posed body, (count, 3),
+    metres. They are spread evenly over the skin in the T-pose. Pose correctives are left out.
     """
     rest = shaped(body, betas)
     joints = np.asarray(body.joint_regressor) @ rest

@@ -1,9 +1,10 @@
 """A calibration of any format in memory: its cameras, their conversion to the convention of
 captures, lens distortion, and checks.
 
-Readers return a `Calibration`. Its cameras have OpenCV's axes (x right, y down, z forward). Its
-unit of length, the world's up axis and the place of pixel centres are those of the format.
-`in_capture_convention` changes these to metres, y up and pixel centres at +0.5.
+Readers return a `Calibration`. Its cameras have OpenCV's axes (x right, y down, z forward). The
+world's up axis and the place of pixel centres are those of the format. So is the unit of length,
+unless the reader has converted lengths to metres. `in_capture_convention` changes these to metres,
+y up and pixel centres at +0.5.
 """
 
 import dataclasses
@@ -33,7 +34,9 @@ rotation. Rounding to three decimals (EasyMocap) stays below it. Rounded rotatio
 the nearest rotation.
 """
 LARGEST_COEFFICIENT = 1e100
-"""The largest coefficient of a lens. Products of larger ones are not finite."""
+"""Coefficients of a lens are clipped to this magnitude where the reach of the lens is computed, so
+that the numbers stay finite.
+"""
 ROTATION_TO_Y_UP = {
     "+x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
@@ -133,7 +136,9 @@ class Calibration:
     cameras: tuple[CalibratedCamera, ...]
     """The cameras, at least one."""
     per_image: bool
-    """Whether there is one camera for each image, not one for each camera."""
+    """Whether `cameras` has an entry for each image. False: it has one for each real camera, which
+    may have taken many images.
+    """
     pixel_centers: PixelCenters
     """Where the centre of the first pixel is in this format, unless the user says otherwise."""
     up: str
@@ -356,6 +361,8 @@ def pose_matrix(
 def rotation(value: Any, file: object, field: str) -> Float[np.ndarray, "3 3"]:
     """Returns the 3 x 3 matrix of a rotation in a file. value: the 9 numbers of the matrix, or the
     3 numbers of a rotation vector (cv2.Rodrigues). A matrix is not checked to be a rotation.
+
+    Raises: CaptureError if these are not 9 or 3 finite numbers.
     """
     from scipy.spatial.transform import Rotation
 
@@ -396,8 +403,8 @@ def brown_conrady(values: Any, file: object, field: str) -> Float[np.ndarray, "5
 def pinhole_lens(values: Any, file: object, field: str) -> dict[str, Any]:
     """Returns the fields of a `CalibratedCamera` for OpenCV's list of coefficients.
 
-    Raises: CaptureError if there are not 4, 5, 8, 12 or 14 coefficients, or if one of the last two
-    of 14 (a tilted sensor) is not 0.
+    Raises: CaptureError unless these are 4, 5, 8, 12 or 14 finite numbers, and if one of the last
+    two of 14 (a tilted sensor) is not 0.
     """
     values = file_numbers(values, file, field).ravel()
     if len(values) not in COUNTS:
@@ -413,8 +420,11 @@ def pinhole_lens(values: Any, file: object, field: str) -> dict[str, Any]:
 
 
 def fisheye_lens(values: Any, file: object, field: str, refusal: CaptureError) -> dict[str, Any]:
-    """Returns the fields of a `CalibratedCamera` for the coefficients k1 k2 k3 k4 of a fisheye;
-    missing ones are 0. refusal: the error to raise if photos have to be undistorted.
+    """Returns the fields of a `CalibratedCamera` for the coefficients k1 k2 k3 k4 of a fisheye.
+    Missing coefficients become 0. Coefficients after k4 are kept unless all of them are 0.
+
+    refusal: the error to raise if photos have to be undistorted. Raises: CaptureError unless the
+    coefficients are finite numbers.
     """
     values = file_numbers(values, file, field).ravel()
     if values[4:].any():

@@ -8,8 +8,8 @@ folder on disk.
     me/images/*.png ...   one photo per view, all of one size; the same for masks
 
 docs/capture_format.md describes the format in full. Whatever is wrong in a folder is a
-`CaptureError`: one line that names the file, the field and what was expected. In memory the images
-have a white background wherever masks are known.
+`CaptureError`: one line that names the file, the field if a value is wrong, and what was expected.
+In memory the images have a white background wherever masks are known.
 """
 
 import dataclasses
@@ -325,7 +325,8 @@ def load_capture(
         The capture in memory. Photos with masks are on white.
 
     Raises:
-        CaptureError: for whatever is wrong in the folder, one line with file and field.
+        CaptureError: for whatever is wrong in the folder. The error is one line that names the
+            file, and the field if a value is wrong.
 
     Examples:
         >>> capture = hg.load_capture("demo_capture")
@@ -480,8 +481,8 @@ def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
 
 
 def _check_before_writing(capture: Capture) -> None:
-    """Check a `Capture` that may have been made by hand. Its faults are those that reading would
-    refuse, too.
+    """Check a `Capture` that may have been made by hand. What reading would refuse is refused here,
+    too.
 
     Raises: CaptureError.
     """

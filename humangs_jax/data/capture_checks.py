@@ -38,7 +38,9 @@ than this.
 
 
 class CaptureError(FileError):
-    """A fault in a capture. The message is one line: file, field, and what was expected."""
+    """A fault in a capture. The message is one line: the file, the field if a value is wrong, and
+    what was expected.
+    """
 
 
 # Files
@@ -117,8 +119,8 @@ def expect(value: Any, kind: type, file: object, field: str) -> Any:
 
 
 def members(value: Any, file: object, field: str = "", /, **kinds: type) -> list[Any]:
-    """Returns the members of a JSON object that `kinds` names, in its order, after checking their
-    types. kinds: the type of each member by name.
+    """Returns the members of a JSON object that `kinds` names, in the order of `kinds`, after
+    checking their types. kinds: the type of each member by name.
 
     Raises: CaptureError.
     """
@@ -158,8 +160,11 @@ numbers = functools.partial(file_numbers, dtype=np.float32)
 def floats(
     value: Any, file: object, field: str, shape: tuple[int, ...]
 ) -> Float[np.ndarray, "*shape"]:
-    """Returns finite float64 numbers, nested in any way, reshaped to `shape` in row-major order.
-    Raises: CaptureError if there are more or fewer numbers, or if they are not finite.
+    """Returns finite float64 numbers, reshaped to `shape` in row-major order. value: an array, or
+    nested lists, of any shape with that many numbers.
+
+    Raises: CaptureError if there are more or fewer numbers, if nested lists have unequal lengths,
+    or if something is not a finite number.
     """
     array = file_numbers(value, file, field)
     if array.size != np.prod(shape):
@@ -272,7 +277,7 @@ def shape_coefficients(
     them, betas need a number for each of them, or have to be 0.
 
     Raises: CaptureError for a coefficient that is not 0 if the body has no such direction, and if
-    there is not one name for each coefficient.
+    there are not as many different names as coefficients.
     """
     directions = body.shape_names or tuple(
         f"shape_{i}" for i in range(body.shape_directions.shape[-1])

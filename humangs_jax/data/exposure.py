@@ -45,15 +45,18 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh, vertex_normals
 EXPOSURE_SIZE = 256
 """Side of the squares around the person that are compared, pixels."""
 FACING = 0.5
-"""A photo shows a point if the cosine of the angle between its normal and the direction to the
-camera is more than this.
+"""A photo shows a point only if the cosine of the angle between the point's normal and the
+direction to the camera is more than this.
 """
 THICKNESS = 0.02
-"""A photo shows a point if it lies less than this behind the nearest surface, metres."""
+"""A photo shows a point only if the point lies less than this behind the nearest surface, metres.
+"""
 INSIDE = 5
-"""Side of the square around each point, pixels. The square must lie in the mask."""
+"""Side of the square around each point, pixels. A photo shows a point only if the square lies in
+the mask, see `WHOLE`.
+"""
 WHOLE = 0.99
-"""A point is used if the mask is above this everywhere in the square with side `INSIDE`."""
+"""A square of side `INSIDE` lies in the mask if the mask is above this everywhere in the square."""
 BLUR = 3
 """Side of the square over which colors are averaged, pixels."""
 USABLE = (0.06, 0.95)
@@ -225,8 +228,8 @@ FITS = 16
 the fit before.
 """
 REDESCENDING = 8
-"""Number of fits, the last of `FITS`, after which the rows get Cauchy's weights. Parts that differ
-then lose nearly all influence. If the first fits were followed by these weights, too, the result
+"""After each of this many fits, the last ones of `FITS`, the rows get Cauchy's weights. Parts that
+differ then lose nearly all influence. With these weights after the first fits, too, the result
 would depend on where the search starts.
 """
 
@@ -266,12 +269,13 @@ def gains_between(
     groups: Int[np.ndarray, " v"],
     frames: Int[np.ndarray, " v"],
 ) -> Float[np.ndarray, "v 3"]:
-    """Returns gains that make groups of views equal, (v, 3): a row for each view. The groups share
-    too few points to be compared by these. All views of a group have the same gains. The gains are
-    found from the colors of the body's parts.
+    """Returns gains that make groups of views equal, (v, 3): a row for each view. All views of a
+    group have the same gains. Views of different groups share too few points, so the groups are
+    compared by the colors of the body's parts.
 
     If two groups share a frame, all photos count as taken in one light. Gains are then 1 if the
-    white balances hardly differ, see `OTHER_LIGHT`.
+    white balances hardly differ, see `OTHER_LIGHT`. Gains are also 1 if no two groups show the same
+    part.
 
     Arguments:
         colors: in [0, 1], in equal exposure within each group.

@@ -71,10 +71,10 @@ CAPTURE = Reason("folder", "that is a capture already")
 
 @dataclasses.dataclass(frozen=True)
 class Unused:
-    """A file that is not used."""
+    """A file or a folder that is not used."""
 
     path: Path
-    """The path of the file."""
+    """The path of the file or folder."""
     why: Reason
     """The reason."""
 
@@ -88,8 +88,9 @@ class FolderScan:
     photos: tuple[Path, ...]
     """The photos, sorted by path."""
     unused: tuple[Unused, ...] = ()
-    """The files and folders that are not used, sorted by path. Videos are among them only if there
-    are photos. Files that nobody takes for a photo or a video are not among them.
+    """The files and folders that are not used, sorted by path. Videos that could be read
+    (`VIDEO_SUFFIXES`) are among them only if there are photos. Files that nobody takes for a photo
+    or a video are not among them.
     """
     masks: tuple[Path, ...] = ()
     """The masks of the photos, if each photo has a mask in its own folder. Otherwise this is empty,
@@ -103,7 +104,7 @@ def scan_folder(folder: Path, skip: Callable[[Path], bool] = lambda place: False
 
     Arguments: skip: returns whether a subfolder holds something other than photos. Such a subfolder
     is not searched.
-    Raises: CaptureError if the folder cannot be read.
+    Raises: CaptureError if the folder cannot be read, or holds more than the limit `entries`.
     """
     if not folder.is_dir():
         return FolderScan(folder, ())

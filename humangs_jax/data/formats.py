@@ -69,7 +69,9 @@ class CameraFormat(SourceFormat):
     pixel_centers: Literal["integer", "half"] = "integer"
     """Where the centre of the first pixel is: at (0, 0) or at (0.5, 0.5)."""
     per_image: bool = False
-    """Whether there is one camera for each image, not one for each camera."""
+    """Whether files have an entry for each image. False: they have one for each real camera, which
+    may have taken many images.
+    """
     unit: float | None = None
     """Metres per unit of length. None: the format states no unit, or its reader converts lengths to
     metres.
@@ -503,8 +505,8 @@ class DataSetFormat(Format):
 
     find: str | Callable[[Path], tuple[Path, ...]] = ""
     """The function that finds the subjects below a path, or its name as "package.module:function".
-    It returns their sorted paths. If the path itself is a subject, a list of people or a folder of
-    scans, it returns this path alone. The result is empty if the path has another layout.
+    It returns their sorted paths. If the path is the folder of one subject, a list of people or a
+    folder of scans, it returns this path alone. The result is empty if the path has another layout.
     """
     lists: bool = False
     """Whether one file lists many people. The code is then called as code(path, body, size), and

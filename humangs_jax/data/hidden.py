@@ -28,7 +28,9 @@ from humangs_jax.data.vertex_offsets import silhouette
 from humangs_jax.io.images import resized
 
 LONGEST = 512
-"""Longest side of the photos in which silhouettes are compared, pixels."""
+"""Largest length of the longer side of the photos in which silhouettes are compared, pixels. Larger
+photos are reduced.
+"""
 INSIDE = 0.035
 """A hole is looked for where the silhouette's edge is farther away than this, metres. Fitted bodies
 are off by less.

@@ -54,21 +54,21 @@ LEAST_PART = 0.005
 and not the person.
 """
 WHITE = 0.98
-"""A photo shows no background if no channel of a pixel farther than `REACH` outside of the mask is
-darker than this. No edge can then be found.
+"""A photo shows no background if no pixel farther than `REACH` outside of the mask has a channel
+below this. No edge can then be found.
 """
 SECTORS = 16
-"""Number of sectors. Sectors divide the silhouette by the angle about its middle, and have equally
-many points.
+"""Largest number of sectors. Sectors divide the silhouette by the angle about its middle, and have
+equally many points.
 """
 SECTOR_POINTS = 8
 """The least number of points of a sector. Where points are few, there are fewer sectors."""
 AGREE = 0.7
-"""Least share of the votes that must be for the move, among the votes of all views that would be
-moved in the same direction. Sectors vote, see `_sector_votes`.
+"""A mask is moved only if at least this share of the votes is for the move. The votes of all views
+that would be moved in the same direction are counted. Sectors vote, see `_sector_votes`.
 """
 AGREE_ALONE = 0.5
-"""Least share of the votes that must be for the move, among the votes of the view."""
+"""A mask is moved only if at least this share of the votes of its own view is for the move."""
 EDGE = 0.06
 """There is an edge where the mask ends if the colors change enough across this end. The change must
 be more than (1 + `OF_TEXTURE`) times the change beside it plus `EDGE` times the strongest change in
@@ -77,16 +77,16 @@ the sector.
 OF_TEXTURE = 1.0
 """Weight of the change of colors beside an edge, see `EDGE`."""
 SEEN_APART = 1.5
-"""A sector votes for a move if its edge is at most this many units away from where the silhouette
-would move to. An edge where the mask ends is looked for only if the mask is off by at least this
-many pixels of the image that is searched.
+"""A sector votes for a move only if its edge is at most this many units away from where the
+silhouette would move to. An edge where the mask ends is looked for only if the mask is off by at
+least this many pixels of the image that is searched.
 """
 CLEAR = 1.3
 """Colors are not blurred by an edge that is at least this far away, pixels."""
 THIN = 0.0007
-"""A mask that has grown by its excess has no part thinner than twice the excess. Masks are not
-moved if their thinner parts are larger than this, as a share of the area that the masks would lose,
-on average over the views.
+"""Largest area of the thin parts of a mask, divided by the area that the mask would lose, see
+`_thin_parts`. The mean over all views that would be moved in the same direction counts. If it is
+larger, none of these masks is moved.
 """
 
 
@@ -161,7 +161,7 @@ def masks_at_edges(
 
 def _believed(shift: _Shift, seen: Sequence[_Shift]) -> bool:
     """Returns whether a shift corrects the mask, and does not follow edges within the person. seen:
-    the shifts of all views.
+    the shifts of all views in which one was looked for.
     """
     alike = [other for other in seen if other.excess * shift.excess > 0]
     if not alike or 2 * len(alike) < len(seen) or np.mean([other.thin for other in alike]) > THIN:
@@ -450,8 +450,8 @@ LEAST_WEIGHT = 1e-3
 less, the rim stays as it is. Fingers, for example, are too thin to have such pixels.
 """
 CONTRAST = 0.02
-"""A pixel may be cleaned if the distance between the two means (see `DEPTH`) is more than this, as
-RGB in [0, 1].
+"""A pixel may be cleaned if the two means (see `DEPTH`) are farther apart than this, as points in
+RGB with values in [0, 1].
 """
 CERTAIN = 0.15
 """A pixel is cleaned if the background's share in its color is more than this."""

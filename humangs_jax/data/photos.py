@@ -2,8 +2,8 @@
 frame that each view shows.
 
 No body is needed to read the photos. `humangs import cameras` writes such a folder without a body,
-and `humangs fit` adds the body. Every fault is a `CaptureError`, one line with file and field.
-docs/capture_format.md describes the format.
+and `humangs fit` adds the body. Every fault is a `CaptureError`, one line that names the file, and
+the field if a value is wrong. docs/capture_format.md describes the format.
 """
 
 import contextlib
@@ -65,7 +65,7 @@ LARGEST_LABEL = 20 / 255
 not hold coverage.
 """
 NEARLY_WHITE = 0.9
-"""A mask also holds labels if its values are 0 and one other value, and this one is below
+"""A mask also holds labels if its values are 0 and one other value, and the other value is below
 `NEARLY_WHITE`.
 """
 LEAST_LABELLED = 1e-3
@@ -105,7 +105,7 @@ def load_photos(path: str | Path, *, fit_masks: bool = False) -> Photos:
     """Read the photos of a capture folder. The folder need not have a body.npz. fit_masks: see
     `read_photos`.
 
-    Raises: CaptureError, one line naming file and field.
+    Raises: CaptureError, one line that names the file, and the field if a value is wrong.
     """
     folder = capture_folder(path)
     with reading(folder / "capture.json", "capture", CaptureError):
@@ -130,8 +130,8 @@ def read_description(file: Path) -> dict[str, Any]:
     """Read capture.json, and check its keys and the types of its values. The frames and matrices of
     the views are not checked.
 
-    The paths in it must stay inside the folder. The limit `photos_outside` allows others for photos
-    and masks. Raises: CaptureError.
+    The paths in it must stay inside the folder. The limit `photos_outside` allows other paths for
+    photos, masks and images of unknown pixels. Raises: CaptureError.
     """
     description = checked_json(
         file, missing="no such file: a capture is a folder with a capture.json"
@@ -498,7 +498,7 @@ def read_view(
 
     The third result is True if there is a mask and the image still shows its background. It is
     False if the image is on white, or if there is no mask. on_white: whether images that have a
-    mask file are on white already.
+    mask file are on white already. Raises: CaptureError.
     """
     image, alpha = read_checked(read_image, folder / view["image"])
     if alpha is not None:

@@ -50,7 +50,7 @@ class PreparedCapture:
     not certain.
     """
     chosen: bool = False
-    """Whether only some of the views that show the person are used, see `select`."""
+    """Whether views were chosen by `select`. If not, all views that show the person are used."""
     body: BodyModel | None = None
     """The body that carries the Gaussians, with a skirt where the photos show one.
 
@@ -136,8 +136,9 @@ def prepare_capture(
     """Decide which photos are used, and how. `reconstruct`, `refine` and `check_capture` can then
     share the result.
 
-    A `PreparedCapture` is not prepared again. If `views` asks for fewer views, it loses some. If it
-    has no body for the network of `config`, it gets one. Otherwise it is returned as it is.
+    A `PreparedCapture` is not prepared again. If `views` is "auto" or less than the number of its
+    views, some of its views are chosen. If it has no body for the network of `config`, it gets one.
+    Otherwise it is returned as it is.
 
     Args:
         capture: photos, cameras, poses, and masks if there are some.
@@ -152,7 +153,8 @@ def prepare_capture(
 
     Raises:
         CaptureError: one line that names the views, if none shows the person.
-        ValueError: for `views` below 1, or a word other than "auto".
+        ValueError: for `views` below 1, or a word other than "auto"; with a `config`, also as
+            `data.views.gaussian_body`.
 
     Examples:
         >>> variables, config = hg.load_weights()

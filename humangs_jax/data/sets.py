@@ -73,9 +73,9 @@ def begin_set(
     """Start a set in a folder, or check that the set in it can be continued.
 
     Arguments: made_with: what the whole set is made with; its entry `SETTINGS` is a dictionary.
-    alone: whether a new set needs an empty folder.
-    Raises: CaptureError if the folder has a set of another kind, or one that was made with
-    something else. ValueError if `alone` is True and the folder of a new set is not empty.
+    alone: whether a new set needs an empty folder. Entries that begin with a dot do not count.
+    Raises: CaptureError if the folder has a set of another kind or version, or one that was made
+    with something else. ValueError if `alone` is True and the folder of a new set is not empty.
     """
     if not (folder / MANIFEST).is_file():
         if (
@@ -137,7 +137,7 @@ def write_manifest(
 
 def finished(folder: Path, mark: str) -> list[str]:
     """Returns the sorted names of the subfolders that hold the file `mark`. A subfolder with this
-    file is complete.
+    file is complete. Names that begin with a dot are left out.
     """
     return sorted(
         path.parent.name

@@ -9,9 +9,10 @@ smoothly between them. A row of the skirt follows the outer halves of both legs,
 between them. From there the vertices are displaced along their normals to the edges of the masks,
 as the body is (`data.vertex_offsets`).
 
-Points between the legs that a photo shows beside both legs are compared with the masks. If they lie
-inside the masks, there is a skirt. It ends above the first row whose points do not. If no photo
-shows such points, there is no skirt. All of this runs on the host, by numpy and scipy.
+Points between the legs that a photo shows beside both legs are compared with the masks. If enough
+of them lie inside the masks, there is a skirt. It ends above the first row whose points lie outside
+the masks. If no photo shows such points, there is no skirt. All of this runs on the host, by numpy
+and scipy.
 """
 
 import jax
@@ -57,11 +58,13 @@ HALF = 13
 SKIRT_VERTICES = ROWS * 2 * (GAP + HALF)
 """Number of vertices of a skirt. They are the last ones of a body that has a skirt."""
 BESIDE = 0.02
-"""A point between the legs counts if it is farther than this from the skin of both legs in the
+"""A point between the legs counts only if it is farther than this from the skin of both legs in the
 photo, metres. Trousers may stand off from the skin by this much.
 """
 SHOWN = 0.8
-"""A row is part of a skirt if at least this share of its counted points is inside the masks."""
+"""A row that is judged (see `VOTES`) shows cloth if at least this share of its counted points is
+inside the masks.
+"""
 VOTES = 4
 """A row is judged if at least this many of its points count, in all photos together."""
 LEAST_ROWS = 4
@@ -119,7 +122,8 @@ def add_skirt(
 
 def find_hem(body: BodyModel, capture: Capture) -> float | None:
     """Returns the height down to which the photos show a skirt, in the measure of `TOP`, from `TOP`
-    to `BOTTOM`; None if they show no skirt.
+    to `BOTTOM`. Returns None if they show no skirt, if there are no masks, or if the body has no
+    legs that hang in the T-pose.
     """
     legs = _legs(body)
     if legs is None or capture.masks is None:
@@ -176,7 +180,8 @@ def with_tube(body: BodyModel, hem: float) -> BodyModel:
     """Returns the body with a tube around its legs, from `TOP` down to `hem`, in the measure of
     `TOP`. The tube's vertices come after those of the body.
 
-    Raises: ValueError if the body has no legs that hang in the T-pose, or as `_farthest`.
+    Raises: ValueError if the body has no legs that hang in the T-pose, or if its skin is not around
+    the lines from hip to knee to ankle.
     """
     # each vertex of the tube combines vertices of the body, and so does all that belongs to it
     combined = _tube(body, np.linspace(TOP, hem, ROWS))

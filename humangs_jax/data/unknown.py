@@ -47,7 +47,10 @@ KEYS_SHOWN = 6
 
 
 def binary_kind(file: Path) -> str | None:
-    """Returns the kind of a binary file in words; None for a file of text."""
+    """Returns the kind of a binary file in words; None for a file of text.
+
+    Raises: as `io.reading.open_file`.
+    """
     with open_file(file) as opened:
         head = opened.read(HEAD)
     known = (kind for start, kind in BINARIES.items() if head.startswith(start))

@@ -49,8 +49,8 @@ PROBE = 0.012
 whether it leaves the silhouette.
 """
 LEAVES = 0.6
-"""A vertex is on the silhouette if the move by `PROBE` takes it outwards, in the image, by more
-than this share of `PROBE`.
+"""A vertex near the silhouette's edge (see `NEAR`) is on the silhouette if the move by `PROBE`
+takes it outwards, in the image, by more than this share of `PROBE`.
 """
 DRAWN = 0.5
 """Silhouettes are drawn larger than they are by this much, pixels."""
@@ -71,7 +71,9 @@ bodies. The share was at least 0.03 for bodies that are a centimetre off. For a 
 to 0.06 with fits to keypoints alone, and at most 0.02 with fits refined by the masks.
 """
 LONGEST = 480
-"""The longest side of the window around the person in which silhouettes are compared, pixels."""
+"""The length of the longer side of the window around the person, pixels. Silhouettes are compared
+in this window.
+"""
 MARGIN = 0.12
 """The room on each side of the person, as a share of the longer side of the person's box."""
 
@@ -167,15 +169,16 @@ def fit_vertex_offsets(
     always: bool = True,
 ) -> Float[np.ndarray, "n 3"]:
     """Returns displacements of the vertices of a person's shaped body in the T-pose, (n, 3),
-    metres. They make the body fill the masks. Each step of the fit limits them (`OffsetFitConfig`,
-    `WRAP`).
+    metres. They make the body fill the masks. Each step of the fit limits how far vertices move
+    (`OffsetFitConfig`, `WRAP`).
 
     Displacements are 0 if all masks are empty, or if the masks are not near the body.
 
     Arguments: body: the capture's body, or one of `data.views.gaussian_body`. capture: has masks;
     its views may show any frames, and any axis may be up. inset: see `OffsetFitConfig`. always:
-    whether a body that fits the masks already is displaced, too, see `MISFIT`. If not, its
-    displacements are 0: displacing such a body would make the clothes that the network adds worse.
+    whether a body that fits the masks already is displaced, too, see `MISFIT`. If `always` is
+    False, the displacements of such a body are 0, because others would make the clothes that the
+    network adds worse.
     """
     assert capture.masks is not None
     rest = shaped(body, capture.betas)
@@ -204,7 +207,7 @@ def to_edges(
     move the surface along its normals to the edges of the masks.
 
     held: for each vertex, the weight that keeps it where it is. Each photo that shows the vertex on
-    the silhouette has weight 1.
+    the silhouette has weight 1. reach: how far and how smoothly the surface moves.
     """
     total = np.zeros_like(rest)
     for _ in range(reach.iterations):
@@ -437,7 +440,8 @@ def _outside(
 ) -> PerVertex:
     """Returns how far each vertex moves inwards, metres, so that vertices outside of a mask get
     into all masks. The moves of these vertices are smoothed over the mesh, so vertices near them
-    move, too. Vertices that are not free get no move of their own. The largest move is `WRAP`.
+    move, too. Vertices that are not free are moved only by this smoothing. The largest move is
+    `WRAP`.
     """
     reach = np.arange(0, WRAP + STEP / 2, STEP)
     inside = np.full((len(rest), len(reach)), np.inf)

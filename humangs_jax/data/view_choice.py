@@ -19,7 +19,7 @@ SELECTION_SIZE = 128
 tell which side of the body a photo shows.
 """
 SELECTION_VERTICES = 2000
-"""The number of vertices of the body on which photos are compared."""
+"""Largest number of vertices of the body on which photos are compared."""
 LEAST_GAIN = 0.03
 """Least gain of a further photo, as a share of the sum that the chosen photos reach (see
 `best_views`).
@@ -40,8 +40,8 @@ def best_views(capture: Capture, count: int | None) -> list[int]:
 
     Arguments:
         capture: photos that all show the person.
-        count: the number of photos. None: photos are chosen until the best further photo adds less
-            than `LEAST_GAIN`.
+        count: the number of photos. None: photos are chosen until the best further photo raises the
+            sum by less than the share `LEAST_GAIN`.
 
     Raises: ValueError for a count below 1.
     """
@@ -62,7 +62,7 @@ def best_views(capture: Capture, count: int | None) -> list[int]:
 def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0.0) -> list[int]:
     """Returns the indices of at most `count` rows of a matrix, in the order of their choice. Each
     further row is the one that raises the sum of the columns' maxima most. The choice stops when
-    the next row would raise the sum by less than `least` times the sum.
+    the next row would raise the sum by less than `least` times the sum that is reached already.
     """
     chosen, best = list[int](), np.zeros(quality.shape[1])
     for _ in range(min(count, len(quality))):
@@ -81,8 +81,8 @@ def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
 
     The quality is a product, divided by its largest value over all views and vertices. The product
     is the cosine of the angle between the normal and the direction to the camera, times the focal
-    length over the depth. It is 0 if the vertex is hidden, outside of the photo or outside of the
-    mask.
+    length over the depth. It is 0 if the vertex is hidden, faces away from the camera, or lies
+    outside of the photo or of the mask.
     """
     config = presets.small().with_conventions(pixels="person")
     inputs = prepare_inputs(body, views, config)

@@ -108,7 +108,8 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     The last four results are kept, because making one takes as long as running a small network on a
     CPU. A body that `has_mesh_of` accepts is returned as it is.
 
-    Raises: ValueError if `runtime` has both `max_edge_length` and `body_vertices`.
+    Raises: ValueError if `runtime` has both `max_edge_length` and `body_vertices`, and as
+    `decimate_with_kept` and `split_long_edges`.
     """
     asked = config.runtime
     if None not in (asked.body_vertices, asked.max_edge_length):
@@ -429,8 +430,8 @@ def to_network_views(
     displacement: Float[np.ndarray, "n 3"] | None = None,
 ) -> SubjectViews:
     """Returns a capture's photos in the form that the network takes: padded with white to a centred
-    square, or cropped, and resized to `size` pixels. The cameras are changed accordingly. Unknown
-    pixels are not passed on.
+    square, or cropped, and resized to `size` pixels. The cameras fit the new photos. Unknown pixels
+    are not passed on.
 
     If the capture has no masks, all masks in the result are 0. Only what the posed body covers then
     counts as foreground.

@@ -130,8 +130,8 @@ def find_people(
             capture with a folder held_out is an exception: only the views in that folder are
             compared.
 
-    Raises: ValueError, which names what is wrong; TypeError for cases that are no `Case`;
-    CaptureError when a capture is loaded.
+    Raises: ValueError, which names what is wrong; TypeError for cases that are no `Case`; as
+    `load_body` for the file of a body. `People.load` raises ValueError if a case cannot be loaded.
     """
     if indices is not None and not isinstance(source, Capture | str | Path):
         raise ValueError(
@@ -404,7 +404,9 @@ def predictions_method(folder: str | Path, people: int) -> Method:
     numbers them. An alpha channel is the coverage, and its image is put on the background. An image
     without alpha is taken to be on the protocol's background already.
 
-    Raises: FileNotFoundError if the folder does not exist.
+    Raises: FileNotFoundError if the folder does not exist. The method raises ValueError if an image
+    cannot be read or has another size than the true photo, or if only some of a person's images
+    have an alpha channel.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -438,8 +440,7 @@ def _predictions_of(case: Case, root: Path, people: int) -> Path:
 
 def prediction_files(root: Path, case: Case, people: int) -> dict[str, Path | None]:
     """Returns the file of the predicted image for each view of a case, by the name of the view;
-    None where there is no file.
-    root: folder of predictions.
+    None where there is no file. root: the folder of predictions.
     """
     place = _predictions_of(case, root, people)
     return {name: _prediction(place, name, i) for i, name in enumerate(case.truth.names)}
@@ -485,7 +486,9 @@ def choose_method(
     """Returns the name of the method that is asked for, as reports show it, and the method. If
     nothing is given, the shipped weights are used.
 
-    Raises: ValueError if more than one is given.
+    Raises: ValueError if more than one is given, if one avatar is given for several people, or if
+    the file of an avatar or of weights is damaged; FileNotFoundError if a file or the folder of
+    predictions does not exist.
     """
     given: dict[str, Any] = {
         "avatar": avatar,

@@ -60,6 +60,8 @@ class KeptScores:
     ) -> tuple[dict[str, Any], bool]:
         """Returns the results of a person, and whether they were read from the folder. If the
         folder does not have them, `score` computes them, and they are kept.
+
+        Raises: FileError for a damaged file in the folder; OSError; anything that `score` raises.
         """
         key = checksum({}, self._before, case_key(case), self._method(case))
         if self._ordered:

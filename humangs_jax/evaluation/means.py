@@ -39,11 +39,11 @@ class Mean(NamedTuple):
     mean: float
     """The mean."""
     low: float | None
-    """The lower end of the interval; None if the mean is of one value."""
+    """The lower end of the interval; None if there is only one value."""
     high: float | None
-    """The upper end of the interval; None if the mean is of one value."""
+    """The upper end of the interval; None if there is only one value."""
     count: int
-    """How many values the mean is of."""
+    """The number of values that were averaged."""
     over: str
     """What the values belong to: people, frames or images."""
 

@@ -57,9 +57,9 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 
 SIDE = 320
-"""Longest side of the images on the page, pixels."""
+"""Largest length of the longer side of the images on the page, pixels."""
 INPUT_SIDE = 128
-"""Longest side of the input photos on the page, pixels."""
+"""Largest length of the longer side of the input photos on the page, pixels."""
 QUALITY = 88
 """The quality of the JPEGs."""
 LARGEST_ERROR = 0.25
@@ -364,7 +364,7 @@ def evaluate(
             lowest PSNR.
         keep: a folder for the scores of finished people, so that the same call goes on after an
             interruption. Scores are kept with a checksum of photos, cameras, bodies, views and
-            weights, and reused only if nothing of these has changed. For a `method`, only its name
+            weights, and reused only if none of these has changed. For a `method`, only its name
             and its source code enter the checksum. If it reads other values than before, give
             another folder.
         progress: show a bar.
@@ -374,9 +374,11 @@ def evaluate(
 
     Raises:
         ValueError: of one line, if the protocol is unknown, more than one method is given, there is
-            nothing to compare, or sizes differ.
+            nothing to compare, sizes differ, the source or the file of `indices` does not exist, a
+            file is damaged, or `keep` has scores that were made with other settings.
         TypeError: for cases that are no `Case`.
-        OSError: for files that cannot be read.
+        OSError: if the file of an avatar, of weights or of a body or the folder of predictions does
+            not exist, or if scores cannot be kept.
 
     Examples:
         >>> scores = hg.evaluate("people", weights="weights.safetensors", protocol="lhm")

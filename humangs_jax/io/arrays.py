@@ -1,7 +1,7 @@
 """Checks arrays of files, computes their checksums, and reads npz archives without pickle.
 
 The functions `check_...` raise InvalidFileError, see `io.reading`. `ArrayFile` knows its file, so
-each of its errors is one line with file and key.
+each of its errors is one line that names the file, and the key if an array is wrong.
 """
 
 import hashlib

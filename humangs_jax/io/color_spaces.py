@@ -270,8 +270,8 @@ class Profile(NamedTuple):
 def read_profile(data: bytes) -> Profile:
     """Returns the ICC profile in some bytes.
 
-    Raises: InvalidFileError if the profile is damaged, or does not describe a photo in RGB, grey or
-    CMYK.
+    Raises: InvalidFileError if the profile is damaged, has more than 4 MiB, or does not describe a
+    photo in RGB, grey or CMYK.
     """
     # the header: size (profiles of presses have up to 3 MB), signature, kind of device and colors
     most = 4 << 20

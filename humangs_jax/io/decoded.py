@@ -58,8 +58,8 @@ _current: contextvars.ContextVar[Decoded | None] = contextvars.ContextVar("decod
 @contextlib.contextmanager
 def decoded_once(most: int = 256 << 20) -> Generator[None]:
     """Lets `io.images` decode each photo only once within the block. Pixels are kept as long as
-    they fit into `most` bytes. By default that is enough for twenty photos of four megapixels. At
-    the end of the block all pixels are dropped.
+    they fit into `most` bytes. By default that is enough for twenty photos of four megapixels that
+    are kept as bytes (see `WHOLE_LEVELS`). At the end of the block all pixels are dropped.
     """
     token = _current.set(Decoded(most))
     try:

@@ -113,10 +113,10 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     """Returns a mask, coverage in [0, 1], (h, w), from a grey image or from another image that
     segmentation tools write.
 
-    In an image with a palette, the mask is 1 where the image has the only label besides the
-    background. If label 0 is used, it is the background, and has to be black. Otherwise the only
-    black label is the background. If no black label is used, the mask is 1 everywhere, but label 0
-    has to be black in the palette. A palette of several greys is read like a grey image.
+    In an image with a palette and no transparency, the mask is 1 where the image has the only label
+    besides the background. If label 0 is used, it is the background, and has to be black. Otherwise
+    the only black label is the background. If no black label is used, the mask is 1 everywhere, but
+    label 0 has to be black in the palette. A palette of several greys is read like a grey image.
 
     In an image with colors, the mask is 1 where the image has the only color besides black.
 
@@ -124,8 +124,8 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     are all alike, or are the same mask.
 
     Raises: as `read_image`; FileError if it is not clear which part is the person. This is so if
-    there are several labels or colors, if label 0 is used and not black, if an image with colors
-    has no black, or if the alpha channel and the greys differ.
+    there are several labels or colors, if it is not clear which label is the background, if an
+    image with colors has no black, or if the alpha channel and the greys differ.
     """
     # labels of a palette without transparency
     with open_image(path) as (image, data):
@@ -221,8 +221,9 @@ def focal_length(path: str | Path) -> float | None:
     """Returns the focal length of a photo in pixels, from EXIF's 35-mm equivalent and the photo's
     diagonal.
 
-    Returns None if EXIF has no equivalent, or 0, or if the photo was cut out of the frame that EXIF
-    describes, see `cropped_from`. EXIF defines: equivalent / 43.27 mm = focal length / diagonal.
+    Returns None if EXIF has no equivalent above 0, or if the photo was cut out of the frame that
+    EXIF describes, see `cropped_from`. EXIF defines: equivalent / 43.27 mm = focal length /
+    diagonal.
     Raises: as `open_image`.
     """
     with open_image(path) as (image, data):
@@ -238,9 +239,9 @@ def focal_length(path: str | Path) -> float | None:
 
 
 def cropped_from(path: str | Path) -> tuple[int, int] | None:
-    """Returns the width and height in EXIF if their ratio differs from the photo's, because the
-    photo was cut out of that frame. Otherwise returns None, as for a photo that was made smaller or
-    turned.
+    """Returns the width and height of the frame that a photo was cut out of, from EXIF, see
+    `other_frame`. Returns None if EXIF shows no such frame, for example for a photo that was only
+    made smaller or turned.
 
     Raises: as `open_image`.
     """
@@ -372,7 +373,7 @@ def to_uint8(
 def named_color(name: str) -> tuple[float, float, float]:
     """Returns red, green and blue in [0, 1] of a CSS name or "#rrggbb".
 
-    Raises: ValueError if the name is no opaque color.
+    Raises: ValueError if the name is no color, or has an alpha, as in "#rrggbbaa".
     """
     from PIL import ImageColor
 
@@ -473,8 +474,8 @@ def _formats(data: bytes) -> tuple[str, ...]:
 
 @contextlib.contextmanager
 def image_in(data: bytes, formats: tuple[str, ...] = FORMATS) -> Generator[Any]:
-    """Opens an image from bytes, in one of these formats of Pillow, within the limits. It is not
-    decoded yet.
+    """Opens an image from bytes, within the limits. It is not decoded yet. formats: Pillow's names
+    of the formats that are accepted.
 
     Raises: InvalidFileError; anything that Pillow raises for damaged images, which is of many
     types.

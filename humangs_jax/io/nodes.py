@@ -28,7 +28,8 @@ Tracks = dict[tuple[int, str], Track]
 def node_parents(nodes: Nodes) -> list[int]:
     """Returns the number of each node's parent, -1 for roots.
 
-    Raises: InvalidFileError for a child that is no node, or for a node with two parents.
+    Raises: InvalidFileError for a child that is no node, or for a node with two parents. Other
+    damage may raise other errors.
     """
     parents = [-1] * len(nodes)
     for i, node in enumerate(nodes):

@@ -308,8 +308,8 @@ def check_limit(name: str, amount: float | int, unit: str) -> None:
     """Checks an amount against a limit. name: field of `Limits`. unit: what is counted, for the
     error.
 
-    Raises: InvalidFileError if the amount is larger. The error names the limit and says how to
-    raise it.
+    Raises: InvalidFileError if the amount is larger. The error names the limit. For an amount of at
+    most `LARGEST_AMOUNT` it also says how to raise the limit.
     """
     most = getattr(limits(), name)
     if amount > most:
@@ -504,14 +504,14 @@ def read_configuration(cls: type[T], path: str | os.PathLike[str]) -> T:
 def write_json(path: str | os.PathLike[str], value: Any, indent: int | None = 1) -> None:
     """Writes a value to a JSON file. If writing fails, the path stays as it was.
 
-    Raises: TypeError if JSON cannot hold the value; OSError.
+    Raises: TypeError if JSON cannot hold the value; ValueError if the value holds itself; OSError.
     """
     write_text(path, json_text(value, indent))
 
 
 def json_text(value: Any, indent: int | None = 1) -> str:
-    """Returns the text that `write_json` writes. Raises: TypeError if JSON cannot hold the
-    value.
+    """Returns the text that `write_json` writes. Raises: TypeError if JSON cannot hold the value;
+    ValueError if the value holds itself.
     """
     return json.dumps(value, indent=indent) + "\n"
 

@@ -607,7 +607,7 @@ def as_array(value: Any) -> np.ndarray:
     """Returns a value from `read_pickle` as a full array. The value is an array, a number, a list
     of numbers, or a stand-in with a method `to_array`.
 
-    Raises: ValueError for anything else.
+    Raises: ValueError for anything else, and for a stand-in with damaged contents.
     """
     if hasattr(value, "to_array"):
         try:

@@ -366,6 +366,8 @@ def read_tensors(path: str | os.PathLike[str], wanted: Wanted = everything) -> t
 def is_safetensors(path: str | os.PathLike[str]) -> bool:
     """Says whether a file begins as safetensors files do: with the length of a JSON object, and its
     opening brace.
+
+    Raises: FileNotFoundError; FileError if the file cannot be read.
     """
     with reading(path, "file of tensors"), open_file(path) as file:
         start = file.read(9)

@@ -111,7 +111,7 @@ def read_parameters(file: Path, body: FileBody) -> BodyParameters:
     """Returns the shape and all poses of a smpl_params.npz.
 
     A person has one shape. If shape or expression differ between frames, the values of the first
-    frame are taken. Raises: CaptureError naming file and key.
+    frame are taken. Raises: CaptureError naming the file, and the key if a value is wrong.
     """
     values = open_arrays(file)
     count = len(values.numbers("global_orient", (None, 3), LARGEST_ANGLE))
@@ -140,7 +140,7 @@ def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
     """Read the cameras of a calibration file, with pixel centres at +0.5. The world's axes are
     kept.
 
-    Raises: CaptureError naming file and camera.
+    Raises: CaptureError naming the file, and the camera if one is wrong.
     """
 
     def no_size(name: str) -> tuple[int, int]:
@@ -200,7 +200,8 @@ def _read_missing(file: Path) -> set[tuple[str, int]]:
     """Read the (camera, frame) pairs of the photos that the authors list as missing. Paths may have
     slashes or backslashes.
 
-    Returns an empty set if there is no such file. Raises: CaptureError naming the line.
+    Returns an empty set if there is no such file. Raises: CaptureError naming the line; FileError
+    if the file cannot be read.
     """
     if not file.is_file():
         return set()
@@ -229,10 +230,10 @@ def _video_subject(
     """Returns a subject with the photos that have both a mask and a pose and are not in `listed`,
     ordered by frame, then by camera.
 
-    photos, masks: for each camera a mapping from frame to whatever `read` takes. read: called with
-    a photo and its mask; returns the image on white and the mask as 0 and 1. listed: the (camera,
-    frame) pairs that the authors list as missing. digits: the number of digits of the frame in the
-    name of a view.
+    photos, masks: for each camera a mapping from frame to photo or mask, in the form that `read`
+    takes. read: called with a photo and its mask; returns the image on white and the mask as 0 and
+    1. listed: the (camera, frame) pairs that the authors list as missing. digits: the number of
+    digits of the frame in the name of a view.
     Raises: CaptureError if no photo is left.
     """
     count = len(parameters.translations)
@@ -356,7 +357,7 @@ def _subfolders(
 def _open_subject(layout: _FolderLayout, folder: str | Path, body: FileBody) -> Subject:
     """Open one subject. Only calibration, poses and file names are read.
 
-    Raises: CaptureError naming file and key.
+    Raises: CaptureError naming the file, and the key or the camera if one is wrong.
     """
     folder = Path(folder)
     cameras = read_cameras(folder / layout.calibration)
@@ -406,7 +407,7 @@ def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
 def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
     """Open one sequence with the smallest images that its folder has.
 
-    Raises: CaptureError naming file and key.
+    Raises: CaptureError naming the file, and the key or the camera if one is wrong.
     """
     folder = Path(folder)
     scale = next((s for s in SCALES if (folder / s / CALIBRATION).is_file()), SCALES[0])
@@ -421,7 +422,7 @@ def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
 def _read_csv_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
     """Read the cameras of a calibration.csv.
 
-    Raises: CaptureError naming file, camera and column.
+    Raises: CaptureError naming the file, and the camera, the column or the line that is wrong.
     """
     with reading(file, "csv file", CaptureError):
         rows = list(csv.DictReader(io.StringIO(checked_text(file))))
@@ -480,7 +481,8 @@ def find_dna_rendering(folder: str | Path) -> tuple[Path, ...]:
 class _Smc:
     """An HDF5 file. The size of each value is checked before it is read.
 
-    Raises: CaptureError naming file and key.
+    Raises: CaptureError naming the file, and the key if a value is wrong. Also without the package
+    h5py.
     """
 
     def __init__(self, path: Path):
@@ -552,7 +554,7 @@ class _Smc:
 def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
     """Open one sequence by its main file.
 
-    Raises: CaptureError naming file and key.
+    Raises: CaptureError naming the file, and the key or the camera if one is wrong.
     """
     main = Path(main)
     photos, notes = _Smc(main), _Smc(main.parent.parent / "annotations" / f"{main.stem}_annots.smc")

@@ -57,7 +57,7 @@ channels is below this. White pixels may be a little below 1, since JPEG compres
 a few of 255 levels.
 """
 KEPT_FRAMES = 64
-"""Number of poses of a scene that are kept in memory."""
+"""Largest number of poses of a scene that are kept in memory."""
 SIGNIFICANT = 9
 """Digits of the numbers in lists, as many as float32 has."""
 
@@ -102,7 +102,7 @@ def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
     """Returns the JSON objects of the scenes of a list, by name. Only the names are checked. path:
     the JSON file, or a folder (train.json, else test.json).
 
-    Raises: CaptureError naming file and key.
+    Raises: CaptureError naming the file, and the key if a value is wrong.
     """
     file, scenes = _list_of(path), {}
     content = checked_json(file)
@@ -128,7 +128,7 @@ def open_scene_list(
     size: the side of the stored squares, pixels. None: the longer side of the first image that
     exists among the first images of the scenes, or `STORED_SIZE` if none of these exists.
 
-    Raises: CaptureError if the list cannot be read.
+    Raises: CaptureError if the list cannot be read, or the image that gives the size.
     """
     file = _list_of(path)
     scenes = read_scene_list(file)
@@ -329,7 +329,7 @@ def read_evaluation(path: str | Path) -> dict[str, dict[str, list[int]]]:
     """Returns the numbers of the context and target views of each scene, by its name, from an
     evaluation_N.json.
 
-    Raises: CaptureError naming file and key.
+    Raises: CaptureError naming the file, and the key if a value is wrong.
     """
     file = Path(path)
     content = checked_json(file)

@@ -3,7 +3,8 @@
 A view is one photo: a camera at one frame. Opening a subject lists folders and reads calibration
 and body parameters, so that a sequence of 5,000 frames opens in well under a second. Photos are put
 on white, padded to a centred square and resized. Values of files are checked one by one
-(`open_arrays`, `checked_numbers`). A fault is a `CaptureError` that names file and key.
+(`open_arrays`, `checked_numbers`). A fault is a `CaptureError` that names the file, and the key if
+a value is wrong.
 """
 
 import concurrent.futures
@@ -76,7 +77,7 @@ class FileBody:
     def hands(self) -> HandBasis:
         """Returns the mean and the components of the model's hand poses.
 
-        Raises: CaptureError for the package's own body, which has none.
+        Raises: CaptureError for the package's own body, which has none; as `load_hands`.
         """
         if self.file == DEFAULT_BODY:
             problem = (
@@ -174,7 +175,7 @@ def coefficients(
     that the file does not have are 0.
 
     Raises: CaptureError if a coefficient is not 0 and the body has no such direction, and for a
-    body with other directions than SMPL-X.
+    body without directions of SMPL-X (shape_0 and so on).
     """
     if not any(name.startswith("shape_") for name in body.shape_names):
         problem = (
@@ -299,7 +300,7 @@ computed from them by averaging whole blocks.
 Photo = tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"]]
 """An image on white, (h, w, 3), and its mask, (h, w), as bytes."""
 THREADS = os.cpu_count() or 1
-"""Number of threads that decode the photos of one request. Decoding JPEG files releases the
+"""Largest number of threads that decode the photos of one request. Decoding JPEG files releases the
 interpreter's lock.
 """
 
@@ -411,7 +412,7 @@ class Subject:
         """Returns some views as a `Capture`, which can be reconstructed and animated. The capture
         has the poses of the frames that these views show.
 
-        Raises: ValueError naming file and field.
+        Raises: ValueError naming the file or the subject, and the field or the view that is wrong.
         """
         views = np.asarray(views, int)
         images, masks = self.photos(views, size)
@@ -450,7 +451,7 @@ class Person:
     def subject(self) -> Subject:
         """The subject, opened at the first use.
 
-        Raises: ValueError, naming file and field.
+        Raises: ValueError naming the file, and the key if a value is wrong.
         """
         return self.open()
 
@@ -472,7 +473,7 @@ class Person:
     def posed(self, subject: StoredSubject) -> StoredSubject:
         """Returns the subject with the poses that its views show, renumbered from 0.
 
-        Raises: ValueError naming file and field.
+        Raises: ValueError naming the file, and the key if a value is wrong.
         """
         seen, frames = np.unique(subject.frames, return_inverse=True)
         _, rotations, translations = self.subject.parameters(seen.tolist())
@@ -490,7 +491,7 @@ def open_people(path: str | Path, body: FileBody, size: int | None = None) -> tu
     `open_scene_list`, else `STORED_SIZE`.
 
     Raises: CaptureError if the folder has none of these layouts, or is a data set of scans, which
-    have no photos.
+    have no photos; as `open_scene_list` for a scene list.
     """
     path = Path(path)
     for name, data_set in DATASETS.items():

@@ -137,7 +137,7 @@ def open_thuman(folder: str | Path) -> tuple[list[str], dict[str, str]]:
 def read_fit(file: str | Path, body: FileBody) -> Fit:
     """Read smplx_param.pkl, without running anything in it.
 
-    Raises: CaptureError naming file and key.
+    Raises: CaptureError naming the file, and the key if a value is wrong; as `FileBody.hands`.
     """
     values = open_arrays(file)
     file = values.path

@@ -67,9 +67,9 @@ def read_summary(
     Arguments: body: the body that the capture must have. body_file: the file that `body` comes
     from, see `Capture`.
 
-    Raises: CaptureError naming file and field. A view with neither a mask nor an alpha channel is
-    refused, because training needs to know where the person is. A capture with another body is
-    refused, too.
+    Raises: CaptureError naming the file, and the field if a value is wrong. A view with neither a
+    mask nor an alpha channel is refused, because training needs to know where the person is. A
+    capture with another body is refused, too.
     """
     folder = Path(path)
     file = folder / "capture.json"
@@ -176,7 +176,7 @@ class CaptureFolder:
     def decode(
         self, views: Sequence[int]
     ) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
-        """Returns the images and masks of some views."""
+        """Returns the images and masks of some views. Raises: CaptureError."""
         capture = load_capture(self.name, body=self.body, views=views)
         if capture.masks is None:
             raise CaptureError(
@@ -195,7 +195,7 @@ class PeopleCache:
     Several threads may ask at once.
 
     broken: the first fault that was found in a person, by the person's name. The names are in the
-    order in which faults were found.
+    order in which faults were found. Raises: ValueError if there are no people.
     """
 
     def __init__(self, people: Sequence[StoredPerson], limit_bytes: int = 4 << 30):
@@ -216,8 +216,10 @@ class PeopleCache:
         return self.people[index].name
 
     def summary(self, index: int) -> StoredSubject | None:
-        """Returns person `index` without images, see `StoredPerson`; None if the person is broken,
-        which is reported once.
+        """Returns person `index` without images, see `StoredPerson`. Returns None if the person is
+        left out, see `report`.
+
+        Raises: ValueError if the person's files are wrong, and now everybody is left out.
         """
         name = self.name(index)
         with self._lock:
@@ -326,8 +328,9 @@ class CaptureCache(PeopleCache):
 
 @dataclasses.dataclass(frozen=True)
 class CaptureSource:
-    """People on disk as a `Source`. Example e shows subject e mod n of a permutation drawn for each
-    pass over the n people. A broken person is replaced by the next one in the order.
+    """People on disk as a `Source`. For each pass over the n people, an order of them is drawn.
+    Example e shows the person at place e mod n of the order of its pass. A person that cannot be
+    used is replaced by the next one in the order.
     """
 
     cache: PeopleCache

@@ -168,8 +168,8 @@ def sample_views(
     """Returns the indices of the input views and of the target views, which are disjoint.
 
     Raises: ValueError if the subject has fewer views than the largest of the input counts plus the
-    targets, even if `input_count` is smaller. So whether a subject is usable does not depend on the
-    step.
+    number of targets, even if `input_count` is smaller. So whether a subject is usable does not
+    depend on the step.
     """
     count, needed = len(subject.frames), max(sampling.input_counts) + sampling.target_count
     if count < needed:

@@ -254,7 +254,9 @@ class ScanRenderer:
         return to_uint8(np.asarray(image)), to_uint8(np.asarray(mask))
 
     def texture(self, level: int) -> Float[Array, "th tw 3"]:
-        """Returns the texture halved `level` times, in [0, 1]."""
+        """Returns the texture halved `level` times, in [0, 1]. It is not halved further when its
+        shorter side has one texel.
+        """
         level = min(level, min(self.scan.texture.shape[:2]).bit_length() - 1)
         if level not in self.textures:
             step = 1 << level

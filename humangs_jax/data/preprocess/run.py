@@ -154,9 +154,9 @@ def preprocess(
     body_file: the model of the data set's fits. shard: (i, n): only the i-th of n parts, counted
     from 0, is made. workers: the number of processes that make scans. Videos are made in the
     calling process.
-    Raises: ValueError for a wrong shard, if `out` lies in the data set or holds another set, if
-    there is nobody, if a finished scene was made from other files, or, at the end, if nobody could
-    be made.
+    Raises: ValueError for a wrong shard, if `out` lies in the data set, or holds another set or
+    other files, if there is nobody, if a finished scene was made from other files, or, at the end,
+    if nobody could be made. Also as `FileBody.load`.
     """
     source, out = Path(source).resolve(), Path(out)
     index, count = shard
@@ -272,7 +272,7 @@ def _skip(out: Path, name: str, reason: str) -> None:
 def _read_scene(file: Path, settings: PreprocessConfig) -> dict[str, Any]:
     """Read and check the scene.json of a finished folder.
 
-    Raises: CaptureError naming file and key.
+    Raises: CaptureError naming the file, and the key if a value is wrong.
     """
     content = checked_json(file)
     (known,) = members(content, file, known=dict)
@@ -399,7 +399,7 @@ def _make_scan(
 def scan_content(source: Path, name: str, body: FileBody, settings: PreprocessConfig) -> Content:
     """Returns the content of a scan's scene. Each view is rendered when it is asked for.
 
-    Raises: ValueError naming file and key.
+    Raises: ValueError naming the file, and the key if a value is wrong.
     """
     # the scan is turned and moved to the body that was fitted to it
     scan_file, fit_file = scan_files(source, name)
