@@ -69,7 +69,9 @@ def around_person(
 def _cut(
     images: np.ndarray, corners: Int[np.ndarray, "v 2"], size: Int[np.ndarray, "2"]
 ) -> np.ndarray:
-    """Cuts each image to a window of `size` (width, height) whose upper left corner is (x, y)."""
+    """Cuts each image to a window. size: width and height of all windows. corners: the upper left
+    corner (x, y) of each window.
+    """
     return np.stack(
         [
             image[y : y + size[1], x : x + size[0]]

@@ -86,6 +86,9 @@ def run_demo(
         refine: how the avatar is refined by its photos; None: not at all.
         settings: settings that decide which photos are used, how the network runs, and how frames
             are drawn. Their refinement is ignored. None: `Settings()`.
+
+    Raises: ValueError if `out` has files of these names that the demonstration did not write, or
+    for a wrong file of weights; OSError; KeyboardInterrupt if refinement was interrupted.
     """
     report: dict[str, Any] = {}
     settings = settings or Settings()

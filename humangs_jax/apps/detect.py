@@ -121,8 +121,8 @@ def found_in_photos(folder: Path) -> list[PhotoPeople]:
     folder the calibrated cameras help to match, see `same_people`.
 
     Raises:
-        CaptureError: if there are no photos.
-        FileError: for a file that is no photo; the message names the file.
+        CaptureError: if there are no photos, or if a capture folder has a fault.
+        FileError: for a photo that cannot be read; the message names the file.
         ValueError: if LiteRT is not installed.
     """
     if (folder / "capture.json").is_file():
@@ -231,9 +231,10 @@ def with_masked(
     """Makes sure that the person of each given mask is among the people of its photo, if the
     detector finds this person. Returns the photos.
 
-    Where nobody found in a photo matches the mask, the detector looks again at the photo cut to the
-    mask. If a person found there has at least half of the mask's area, the person is added to the
-    photo. People whose masks lie mostly on this person's mask are then removed.
+    Where nobody found in a photo matches the mask, the detector looks again, at the photo cut to
+    the mask. There it takes the person who matches the mask best. If this person has at least half
+    of the mask's area, the person is added to the photo. People whose masks lie mostly on this
+    person's mask are then removed.
 
     Arguments: masks: one per photo, (h, w), 0 to 1. on_white: the photos cut to their masks, white
     elsewhere.
@@ -298,8 +299,8 @@ def person_in_capture(
     intended person. Keypoints decide who is intended. Without keypoints, the number `person`
     decides. Without a number, the masks decide. Without masks, the only large person is intended.
 
-    Raises: see `found_in_photos`, `choose` and `person_of`. Also ValueError for a photo whose
-    keypoints belong to nobody found in it.
+    Raises: see `found_in_photos`, `choose` and `person_of`. Also ValueError for a photo in which
+    people are found, but nobody to whom its keypoints belong.
     """
     people, sheet = found_in_capture(folder), folder / SHEET_FILE
     if keypoints is None:
@@ -334,7 +335,8 @@ def person_of(
 
     Arguments: sheet: where to write the sheet of people if the call fails.
     Raises: ValueError if the keypoints or masks belong to nobody who was found. Also if a photo has
-    no keypoints or mask, and it is unclear who in the photo is intended.
+    no keypoints or mask, and it is unclear who in the photo is intended. OSError if the sheet
+    cannot be written.
     """
     kind = "keypoints" if isinstance(given, Keypoints) else "masks"
     scores = [
@@ -400,7 +402,10 @@ def keypoints_of(photos: Sequence[PhotoPeople], person: int) -> Keypoints:
 
 
 def upright(file: Path) -> Float[np.ndarray, "h w 3"]:
-    """Reads a photo and turns it upright by its EXIF orientation. Returns (h, w, 3), 0 to 1."""
+    """Reads a photo and turns it upright by its EXIF orientation. Returns (h, w, 3), 0 to 1.
+
+    Raises: FileNotFoundError; FileError if the file cannot be read as a photo.
+    """
     return oriented(read_image(file)[0], orientation(file))
 
 
@@ -484,7 +489,8 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
     Arguments: person: the number that was asked for; None: none was. sheet: where the numbers can
     be looked up. It is written if the choice fails.
     Raises: ValueError if no photo has a person, if nobody has this number, if photos show several
-    large people and no number was asked for, or if it is unclear who is who.
+    large people and no number was asked for, or if it is unclear who is who. OSError if the sheet
+    cannot be written.
     """
     try:
         return _chosen(photos, person, sheet)
@@ -496,7 +502,7 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
 def _write_refused(sheet: Path, photos: Sequence[PhotoPeople]) -> None:
     """Writes the sheet of people to which an error message refers.
 
-    Raises: ValueError if there is a file of this name that we did not write.
+    Raises: ValueError if there is a file of this name that we did not write; OSError.
     """
     sheet.parent.mkdir(parents=True, exist_ok=True)
     check_ours(
@@ -508,7 +514,9 @@ def _write_refused(sheet: Path, photos: Sequence[PhotoPeople]) -> None:
 
 
 def _refused(message: str, photos: Sequence[PhotoPeople], sheet: Path) -> ValueError:
-    """Writes the sheet of people, and returns an error with this message."""
+    """Writes the sheet of people, and returns an error with this message. Raises: see
+    `_write_refused`.
+    """
     _write_refused(sheet, photos)
     return ValueError(message)
 
@@ -574,7 +582,7 @@ def check_found_place(
     folder: Path, names: Sequence[str], advice: str = MOVE_AWAY, *, masks: bool = True
 ) -> None:
     """Checks that results for photos of these names can be written into a folder without replacing
-    files that we did not write.
+    files that we did not write. masks: whether masks will be written. advice: what the user can do.
 
     Raises: ValueError, see `io.atomic.check_ours`.
     """
@@ -583,8 +591,9 @@ def check_found_place(
 
 
 def names_in(folder: Path) -> list[str]:
-    """Returns the names of the photos that `found_in_photos` looks at. Raises: see
-    `found_in_photos`.
+    """Returns the names of the photos that `found_in_photos` looks at.
+
+    Raises: CaptureError if there are no photos, or if a capture folder has a fault.
     """
     if (folder / "capture.json").is_file():
         return [f"{name}.png" for name in load_photos(folder).names]
@@ -628,8 +637,9 @@ def write_found(
             changed to name the masks, and unknown/ gets the places where others may hide the
             person.
         overwrite: whether files that were not written by this function may be replaced, too.
-    Raises: ValueError if the names of two photos differ in the suffix only, or if a file that we
-    did not write is in the way, see `check_found_place`.
+    Raises: ValueError if the names of two photos differ in the suffix only. Without `overwrite`
+    also if a file that we did not write is in the way, see `check_found_place`. OSError if a file
+    cannot be written. With `to_capture` also FileError if the capture cannot be read.
     """
     # photos that differ in their suffix only would share a mask
     files = [_mask_name(photo.name) for photo in photos]
@@ -700,7 +710,7 @@ def hidden_by_others(
     photo: PhotoPeople, person: int, mask: Float[np.ndarray, "h w"] | None = None
 ) -> Bool[np.ndarray, "h w"] | None:
     """Returns the pixels where other people in a photo may stand in front of the person, (h, w).
-    Returns None if nobody does.
+    Returns None if there are no such pixels.
 
     Arguments: mask: mask of the person that replaces the detected one, (h, w), 0 to 1.
     """

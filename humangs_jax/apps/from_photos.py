@@ -144,7 +144,8 @@ def avatar_from_photos(
     call left one in `out`.
 
     Args:
-        photos: folder of photos, which may also have cameras, masks and keypoints, or a video.
+        photos: folder of photos, which may also have cameras, masks and keypoints. Or a video, or a
+            folder with one video: its best frames are written into a folder beside `out`.
         out: the capture folder to write.
         cameras: file or folder of the calibration, if it is not in `photos`. "ignore": the
             calibration in `photos` is ignored, and the cameras are found from the person.
@@ -387,7 +388,7 @@ class FromPhotos:
         return self._known(material, masks_by_detector="masks" in detected)
 
     def _photos_alone(self, material: PhotoFolder) -> Generator[Step, None, Known]:
-        """Finds the person in the photos, and the cameras from the person."""
+        """Finds the person in the photos, and the cameras from the person. Writes the capture."""
         with stage("finding the person and the cameras"):
             given = (material.keypoints, material.masks, material.alpha, material.others)
             own_masks = not (self.without_masks or material.alpha or material.masks)
@@ -510,6 +511,8 @@ class FromPhotos:
     ) -> Generator[Step, None, tuple[Capture, HeldOut | None]]:
         """Fits the body to keypoints and masks, and writes it into the capture. Returns the
         capture, and how well its avatar reproduces a held-out photo; None if this was not measured.
+
+        Raises: ArgumentError if the calibration contradicts the keypoints.
         """
         with stage("fitting the body"):
             fit_masks = self.fit_masks and not known.masks_by_detector
@@ -575,6 +578,9 @@ class FromPhotos:
         """Checks the capture, then makes, refines and writes the avatar. estimate: how well a
         refined avatar of this body reproduces a held-out photo. It is measured here if it is None,
         or if the avatar is not refined.
+
+        Raises: CaptureError if no photo shows the person; KeyboardInterrupt if refinement was
+        interrupted.
         """
         forget_decoded()  # the capture has the photos
         with stage("preparing the photos"):

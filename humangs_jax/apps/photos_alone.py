@@ -39,7 +39,7 @@ from humangs_jax.io.images import (
 )
 
 LONGEST = 2048
-"""Longest side to which photos are reduced, pixels."""
+"""Photos whose longer side exceeds this are reduced to it, pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +86,8 @@ def import_photos(
         others: folder of masks of other people and of things in front of the person. Only some
             photos need to have one.
         own_masks: whether to write the masks of our detector.
-        reduce: whether large photos may be reduced. It has no effect with `masks` or `others`.
+        reduce: whether photos may be reduced to `LONGEST` pixels. It has no effect with `masks` or
+            `others`, or if the person is small in a photo.
         also: names and contents of JSON files that are written with the capture.
     Raises: ValueError (one line) if no camera is found, or if photos show several large people and
     none is chosen. Also as `import_cameras`.
@@ -109,8 +110,9 @@ def import_photos(
 
 
 def _reduced(images: Path, files: list[Path], place: Path) -> list[Path]:
-    """Writes the photos into a folder, upright and not larger than `LONGEST`, and returns their
-    files. Returns an empty list if no photo is larger, or if two photos differ in the suffix only.
+    """Writes the photos into a folder, upright and with a longer side of at most `LONGEST` pixels,
+    and returns the files. If no photo is larger, or if the names of two photos differ in the suffix
+    only, it writes nothing and returns an empty list.
     """
     names = {file.relative_to(images).with_suffix(".png") for file in files}
     if max(max(image_size(file)) for file in files) <= LONGEST or len(names) < len(files):

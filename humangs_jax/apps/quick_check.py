@@ -105,7 +105,7 @@ class Faults(NamedTuple):
     views: tuple[str | None, ...]
     """What is wrong with each view, one line; None if nothing is."""
     inside: tuple[float, ...]
-    """Share of the body in the frame of each view, 0 to 1."""
+    """For each view, the share of the body that lies in the frame, 0 to 1."""
     explained: set[int]
     """Indices of the views that `whole` explains."""
 

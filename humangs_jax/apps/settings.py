@@ -227,8 +227,8 @@ _HEADROOM = 1.25
 machine is slower later.
 """
 FRAMES = 16
-"""Number of frames that are timed for each preset. The 90th percentile of their times is
-compared.
+"""Number of frames that are timed for each preset. The 90th percentile of their times is compared
+with the budget.
 """
 
 
@@ -239,7 +239,7 @@ class Cost:
     reconstruct_ms: float
     """Time in which the avatar is made, with refinement, milliseconds."""
     frame_ms: float
-    """Time of a frame, milliseconds."""
+    """Time of a frame, milliseconds: the 90th percentile of `FRAMES` frames."""
     memory_mb: float | None = None
     """Memory that making the avatar and drawing its frames add to the process at their peak, MiB.
     None where this cannot be measured.
@@ -299,7 +299,8 @@ def tune(
 
     Raises:
         ValueError: if no preset is within the budget; the message has the costs of the fastest.
-            Also if memory is limited where it cannot be measured.
+            Also if memory is limited where it cannot be measured, and as `reconstruct_with`.
+        KeyboardInterrupt: if refinement was interrupted.
 
     Examples:
         >>> tuned = hg.tune(*hg.load_weights(), capture, frame_ms=33)
@@ -344,7 +345,7 @@ def measure(
     size: int = 512,
 ) -> Cost:
     """Measures what settings cost on this machine: makes an avatar of the capture, and draws frames
-    of it from all around. size: side of the frames, pixels.
+    of it from all around. size: side of the frames, pixels. Raises: as `reconstruct_with`.
     """
 
     def make():

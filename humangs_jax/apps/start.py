@@ -178,7 +178,7 @@ look = inspect_folder
 def photo_files(folder: Path) -> tuple[Path, list[Path]]:
     """Returns the folder that has the photos, and their files in order.
 
-    Raises: CaptureError (one line) if there is no photo.
+    Raises: CaptureError (one line) if there is no such folder, or no photo in it.
     """
     scan = scan_photos(folder)
     return scan.folder, list(scan.photos)
@@ -186,9 +186,9 @@ def photo_files(folder: Path) -> tuple[Path, list[Path]]:
 
 def scan_photos(folder: Path) -> FolderScan:
     """Finds the photos of a folder. They may be in a subfolder such as "images" or "photos". The
-    scan also has the files of both folders that are not used.
+    result also lists the files of the folder and of the subfolder that are not used.
 
-    Raises: CaptureError (one line) if there is no photo.
+    Raises: CaptureError (one line) if there is no such folder, or no photo in it.
     """
     _expect_folder(folder)
     places = (folder / name for name in ("images", "photos", "imgs", "rgb"))
@@ -314,7 +314,7 @@ photos would take longer and give no sharper avatar. All photos serve for poses 
 SIZE = 512
 """Side of the crop in which bodies are compared, pixels."""
 LONGEST = 1024
-"""Longest side to which photos are reduced before one is held out, pixels."""
+"""Photos whose longer side exceeds this are reduced to it before one is held out, pixels."""
 
 
 class HeldOut(NamedTuple):
@@ -403,7 +403,7 @@ def _psnr_of_person(
 
 def _photos_to_hold_out(capture: Capture | PreparedCapture) -> PreparedCapture:
     """Returns the prepared photos of which one will be held out. They are the photos that the
-    network reads, reduced to `LONGEST` pixels.
+    network reads. If their longer side exceeds `LONGEST` pixels, they are reduced to it.
     """
     photos = photos_to_read(prepare_capture(capture))
     large = max(photos.capture.images.shape[1:3]) > LONGEST

@@ -157,6 +157,8 @@ def fit_video(
 
     Arguments: rest_joints: joints of the avatar at rest, (j, 3), metres. kept: file in which
     landmarks are kept while the work goes on, so that an interrupted run can go on; None: no file.
+    Raises: as `motion_from_video`. Also FileError if `kept` is a file of another kind, OSError if
+    it cannot be written.
     """
     if height is not None and not _SMALLEST <= height <= _TALLEST:
         raise ArgumentError("height", f"{height:g}: expected metres, {_SMALLEST:g} to {_TALLEST:g}")
@@ -250,6 +252,8 @@ def look_at_video(
 
     Arguments: count: number of frames, for the progress bar. person: number of the person; None:
     the largest. kept: file for landmarks, see `fit_video`.
+    Raises: ValueError if nobody is found, or LiteRT is not installed. Also FileError if `kept` is a
+    file of another kind, OSError if it cannot be written.
     """
     about = made_from(video, person=person, side=LONGER_SIDE)
     rows, last = _earlier(kept, about), None
@@ -396,7 +400,7 @@ def _earlier(kept: Path | None, about: str) -> list[dict[str, np.ndarray]]:
     """Reads the rows of an interrupted run with the same video and person. Returns an empty list if
     there are none.
 
-    Raises: FileError if the file is something else.
+    Raises: FileError if the file is of another kind.
     """
     if kept is None or not kept.exists():
         return []
@@ -414,7 +418,9 @@ def _earlier(kept: Path | None, about: str) -> list[dict[str, np.ndarray]]:
 
 
 def write_check_video(out: Path, video: Path, found: VideoFit) -> int:
-    """Writes the video with the body drawn over it. Returns the number of frames."""
+    """Writes the video with the body drawn over it, with a longer side of at most 720 pixels.
+    Returns the number of frames. Raises: as `write_video`; FileError if the video cannot be read.
+    """
     # pixels of the longer side of a check video
     frames = color_frames(video, 720, None)
     poses = found.fit.motion

@@ -82,8 +82,10 @@ def photos_of_video(video: Path, folder: Path) -> str:
     """Writes the chosen frames into `folder / "images"`, and returns a line that describes them. If
     an earlier run has made the folder from this video, the folder stays as it is.
 
-    Raises: CaptureError. It names the video if the video cannot be read or shows nothing. It names
-    the folder if the folder exists and was not made from the video as it is now.
+    Raises: CaptureError if the video cannot be read or shows nothing; the message names the video.
+    CaptureError if the folder exists and was not made from the video as it is now; the message
+    names the folder. FileError if the folder's `MARK` cannot be read. OSError if the folder cannot
+    be written.
     """
     with reading(video, "video", CaptureError):
         status = video.stat()

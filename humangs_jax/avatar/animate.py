@@ -42,7 +42,8 @@ from humangs_jax.rendering.gaussians import (
 @checked_arguments
 def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
     """Returns the avatar in a pose, differentiable in avatar and pose. With affine skinning,
-    `deformations` holds the linear part of the blended transforms.
+    `deformations` holds the linear part of the blended transforms, multiplied by the stretch of the
+    face if the pose has an expression.
 
     Args:
         avatar: one person.
@@ -112,8 +113,8 @@ def _with_expression(avatar: Avatar, pose: BodyPose) -> tuple[Avatar, BodyPose]:
 
 
 def with_hidden_among(avatar: Avatar, hidden: Gaussians) -> Avatar:
-    """Returns the avatar without its face. The hidden Gaussians of the face become ordinary
-    Gaussians after the others, and follow the head.
+    """Returns the avatar without its face, but with the Gaussians `hidden` after its own Gaussians.
+    They follow the head. hidden: the hidden Gaussians of the face, which may have been moved.
     """
     face, names = avatar.face, avatar.joint_names
     assert face is not None
@@ -221,14 +222,14 @@ def without_pixel_footprint(avatar: Avatar) -> Avatar:
 
 
 def with_pixel_footprint_of(avatar: Avatar, views: SubjectViews) -> Avatar:
-    """Returns the avatar with the low-pass of the photos that it will be fitted to. The
-    `pixel_footprint` of each Gaussian becomes the smaller one of its own and of the photos' pixel
-    there (`pixel_sizes`). The scales stay.
+    """Returns the avatar with the low-pass of the photos that it will be fitted to.
 
-    Where a Gaussian's own was larger, the difference is now an ordinary part of the scales, which a
-    fit can reduce. Images whose pixels are larger than the new `pixel_footprint` then show this
-    Gaussian fainter; all others show it as before. An avatar without a low-pass is changed as by
-    `with_pixel_footprint`.
+    The `pixel_footprint` of a Gaussian is reduced to the side of the photos' pixels at the Gaussian
+    (`pixel_sizes`) if it is larger than that. The scales stay, so a part of them that was low-pass
+    is now an ordinary part, which a fit can reduce. Images whose pixels are larger than the new
+    `pixel_footprint` then show this Gaussian fainter; all others show it as before.
+
+    If the avatar has no low-pass yet, `with_pixel_footprint` adds that of the photos.
     """
     return replace(avatar, gaussians=_pixel_footprint_of(avatar, views))
 
@@ -246,7 +247,8 @@ def pixel_sizes(avatar: Avatar, views: SubjectViews) -> Float[Array, " g"]:
     """Returns the side of a photo's pixel at each Gaussian, metres. Of the photos that contain a
     Gaussian, the one with the smallest pixels there counts.
 
-    Gaussians outside of all photos get the largest value of the others.
+    Gaussians outside of all photos get the largest value of the others, or 0 if there are no
+    others.
     """
 
     def in_photo(photo):

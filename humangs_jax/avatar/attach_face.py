@@ -106,7 +106,8 @@ def body_of(avatar: Avatar) -> BodyModel | None:
     """Returns the shipped body if the avatar has the face of this body. Returns the body that
     `gaussian_body` makes of it if the avatar has the face of that body, and None if it has neither.
 
-    Only triangles are compared. The avatar's vertices may be displaced, and it may have a skirt.
+    Only triangles and the parents of joints are compared. The avatar's vertices may be displaced,
+    and it may have a skirt.
     """
     if avatar.parents != PARENTS:
         return None
@@ -228,8 +229,8 @@ def _stretching(
 
 
 def _vertex_of_gaussians(avatar: Avatar) -> Int[np.ndarray, " g"]:
-    """Returns the index of the vertex that each Gaussian belongs to. If refinement has added
-    Gaussians, this is the vertex nearest to the Gaussian.
+    """Returns the index of the vertex that each Gaussian belongs to. If
+    `Avatar.gaussians_per_vertex` is None, this is the vertex nearest to the Gaussian.
     """
     each, count = avatar.gaussians_per_vertex, len(avatar.rest_vertices)
     if each is not None:

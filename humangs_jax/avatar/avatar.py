@@ -221,8 +221,8 @@ class Avatar(Batchable):
     """
 
     gaussians: Gaussians
-    """The Gaussians in the T-pose, metres. They are ordered by vertex, with the k Gaussians of a
-    vertex next to each other, unless refinement has added some.
+    """The Gaussians in the T-pose, metres. Most networks make k Gaussians for each vertex. These
+    are ordered by vertex, with the k Gaussians of a vertex next to each other.
     """
     skinning_weights: Float[Array, "g j"]
     """The weights of the joints for each Gaussian, (g, j); rows sum to 1."""
@@ -255,8 +255,8 @@ class Avatar(Batchable):
 
     @property
     def gaussians_per_vertex(self) -> int | None:
-        """The number of Gaussians of each vertex. None if refinement has added Gaussians, which are
-        not next to the other Gaussians of their vertex.
+        """The number of Gaussians of each vertex. None if the Gaussians are not ordered by vertex
+        with an equal number for each, for example after `select`. Skinning weights show the order.
         """
         weights, vertices = np.asarray(self.skinning_weights), len(self.rest_vertices)
         if len(weights) % vertices:

@@ -34,8 +34,10 @@ def file_cameras(path: Path, shot: FrameSettings, upright: bool = False) -> dict
     none. If the shot has a width or a height, it replaces the width or height in the file.
 
     Arguments: upright: whether the world is turned so that the axis that is up in the format
-    becomes y. If not, it stays as it is in the file. Raises: FileError, one line that names the
-    file.
+    becomes y. If not, it stays as it is in the file.
+
+    Raises: FileNotFoundError if there is no such file; FileError, one line that names the file, if
+    it cannot be read or has too many cameras; ValueError if `Camera.from_opencv` refuses a camera.
     """
     with reading(path, "calibration"):
         found = read_calibration(path, lambda name: shot.resolution)
@@ -59,9 +61,9 @@ def file_cameras(path: Path, shot: FrameSettings, upright: bool = False) -> dict
 
 
 def one_size(path: Path, cameras: Mapping[str, Camera]) -> Camera:
-    """Returns a batch of the cameras of a file.
+    """Returns the cameras of a file as one batch. path: the file, for the error.
 
-    Raises: ValueError if their images differ in size.
+    Raises: ValueError if the images of two cameras differ in size.
     """
     sizes = {(camera.width, camera.height): name for name, camera in cameras.items()}
     if len(sizes) > 1:
@@ -101,8 +103,8 @@ def camera_path(cameras: Camera, frames: int) -> Camera:
 
 
 def standing(avatar: Avatar, pose: BodyPose | None = None) -> BodyPose:
-    """Returns a pose (default: the T-pose), moved so that the person stands on the floor, at x = z
-    = 0.
+    """Returns a pose (default: the T-pose), moved so that the person stands on the floor, y = 0,
+    with the root joint at x = z = 0.
     """
     if pose is None:
         pose = rest_pose_of(avatar)

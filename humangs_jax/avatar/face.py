@@ -126,7 +126,8 @@ def moved_gaussians(
     face: Face, gaussians: Gaussians, expression: Float[Array, " e"], stretched: bool
 ) -> Gaussians:
     """Returns the Gaussians of an avatar in T-pose, moved by an expression. Gaussians of an eye
-    fade as its lids close. stretched: whether the Gaussians also get `deformations`.
+    fade as its lids close, if the face has the expressions `BLINKS`. stretched: whether the
+    Gaussians also get `deformations`.
     """
     moves = jnp.einsum("mae,e->ma", face.expressions.directions, expression, precision=EXACT)
     moves = jnp.concatenate([moves, jnp.zeros_like(moves[:1])])
@@ -144,9 +145,9 @@ def moved_gaussians(
 
 
 def with_hidden(gaussians: Gaussians, hidden: Gaussians) -> Gaussians:
-    """Returns the Gaussians, followed by the hidden ones. `hidden` has no harmonics, low-pass and
-    deformations. If `gaussians` has them, the hidden Gaussians get harmonics of 0, the median
-    low-pass, and the identity as their deformation.
+    """Returns the Gaussians, followed by the hidden ones. `hidden` has neither harmonics nor
+    `pixel_footprint` nor deformations. For each of these that `gaussians` has, the hidden Gaussians
+    get values: harmonics of 0, the median `pixel_footprint`, the identity as deformation.
     """
     fields = {}
     if gaussians.harmonics is not None:

@@ -48,9 +48,10 @@ class FrameSettings:
 
     def check(self) -> None:
         # not on construction: the command line would make a box of it
-        """Check that all settings are in range.
+        """Check that all settings are in range, and that the background is a color or
+        "transparent".
 
-        Raises: ValueError naming a setting that is out of range.
+        Raises: ValueError, which names the setting that is wrong.
         """
         for field in dataclasses.fields(self):
             check_range(FrameSettings, field.name, getattr(self, field.name), field.name)

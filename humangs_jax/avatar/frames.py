@@ -109,6 +109,8 @@ def draw_gaussians(
 
     Buffers are planned for the first frame, with room to spare. Programs are compiled once per
     image size, and again only if a frame needs more room than that.
+
+    Raises: ValueError, at the end, if there are not as many cameras as frames.
     """
     frames = zip(gaussians, cameras, strict=True)
     first = next(frames, None)
@@ -189,8 +191,8 @@ def a_pose_of(avatar: Avatar) -> BodyPose:
 
 
 def tracked_points(avatar: Avatar, poses: BodyPose) -> Float[np.ndarray, "m p 3"]:
-    """Returns the positions of opaque Gaussians of the avatar in each pose of a batch, metres.
-    Cameras are placed so that the images contain all of these points.
+    """Returns the positions of some opaque Gaussians of the avatar in each pose of a batch, metres.
+    From these points `shot_cameras` finds the middle of the person and the distance of the cameras.
     """
     opacities = np.asarray(avatar.gaussians.opacities)
     opaque = np.flatnonzero(opacities >= min(TRACKED_OPACITY, opacities.max()))
@@ -305,8 +307,11 @@ def trim_and_resample(
     """Returns a motion from `start` to `stop` (seconds), resampled to another frame rate and
     repeated `loop` times.
 
-    Every repetition starts at the place on the ground where the one before has ended. Heights are
-    repeated as they are. Raises: ValueError naming what is out of range.
+    On the ground, every repetition starts one step beyond the place where the one before has ended.
+    The step is the mean movement from frame to frame. Heights are repeated as they are.
+
+    Raises: ValueError if `start`, `stop`, `fps` or `loop` is out of range, or if there would be
+    more frames than the limit `frames`.
     """
     count = len(motion.translations)
     length = count / motion.fps
@@ -463,7 +468,9 @@ def motion_frames(
     progress: bool = True,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """Yields the frames of a moving avatar, which the camera follows. See `motion_views` and
-    `images`.
+    `images`. progress: whether to show a progress bar.
+
+    Raises: as `motion_views`.
     """
     if shot is None:
         shot = FrameSettings()

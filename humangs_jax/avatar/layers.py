@@ -124,9 +124,10 @@ def write_views(
     The files appear together when all are drawn. Images view_*.png and a views.exr of an earlier
     call are removed. Returns the number of views.
 
-    Raises: ValueError if a layer does not exist, if the layers of all views have more bytes than
-    the limit for arrays (see docs/security.md), or if a file of the same name was not written by
-    humangs; OSError if the files cannot be written.
+    Raises: ValueError if a file of the same name was not written by humangs; OSError if the files
+    cannot be written. With `exr` also ValueError if a layer does not exist, if a camera has
+    distortion or a lens other than a pinhole, or if the layers of all views have more bytes than
+    the limit `array_bytes` (see docs/security.md).
     """
     out, count = Path(out), len(poses)
     if names is None:
@@ -175,7 +176,9 @@ def exr_view(
     how: SplatConfig,
 ) -> ExrView:
     """Returns a view with its layers. rendering: the avatar in this pose, drawn from this camera
-    onto black.
+    onto black. layers: names in `LAYERS`. how: how the normals and parts are splatted.
+
+    Raises: ValueError for a camera with distortion or a lens other than a pinhole.
     """
     layers, alpha = set(layers), np.asarray(rendering.alpha)
     channels, attributes = {}, {}
@@ -224,6 +227,9 @@ def write_renderings_exr(
 ) -> None:
     """Write renderings onto black as an EXR file with one part for each view: premultiplied RGBA in
     32 bits, Z in metres, and the camera.
+
+    Raises: ValueError for a camera with distortion or a lens other than a pinhole; OSError if the
+    file cannot be written.
     """
     each = enumerate(zip(cameras, renderings, strict=True))
     write_exr(
@@ -266,7 +272,8 @@ def gaussian_parts(avatar: Avatar) -> Int[np.ndarray, " g"]:
 
 def gaussian_normals(avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
     """Returns a unit normal of the posed body's surface for each Gaussian. It is the normal of the
-    vertex nearest in the T-pose, turned by the Gaussian's transform.
+    vertex that is nearest to the Gaussian in the T-pose, turned by the Gaussian's skinning
+    transform.
     """
     normals = surface_normals(avatar.rest_vertices, avatar.faces, avatar.gaussians.means)
     return _posed_normals(normals, avatar, pose)

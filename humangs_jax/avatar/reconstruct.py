@@ -114,8 +114,9 @@ def reconstruct(
 
     Raises:
         ValueError: if the network makes no Gaussians, if no view of the capture shows the person,
-            or if an array of the capture has values that are not finite or out of range. The
-            message names the array.
+            or if the capture has more views than the limit `network_views`. Also if a camera has
+            distortion or a lens other than a pinhole, or if an array of the capture has a wrong
+            shape, or values that are not finite or out of range. The message names this array.
 
     Examples:
         >>> avatar = hg.reconstruct(*hg.load_weights(), hg.load_capture("demo_capture"))
@@ -199,11 +200,11 @@ def reconstruct_batch(
     """Reconstruct several people, `batch` at a time in one program, whatever their numbers of
     views.
 
-    A batch keeps a machine busier than one person does, on CPUs too; its memory grows with the
-    number of people. People in skirts are reconstructed alone, because their bodies have more
-    vertices. The other people of a batch are reconstructed together with the first of them if they
-    have the same body model, and if y is up either in both worlds or in neither. Anyone else is
-    reconstructed alone. A capture that cannot be used does not stop the others.
+    A batch uses a machine better than one person does, on CPUs too, but needs memory in proportion
+    to the number of people. People in skirts are reconstructed alone, because their bodies have
+    more vertices. The other people of a batch are reconstructed together with the first of them if
+    they have the same body model, and if y is up either in both worlds or in neither. Anyone else
+    is reconstructed alone. A capture that cannot be used does not stop the others.
 
     Args:
         variables: the variables of the network. `load_weights` returns them with `config`.
@@ -215,6 +216,9 @@ def reconstruct_batch(
     Yields:
         Each capture with its avatar, in the order of the captures. If a function raises a
         ValueError or OSError, or if a capture cannot be used, the item has this error instead.
+
+    Raises:
+        TypeError: if an item of `captures` is neither a capture nor a function that returns one.
 
     Examples:
         >>> made = hg.reconstruct_batch(*hg.load_weights(), captures)
@@ -277,10 +281,9 @@ def stack_captures(
         these photos, and without light if no world is y-up.
 
     Raises:
-        ValueError: if there is no capture, if a capture has no view that shows the person, if a
-            capture has values that are not finite or out of range, or if the body models differ.
-            Also if `config` wants light and only some of the worlds are y-up, because in a batch
-            all avatars have a light or none has.
+        ValueError: if there is no capture, if `reconstruct` would refuse one of the captures, or if
+            the body models differ. Also if `config` wants light and only some of the worlds are
+            y-up, because in a batch all avatars have a light or none has.
 
     Examples:
         >>> body, views, config = hg.stack_captures(config, captures)
@@ -369,8 +372,8 @@ def reconstruct_views(
         `config.runtime.token_capacity`.
 
     Raises:
-        ValueError: if the body is not the one that this configuration wants, or if the photos do
-            not have its image size.
+        ValueError: if the body is not the one that this configuration wants, if the photos do not
+            have the image size of the configuration, or if the network makes no Gaussians.
 
     Examples:
         >>> batched = jax.vmap(hg.reconstruct_views, in_axes=(None, None, None, 0))
@@ -444,6 +447,8 @@ def completed_avatar(
     """Returns the avatar of `make_avatar`, completed as the conventions of the configuration ask
     for. The conventions may change the skinning weights between the legs, and add the light of the
     photos and the low-pass.
+
+    Raises: as `make_avatar`.
     """
     conventions = config.conventions
     avatar = make_avatar(outputs, body, subject_rest(body, views.betas, views.displacement), config)

@@ -294,8 +294,8 @@ SIDES = {
     "left side": (1.0, 0.0, 0.0),
     "right side": (-1.0, 0.0, 0.0),
 }
-"""The directions of the sides in the T-pose. Surfaces whose normals are within 60 degrees belong to
-a side.
+"""The directions of the sides in the T-pose. A surface belongs to a side if the angle between its
+normal and the side's direction is less than 60 degrees.
 """
 PARTS = {"head": HEAD_JOINTS, "lower legs": ("knee",), "feet": ("ankle", "foot")}
 """Words in joint names, by part. A vertex belongs to a part if the name of its main joint has one
@@ -318,8 +318,7 @@ def guess_line(capture: Capture) -> str | None:
 
 
 def unseen_sides(capture: Capture) -> list[str]:
-    """Returns the names of the `SIDES` and `PARTS` of which photos show less than the share
-    `LEAST_SHOWN`.
+    """Returns the names of the `SIDES` and `PARTS` that are guesses, see `LEAST_SHOWN`.
 
     This runs on the host, and does not consider that other limbs may be in front.
     """

@@ -85,9 +85,10 @@ def write_video(
     """Write frames as a video or as PNG files. No file appears before all frames are written. If
     writing fails, nothing changes.
 
-    Frames are asked for one by one. A .gif keeps one byte for each channel of all frames in memory,
-    other formats keep no frame. Video codecs want even sides: odd ones get one more row or column,
-    a copy of the last. A GIF of more than 50 frames a second leaves out frames to keep its speed.
+    Frames are asked for one by one. A .gif keeps one byte for each channel of all its frames in
+    memory; other formats keep no frame. .mp4 and .webm need even sides: if a side is odd, the last
+    row or column is repeated. If there are more than 50 frames a second, a .gif leaves out frames
+    to keep its speed.
 
     Args:
         path: .mp4, .webm or .gif; without a suffix a folder of frame_00000.png and so on, which
@@ -100,10 +101,12 @@ def write_video(
         The number of frames that were given.
 
     Raises:
-        ValueError: if there is no frame, if frames differ in shape, have a number outside of
-            [0, 1], or have integers other than uint8, or if `fps` is not positive. Also if the
-            suffix is unknown, if frames have alpha and the format has none, if a GIF does not fit
-            into memory, or if a PNG file that would be replaced was not written by humangs.
+        ValueError: if there is no frame, if frames differ in shape or have another shape than
+            above, or if their numbers are neither uint8 nor finite floats in [0, 1]. Also if `fps`
+            is not positive and finite, if the suffix is unknown, if frames have alpha and the
+            format has none, or if a GIF does not fit into memory. Also if the path of a video is a
+            folder, if that of a folder is a file, or if a PNG file that would be replaced was not
+            written by humangs.
         OSError: if the file cannot be written. Errors of the iterator `frames` are passed on.
 
     Examples:
@@ -157,7 +160,8 @@ def write_images(
 def _checked(path: Path, frames: Iterable[Frame]) -> Iterator[np.ndarray]:
     """Yields the frames as arrays, each after a check.
 
-    Raises: ValueError that names the frame.
+    Raises: ValueError, which names the path. It also names the frame, unless the frame has no
+    pixels.
     """
     shape = None
     for i, given in enumerate(frames):
@@ -244,7 +248,10 @@ def write_webm(
 def _write_by_ffmpeg(
     path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...], quality: list[str]
 ) -> None:
-    """Write a video by a call of ffmpeg. imageio's writer does not report when ffmpeg fails."""
+    """Write a video by a call of ffmpeg. imageio's writer does not report when ffmpeg fails.
+
+    Raises: OSError if ffmpeg fails.
+    """
     import imageio_ffmpeg
 
     height, width, channels = shape

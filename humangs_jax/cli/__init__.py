@@ -86,7 +86,7 @@ Completion for bash, zsh or tcsh: humangs --tyro-print-completion SHELL"""
 
 
 def main() -> None:
-    """Runs the console script. Slow imports happen only after Ctrl-C is handled."""
+    """Runs the console script. The handler of Ctrl-C is installed before any slow import."""
     try:
         _prepare("--verbose" in sys.argv)
         code = execute(sys.argv[1:])
@@ -104,7 +104,8 @@ def execute(arguments: Sequence[str]) -> int:
     """Runs a command line in this process and returns the exit code. arguments: words after
     `humangs`.
 
-    Raises: SystemExit for --help, or if there are no words.
+    Raises: SystemExit for --help, or if there are no words. Also an error of the command that is
+    neither a ValueError nor an OSError, and does not mean that memory was short.
     """
     from humangs_jax.cli import screen
     from humangs_jax.cli.options import check_options

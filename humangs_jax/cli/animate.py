@@ -158,7 +158,8 @@ class Animate:
     def _motion(self, avatar: "Avatar") -> "Motion":
         """Reads the motion of a file, or finds the motion in a video.
 
-        Raises: UsageError for options that a video does not take.
+        Raises: UsageError for options that a video does not take; as `load_motion` for a file, and
+        as `motion_beside` for a video.
         """
         from humangs_jax.data.folders import is_video
 

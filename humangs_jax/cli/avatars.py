@@ -227,8 +227,8 @@ class Reconstruct:
 
         part, parts: index of the part, and number of parts.
 
-        Raises: CaptureError if an avatar was made from other contents than its capture has now, or
-        if the set was made with other settings.
+        Raises: CaptureError if an avatar of this part was made from other contents than its capture
+        has now, or if the set was made with other settings. FileError if an avatar cannot be read.
         """
         self._begin_set(out)
         done = {name for name in captures if (out / f"{name}.npz").exists()}
@@ -265,7 +265,7 @@ class Reconstruct:
     def _read(self, folder: Path, views: int | str | None) -> "PreparedCapture":
         """Reads the views of a capture that the network is to use.
 
-        Raises: ValueError if no view shows the person; UsageError for --refine without masks.
+        Raises: as `_read_capture`; UsageError for --refine without masks.
         """
         prepared = _read_capture(folder, self.check, self.fit_masks, views)
         if self.refine not in (None, "0") and prepared.capture.masks is None:
@@ -354,7 +354,7 @@ def _capture_folders(given: tuple[Path, ...]) -> dict[str, Path]:
 def _check_source(avatar: Path, capture: Path) -> None:
     """Checks that an avatar was made from the present content of its capture.
 
-    Raises: CaptureError, which names both, if it was not.
+    Raises: CaptureError, which names both, if it was not; FileError if the avatar cannot be read.
     """
     from humangs_jax.avatar.avatar import recorded_source
     from humangs_jax.data.capture import capture_checksum
@@ -377,7 +377,7 @@ def _read_capture(
     in the photos, and to look for what is in front of the person. views: as --views of
     `reconstruct`. None: all views that show the person.
 
-    Raises: ValueError if no view shows the person.
+    Raises: as `load_capture`; ValueError if no view shows the person.
     """
     with stage("reading the capture"):
         from humangs_jax.data.capture import load_capture

@@ -37,9 +37,11 @@ def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
 def found_here(capture: Path, person: int | None) -> Path:
     """Returns the file of keypoints in a capture folder.
 
-    If the folder lacks keypoints or masks, they are found in its photos and written there. person:
-    number of the person on the sheet, if the photos show several people. Keypoints are then found
-    again.
+    If the folder lacks keypoints or masks, or if `person` is given, keypoints are found in its
+    photos and written there. So are masks if it has none. person: number of the person on the
+    sheet, if the photos show several people.
+
+    Raises: as `load_photos`, `detect.person_in_capture` and `detect.write_found`.
     """
     from humangs_jax.apps import detect
     from humangs_jax.data.photos import capture_folder, load_photos

@@ -57,6 +57,8 @@ class Detections:
 
         Returns the keypoints, and the record of the earlier fit if they are from it. Each is None
         if there is none.
+
+        Raises: as `read_keypoints`, `read_fit_record` and `FitRecord.of_views`.
         """
         from humangs_jax.capture.fitting.files import FIT_FILE, read_fit_record
         from humangs_jax.data.photos import capture_folder

@@ -106,7 +106,7 @@ class PartOfMotion:
     def load(self, path: Path | None, rest_joints: "Array | None" = None) -> "Motion":
         """Reads the motion of a file, or the shipped walk if `path` is None.
 
-        Raises: MotionError; UsageError for options without a file.
+        Raises: UsageError for options without a file; as `load_motion`.
         """
         from humangs_jax.motion import load_motion
 
@@ -408,7 +408,8 @@ def first_refinement(text: str | None) -> RefineConfig | None:
 def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings | None":
     """Returns the settings of --preset or of the file of --config; None without either.
 
-    Raises: UsageError if both are given; FileError for a wrong file.
+    Raises: UsageError if both are given; FileNotFoundError if there is no such file; FileError if
+    it is no file of settings.
     """
     if preset is not None and config is not None:
         raise UsageError(

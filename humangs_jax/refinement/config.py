@@ -150,6 +150,6 @@ class RefineConfig:
 
 
 ITERATIONS_ALONE = RefineConfig(steps=0, seconds=None, image_size=512)
-"""The default refinement of new avatars: iterations on photos of at most 512 pixels, and steps on
-the head. It takes some seconds.
+"""The default refinement of new avatars: iterations on photos whose longer side is reduced to 512
+pixels, and steps on the head where `head_steps` allows them. It takes some seconds.
 """

@@ -44,8 +44,8 @@ LEAST_SIDE = 512
 In such photos heads show more detail than the iterations reach.
 """
 LARGEST_HEAD = 112
-"""The side that the largest head should have in the photos, pixels. Photos are reduced to make it
-about that small.
+"""The side that the largest head should have in the photos, pixels. Photos are reduced so that the
+head has about this size, see also `LOOK`.
 """
 LOOK = 1024
 """The largest longer side of the photos in which heads are looked for, pixels. Crops are made of

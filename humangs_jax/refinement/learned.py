@@ -67,8 +67,8 @@ If the weight is smaller, the Gaussian counts in proportion.
 """
 TYPICAL_LOG_SCALE = -4.5
 MOST_PHOTOS = 6
-"""The largest number of photos that an iteration reads, as in training. The network does not know
-sums over more photos, and more photos take longer.
+"""The largest number of photos that an iteration reads, as in training. The network was not trained
+with sums over more photos, and more photos take longer.
 """
 
 
@@ -492,7 +492,7 @@ def refiner_iteration(
 
 def save_refiner(path: str | os.PathLike[str], variables: PyTree) -> None:
     """Writes the variables of a `Refiner` as a safetensors file. If writing fails, the path stays
-    as it was.
+    as it was. Raises: OSError.
     """
     from safetensors.numpy import save
 
@@ -507,7 +507,8 @@ def save_refiner(path: str | os.PathLike[str], variables: PyTree) -> None:
 def read_refiner(path: str | os.PathLike[str]) -> PyTree:
     """Returns the variables that `save_refiner` wrote.
 
-    Raises: FileNotFoundError; FileError if it is no safetensors file.
+    Raises: FileNotFoundError; FileError if it is no safetensors file; ValueError if the name of a
+    tensor is not LAYER/NAME.
     """
     variables: dict[str, Any] = {}
     for key, tensor in read_safetensors(path)[0].items():

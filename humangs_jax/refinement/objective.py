@@ -89,8 +89,8 @@ def parameters_of(gaussians: Gaussians) -> UnconstrainedGaussians:
 def gaussians_of(
     parameters: UnconstrainedGaussians, pixel_footprint: Float[Array, " g"] | None
 ) -> Gaussians:
-    """Returns the Gaussians of some parameters. The low-pass of pixels of `pixel_footprint`, (g,),
-    metres, is added to their scales.
+    """Returns the Gaussians of some parameters, with a low-pass added to their scales.
+    pixel_footprint: the side of a pixel at each Gaussian, (g,), metres. None: no low-pass is added.
     """
     gaussians = constrain(parameters)
     return replace(
@@ -142,7 +142,7 @@ def image_loss(image: Image, photo: Photo, config: RefineConfig) -> Scalar:
     """Returns the loss of an image against a photo: the weighted sum of the L1 distance of colors,
     the structural dissimilarity and the L1 distance of coverage. Each is a mean over the crop.
 
-    A pixel that does not count takes the photo's value, so that it contributes nothing anywhere.
+    The image takes the photo's values in pixels that do not count, so they add nothing to the loss.
     """
     rgb = jnp.where(photo.counted[..., None], image[0], photo.image)
     alpha = jnp.where(photo.counted, image[1], photo.mask)

@@ -17,8 +17,8 @@ from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 
 MARGIN = 8
-"""Width of the margin around the mask that a crop also contains, pixels. The window of structural
-similarity has 11 pixels, and the loss counts alpha beyond the silhouette there.
+"""Width of the margin that a crop contains around the mask, pixels. The window of structural
+similarity is 11 pixels wide, and in the margin the loss counts alpha beyond the silhouette.
 """
 MULTIPLE = 16
 """Sides of crops are multiples of this number of pixels, so that few sizes are compiled. A crop is
@@ -98,8 +98,9 @@ def windows(
     boxes: Sequence[Sequence[Sequence[int]]],
 ) -> tuple[Float[Array, "v rows columns 3"], Float[Array, "v rows columns"], Camera]:
     """Returns the images, masks and cameras of windows, one around the box of each view. All
-    windows have one size: the largest box fits in, with `MARGIN` on all sides unless the image ends
-    there.
+    windows have one size. The largest box fits into it with `MARGIN` on all sides, but no window is
+    larger than the image.
+
     boxes: ((top, bottom), (left, right)) of each view, pixels.
     """
     height, width = masks.shape[1:]

@@ -67,9 +67,9 @@ class Refinement:
     left_out: tuple[str, ...] = ()
     """Names of photos that contradict the others, and were not fitted."""
     head_steps: int = 0
-    """Steps of the optimizer on the head alone; 0 if they were not kept."""
+    """Steps of the optimizer on the head alone; 0 if none were made, or if they were not kept."""
     moved: bool = False
-    """Whether the photos were warped to match one another: the person has moved between them, or
+    """Whether the photos were warped to the avatar, because the person has moved between them, or
     a pose or a camera is off. If so, `loss` and `psnr` compare with the warped photos.
     """
 
@@ -110,10 +110,11 @@ def refine(
     the fit is no better.
 
     First come iterations of a learned optimizer, then steps of Adam. Steps on the head alone follow
-    if photos have 512 pixels or more (`RefineConfig.head_steps`), unless `steps` is above 0 or the
-    time is limited. Views whose mask does not show the person are left out, and exposure is made
-    equal, as in `reconstruct`. Ctrl-C ends the run; the best state until then is returned.
-    `refine_with_report` also returns the steps, the seconds and the gain.
+    if photos have 512 pixels or more (`RefineConfig.head_steps`), unless the argument `steps` is
+    above 0, or seconds limit the steps. Views whose mask does not show the person are left out, and
+    exposure is made equal, as in `reconstruct`. Once the photos are prepared, Ctrl-C ends the run,
+    and the best state until then is returned. `refine_with_report` also returns the steps, the
+    seconds and the gain.
 
     Args:
         avatar: the avatar of the person in the photos, on the body of the capture.
@@ -122,8 +123,8 @@ def refine(
         seconds: limit in seconds. If `seconds` or `steps` is given, these two arguments replace
             both limits of the configuration. The seconds become a number of steps before the first
             step.
-        steps: limit in steps, which repeats a run exactly on the same machine. 0: iterations and
-            steps on the head alone.
+        steps: limit in steps. A run that only steps limit can be repeated exactly on the same
+            machine. 0: only iterations and steps on the head.
         progress: show a bar.
         watch: is called with the current avatar after the iterations and at each of the checks. Its
             time counts.
@@ -133,7 +134,8 @@ def refine(
 
     Raises:
         ValueError: if the capture has no view, no masks, or no view that shows the person, if its
-            poses have another number of joints than the avatar, or if the avatar has harmonics.
+            poses have another number of joints than the avatar, or if the avatar has harmonics or
+            deformations. Also if `seconds` or `steps` is out of range.
 
     Examples:
         >>> sharp = hg.refine(avatar, capture, seconds=15)

@@ -76,7 +76,7 @@ HELD_OUT_PHOTOS = 4
 sees. With fewer, blocks of pixels are held out of each photo.
 """
 TRIAL = 1 / 3
-"""Share of all steps that are made in trials."""
+"""The part of all steps that trials make, as a share of all steps."""
 ALLOWED_LOSS = 0.5
 """Decibels that steps may lose on a photo that is held out. Losing a little there is allowed,
 because the final steps use this photo, too. With six validation people, steps lose up to 0.4 on the
@@ -259,7 +259,7 @@ class Candidate(NamedTuple):
     used: Int[np.ndarray, " n"]
     """The indices of the photos to fit, (n,)."""
     kept: bool = True
-    """Whether the state is the best so far."""
+    """Whether the state may be the result of the run. The result is the last such state."""
 
 
 class _Trial(NamedTuple):
@@ -531,8 +531,8 @@ def steps(
     shown: tuple[float, float],
 ) -> Iterator[Candidate]:
     """Makes the first `end` of `total` steps on some photos. Yields the state at each check and at
-    the end. shown: places of the progress bar before the first and after the last of the `total`
-    steps, in [0, 1].
+    the end. Ends early if the run takes too long (`OVERRUN`). shown: places of the progress bar
+    before the first and after the last of the `total` steps, in [0, 1].
     """
     config, clock = task.config, task.clock
     share = 1.0

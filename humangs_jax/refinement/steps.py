@@ -78,7 +78,7 @@ def init_state(
     parameters: UnconstrainedGaussians, found: Comparison, config: RefineConfig, splat: SplatConfig
 ) -> RefineState:
     """Returns the state before the first step. found: the comparison of the parameters with all
-    photos together. Gaussians that no photo shows get trust 0.
+    photos together (`Comparison.together`). Gaussians that no photo shows get the trust 0.
     """
     return started(parameters, _trust(from_host(found.visibility), config), config, splat)
 
@@ -150,6 +150,8 @@ def refine_views(
     `visible` of the configuration are used. `splat` needs `max_pairs` (see `plan_buffers`). Batch
     over people whose arrays have the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None,
     None))`.
+
+    Raises: ValueError if the avatar has harmonics or deformations.
     """
     avatar, photos = with_pixel_footprint_of(avatar, views), photos_of(views)
     parameters = parameters_of(avatar.gaussians)

@@ -261,9 +261,10 @@ def save_gaussians(
         version: Of a `.spz`: 3, which more programs read, or 4. None: 3.
 
     Raises:
-        ValueError: Another suffix or version, numbers that files cannot hold, or harmonics that the
-            format does not hold.
+        ValueError: Another suffix or version, numbers that files cannot hold, harmonics that the
+            format does not hold, or no Gaussians for a `.glb`.
         OSError: The file cannot be written.
+        TypeError: The call is inside of a JAX transformation.
 
     Examples:
         >>> hg.save_gaussians("garden.spz", hg.load_gaussians("garden.ply", y_up=True), y_up=True)
@@ -336,8 +337,8 @@ def loaded(arrays: Mapping[str, Float[np.ndarray, "g ..."]], notes: list[str]) -
 def _finite(arrays: Mapping[str, np.ndarray], notes: list[str]) -> Mapping[str, np.ndarray]:
     """Returns the arrays without the Gaussians (rows) that have a number that is not finite, also
     after rounding to float32. A line with the count of these Gaussians is appended to `notes`.
-    Arrays of different lengths or without floats are returned as they are. Raises: InvalidFileError
-    if no Gaussian is left.
+    If an array has no floats, or another length than the first one, all arrays are returned as they
+    are. Raises: InvalidFileError if no Gaussian is left.
     """
     count = len(next(iter(arrays.values())))
     keep = np.ones(count, bool)
@@ -449,8 +450,11 @@ def export(
 
     Raises:
         ValueError: for another suffix, for a format that cannot hold what is asked for, for numbers
-            that files cannot hold, or if `numbers` has not one number for each frame.
+            that files cannot hold, if `numbers` has not one number for each frame, or if `animate`
+            refuses a pose of the motion. Also if the `.mtl` or `.png` of an `.obj` would replace a
+            file that humangs did not write.
         OSError: if a file cannot be written.
+        TypeError: inside of JAX transformations.
 
     Examples:
         >>> hg.export("person.glb", avatar, hg.load_motion("dance.bvh"), mesh=True)

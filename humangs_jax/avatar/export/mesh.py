@@ -142,7 +142,7 @@ def vertex_weights(avatar: Avatar) -> Float[np.ndarray, "n j"]:
     """Returns the skinning weights of the body's vertices: for each vertex the mean over its
     Gaussians.
 
-    Where refinement has added Gaussians, it is the mean over the four nearest ones.
+    If `Avatar.gaussians_per_vertex` is None, it is the mean over the four nearest Gaussians.
     """
     weights = np.asarray(avatar.skinning_weights, np.float32)
     each = avatar.gaussians_per_vertex
@@ -446,6 +446,8 @@ def write_poses(
 ) -> None:
     """Write an `.obj` for each pose of a motion, or a single one in T-pose with its feet on 0. All
     of them use the material and the texture beside `path`. files: the paths of the `.obj` files.
+
+    Raises: as `check_beside` and `body_mesh`; OSError if a file cannot be written.
     """
     check_beside(path)
     mesh = body_mesh(avatar)
