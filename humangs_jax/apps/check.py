@@ -3,9 +3,9 @@ computes numbers that show what is wrong.
 
 Blue is the person's left side, red is the right side, and the green line is the boundary of the
 body. Photo and body should coincide. A yellow line is the boundary of the displaced body that
-`reconstruct` uses. The displacement is that of the capture. If the capture has none, `reconstruct`
-moves a body that does not fit the masks to their edges. It adds a skirt if the masks show one.
-`apps.quick_check` names what is wrong with a view.
+`reconstruct` uses. The displacement is that of the capture. If the capture has none, and the body
+does not fit the masks, `reconstruct` moves its vertices to the edges of the masks. It adds a skirt
+if the masks show one. `apps.quick_check` names what is wrong with a view.
 
 On the sheet of a fit a disc is a keypoint: blue for the person's left, red for the right, white for
 the middle. A ring is a keypoint that is an outlier. A line leads from the keypoint to a cross,

@@ -60,8 +60,8 @@ FILES = ("report.json", *_PICTURES, "avatar.npz", "avatar.ply", "avatar.html")
 marks a folder that the demonstration has written.
 """
 REPORTED = frozenset(("psnr", "views", "baseline_psnr"))
-"""Keys that report.json has at least. The demonstration has written a folder whose report.json has
-all of them.
+"""Keys that every report.json has. A folder whose report.json has all of them counts as written by
+the demonstration.
 """
 
 

@@ -90,7 +90,7 @@ class _Sheet:
     """How the sheet of people looks."""
 
     thumbnail: int = 480
-    """Longest side of a photo on the sheet, pixels."""
+    """Photos whose longer side exceeds this are reduced to it on the sheet, pixels."""
     colors: tuple[tuple[int, int, int], ...] = (
         (46, 160, 67),
         (31, 111, 235),
@@ -238,6 +238,7 @@ def with_masked(
 
     Arguments: masks: one per photo, (h, w), 0 to 1. on_white: the photos cut to their masks, white
     elsewhere.
+    Raises: ValueError if LiteRT is not installed.
     """
     # where a given mask and the person found there overlap less, somebody else may have been found
     lost = [

@@ -246,7 +246,10 @@ class FromPhotos:
     """Whether to begin anew even if `out` has a body or an avatar."""
 
     def steps(self) -> Iterator[Step]:
-        """Does all of the work, from the photos to the page, and yields the steps."""
+        """Does all of the work, from the photos to the page, and yields the steps.
+
+        Raises: as `avatar_from_photos`.
+        """
         if self.masks is not None and self.without_masks:
             raise ArgumentError("masks", f"{self.masks}: does not go with without_masks")
         self.resumes()  # what is wrong with the folder is reported before the work
@@ -512,7 +515,8 @@ class FromPhotos:
         """Fits the body to keypoints and masks, and writes it into the capture. Returns the
         capture, and how well its avatar reproduces a held-out photo; None if this was not measured.
 
-        Raises: ArgumentError if the calibration contradicts the keypoints.
+        Raises: ArgumentError if the calibration contradicts the keypoints; as `load_photos`,
+        `read_keypoints` and `fit_photos`; OSError if the fit cannot be written.
         """
         with stage("fitting the body"):
             fit_masks = self.fit_masks and not known.masks_by_detector

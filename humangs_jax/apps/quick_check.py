@@ -112,7 +112,7 @@ class Faults(NamedTuple):
 
 def likely_mistakes(capture: Capture) -> tuple[str, ...]:
     """Returns warnings about what looks wrong in a capture, one line each. Problems of the whole
-    capture come first.
+    capture come first. Looks at no more than `VIEWS` views.
     """
     some = np.unique(
         np.linspace(0, capture.view_count - 1, min(capture.view_count, VIEWS)).round().astype(int)

@@ -115,7 +115,9 @@ class Settings:
         return dataclasses.replace(config, runtime=self.runtime)
 
     def photos(self, capture: Capture | PreparedCapture) -> PreparedCapture:
-        """Returns a prepared capture with the photos that these settings use."""
+        """Returns a prepared capture with the photos that these settings use. Raises: as
+        `prepare_capture`.
+        """
         return prepare_capture(capture, views=self.views)
 
     def shot(self, shot: FrameSettings) -> FrameSettings:

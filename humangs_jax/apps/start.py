@@ -359,6 +359,7 @@ def held_out_psnr(
         number: which photo is held out. 0 is the photo with the nearest neighbour, 1 the next in
             this order.
         watch: is called before refinement, with the avatar and the photos from which it was made.
+    Raises: as `prepare_capture` and `reconstruct`.
     """
     photos = _photos_to_hold_out(capture)
     capture = photos.capture
@@ -448,6 +449,7 @@ def better_body(
 
     Arguments: refinement: as for `held_out_psnr`. ahead: compiles the programs of the refinement in
     the background.
+    Raises: as `held_out_psnr`.
     """
     photos = _photos_to_hold_out(first)
 

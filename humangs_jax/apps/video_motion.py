@@ -59,8 +59,8 @@ class _Following:
     """How one person is followed from frame to frame."""
 
     patience: int = 8
-    """Number of frames that are all searched once the person is lost. A search takes ten times as
-    long as following the person from the frame before.
+    """Once the person is lost, this number of frames is searched, one after the other. A search
+    takes ten times as long as following the person from the frame before.
     """
     rarely: int = 8
     """After `patience` frames without the person, only one of this many frames is searched."""

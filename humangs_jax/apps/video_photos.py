@@ -140,6 +140,8 @@ def seconds_of_photos(folder: Path, names: Sequence[str]) -> Float[np.ndarray, "
 
     Returns None if the photos in the folder were not taken from a video by `photos_of_video`, if
     the video does not have a rate, or if the names do not end in ascending numbers.
+
+    Raises: FileError if the folder's `MARK` is no JSON.
     """
     known = None
     if (folder / MARK).is_file():
@@ -182,6 +184,8 @@ def followed(frames: Iterable[UInt[np.ndarray, "h w 3"]], count: int) -> Iterabl
     landmarks in each frame, or None where nobody is found. If the person is lost, the largest
     person who is found next is followed. The generator ends early if nobody is found in `PATIENCE`
     frames in a row.
+
+    Raises: ImportError if LiteRT is not installed.
     """
     networks, last, missed = Networks(), None, 0
     for frame in bar(frames, total=count, desc="following the person", unit="frame"):

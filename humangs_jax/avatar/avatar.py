@@ -280,7 +280,7 @@ class Avatar(Batchable):
 
         Args:
             body: the body model that the avatar's vertices belong to. It must have expressions.
-                None: the shipped body.
+                None: the shipped body, or what `gaussian_body` makes of it.
 
         Raises:
             ValueError: if the avatar's vertices are not those of the body, or if the body has no
@@ -400,6 +400,8 @@ def _read(
     """Returns the arrays of an avatar file by key, and its header. The arrays are not checked.
 
     wanted: function that returns whether the array of a key is read. None: all are read.
+
+    Raises: FileError, InvalidFileError.
     """
     try:
         arrays, _ = read_npz(path, wanted)

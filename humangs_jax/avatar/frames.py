@@ -81,6 +81,8 @@ def draw(
     """Yields one rendering for each pose and its camera. how: how to splat. None: the preset
     `avatar.rendering`, for which the avatar was trained. exposure_gains: factors on the colors in
     each image, (v, 3), see `data.exposure`. at_once: as for `draw_gaussians`.
+
+    Raises: as `skin` and `draw_gaussians`.
     """
     if how is None:
         how = SPLAT_PRESETS[avatar.rendering]

@@ -48,8 +48,8 @@ def check_video(
     video's format.
 
     A path without a suffix is a folder of PNG files. Raises: ValueError for another suffix, for
-    transparency in a format without it, for a GIF that would not fit into memory, for a video whose
-    path is a folder, or for a folder of PNG files whose path is a file.
+    transparency in a format without it, for a GIF whose frames have more than `LARGEST_GIF` bytes,
+    for a video whose path is a folder, or for a folder of PNG files whose path is a file.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -104,9 +104,9 @@ def write_video(
         ValueError: if there is no frame, if frames differ in shape or have another shape than
             above, or if their numbers are neither uint8 nor finite floats in [0, 1]. Also if `fps`
             is not positive and finite, if the suffix is unknown, if frames have alpha and the
-            format has none, or if a GIF does not fit into memory. Also if the path of a video is a
-            folder, if that of a folder is a file, or if a PNG file that would be replaced was not
-            written by humangs.
+            format has none, or if a GIF would have to keep more than 1 GiB. Also if the path of a
+            video is a folder, if that of a folder is a file, or if a PNG file that would be
+            replaced was not written by humangs.
         OSError: if the file cannot be written. Errors of the iterator `frames` are passed on.
 
     Examples:
@@ -152,7 +152,7 @@ def video_size(path: str | Path, width: int, height: int) -> tuple[int, int]:
 def write_images(
     folder: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]
 ) -> None:
-    """Write each frame as a PNG file, frame_00000.png and so on."""
+    """Write each frame as a PNG file, frame_00000.png and so on. Raises: OSError."""
     for i, frame in enumerate(frames):
         write_png(folder / f"frame_{i:05d}.png", frame, mark=DRAWN)
 
@@ -206,7 +206,7 @@ def _check_numbers(name: str, frame: np.ndarray) -> None:
 
 
 def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
-    """Write a video in H.264."""
+    """Write a video in H.264. Raises: OSError."""
     quality = [
         "-c:v",
         "libx264",
@@ -223,7 +223,7 @@ def write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple
 def write_webm(
     path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]
 ) -> None:
-    """Write a video in VP9."""
+    """Write a video in VP9. Raises: OSError."""
     quality = [
         "-c:v",
         "libvpx-vp9",
@@ -317,7 +317,7 @@ def _commonest(pixels: np.ndarray) -> tuple[int, int, int]:
 
 
 def _check_gif(path: Path, frames: int, width: int, height: int) -> None:
-    """Raises ArgumentError if the frames of a GIF would not fit into memory."""
+    """Raises ArgumentError if the frames of a GIF would have more than `LARGEST_GIF` bytes."""
     if frames * width * height * 3 > LARGEST_GIF:
         raise ArgumentError(
             "path",
@@ -329,7 +329,7 @@ def _check_gif(path: Path, frames: int, width: int, height: int) -> None:
 def write_gif(path: Path, frames: Iterable[np.ndarray], fps: float, shape: tuple[int, ...]) -> None:
     """Write a GIF, with one palette for all frames.
 
-    Raises: ArgumentError if the frames do not fit into memory.
+    Raises: ArgumentError if the frames have more than `LARGEST_GIF` bytes; OSError.
     """
     from PIL import Image
 
@@ -396,7 +396,7 @@ def contact_sheet(
     headers: Sequence[str] | None = None,
     columns: int | None = None,
 ) -> None:
-    """Write a grid of images as a PNG; see `tile`."""
+    """Write a grid of images as a PNG; see `tile`. Raises: OSError."""
     write_png(path, tile(images, labels=labels, headers=headers, columns=columns), mark=DRAWN)
 
 
@@ -408,7 +408,7 @@ def side_by_side(
     labels: Sequence[str] | None = None,
 ) -> None:
     """Write a PNG with the truth, our image and the error of every view, and the scale of the error
-    below. labels: one for each view.
+    below. labels: one for each view. Raises: OSError.
     """
     errors = error_colors(np.abs(truth - ours).mean(axis=-1), LARGEST_ERROR)
     triples = np.stack([truth, ours, errors], axis=1).reshape(-1, *truth.shape[1:])

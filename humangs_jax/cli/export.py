@@ -188,6 +188,8 @@ class Export:
         """Returns the numbers of the frames that are written.
 
         count: number of frames of the motion. animated: whether the file can hold a motion.
+
+        Raises: UsageError if --frame is out of range; ValueError for wrong --frames.
         """
         from humangs_jax.avatar.export.gaussians import frame_range
 

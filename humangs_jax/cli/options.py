@@ -397,6 +397,8 @@ def first_refinement(text: str | None) -> RefineConfig | None:
     """Parses --refine of a new avatar, as `refine_limits` does.
 
     Returns None for "0", which means no refinement. Without --refine, returns `ITERATIONS_ALONE`.
+
+    Raises: UsageError, see `refine_limits`; ValueError for a number that is out of range.
     """
     if text is None:
         return ITERATIONS_ALONE

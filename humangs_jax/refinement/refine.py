@@ -110,11 +110,11 @@ def refine(
     the fit is no better.
 
     First come iterations of a learned optimizer, then steps of Adam. Steps on the head alone follow
-    if photos have 512 pixels or more (`RefineConfig.head_steps`), unless the argument `steps` is
-    above 0, or seconds limit the steps. Views whose mask does not show the person are left out, and
-    exposure is made equal, as in `reconstruct`. Once the photos are prepared, Ctrl-C ends the run,
-    and the best state until then is returned. `refine_with_report` also returns the steps, the
-    seconds and the gain.
+    if the longer side of the photos has 512 pixels or more (see `RefineConfig.head_steps` for all
+    conditions), unless the argument `steps` is above 0, or seconds limit the steps. Views whose
+    mask does not show the person are left out, and exposure is made equal, as in `reconstruct`.
+    Once the photos are prepared, Ctrl-C ends the run, and the best state until then is returned.
+    `refine_with_report` also returns the steps, the seconds and the gain.
 
     Args:
         avatar: the avatar of the person in the photos, on the body of the capture.
@@ -239,7 +239,7 @@ def calls_of_refine(
 ) -> Iterator[Call]:
     """Yields the programs of a refinement's iterations, so that they can be compiled before it
     begins. Programs of steps are not among them. Yields nothing if there are no iterations or if
-    the capture has no masks.
+    the capture has no masks. Raises: as `prepare_capture`.
     """
     photos = prepare_capture(capture)
     if config.iterations and photos.capture.masks is not None:

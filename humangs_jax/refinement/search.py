@@ -316,8 +316,8 @@ def _fresh(avatar: Avatar, pixel_footprint: Float[Array, " g"] | None) -> Gaussi
 
 
 def planned(avatar: Avatar, views: SubjectViews) -> SplatConfig:
-    """Returns the configuration with which the photos are drawn. Its buffers have room for each
-    photo, times `BUFFER_MARGIN`.
+    """Returns the configuration with which the photos are drawn. Its buffers have room for
+    `BUFFER_MARGIN` times what any of the photos needs.
     """
     poses = jax.vmap(BodyPose)(views.rotations, views.translations)
     configs = [

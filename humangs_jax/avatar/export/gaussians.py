@@ -147,7 +147,7 @@ def plain_arrays(gaussians: Gaussians) -> Sequence[Float[np.ndarray, "g ..."]]:
     the scales, so that viewers draw the same images, at the size that the Gaussians were fitted to.
 
     Raises: ValueError for numbers that files cannot hold, because they are not finite or larger
-    than `checks.LARGEST`.
+    than `checks.LARGEST`. Also for negative scales and for opacities outside of [0, 1].
     """
     names = ("means", "quats", "scales", "colors", "harmonics")
     check_values("export", record_values(gaussians, "gaussians"))

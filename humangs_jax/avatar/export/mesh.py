@@ -88,6 +88,8 @@ class BodyMesh:
     def posed(self, avatar: Avatar, pose: BodyPose) -> "BodyMesh":
         """Returns the mesh in a pose of the avatar's joints. Normals are multiplied by the linear
         part of the blended transforms, and scaled to length 1.
+
+        Raises: ValueError if the pose's expression does not fit the avatar's face.
         """
         rest = RestBody(avatar.rest_vertices, avatar.rest_joints)
         still = jnp.asarray(self.vertices)
@@ -199,7 +201,7 @@ def write_animation(
     path: Path, files: Sequence[Path], avatar: Avatar, motion: Motion | None, up: Up, name: str
 ) -> None:
     """Write a whole motion into one `.glb`, see `write_mesh_glb`. Expressions are written if the
-    avatar has a face or if its body is known.
+    avatar has a face or if its body is known. Raises: as `body_mesh`; OSError.
     """
     avatar = faced(avatar)
     write_mesh_glb(path, avatar, body_mesh(avatar), motion, name, up)
@@ -218,6 +220,8 @@ def write_mesh_glb(
     Arguments: motion: written as it is. Callers put it on the floor first, see
     `body.motion.grounded`. None: the person stands in T-pose, feet on 0. name: the name of the
     motion. up: the axis that points up in the file.
+
+    Raises: ValueError for another `up`; OSError if the file cannot be written.
     """
     writer = GlbWriter()
     skeleton = len(avatar.parents) + 1  # nodes: the joints, then what they hang on, then the mesh
@@ -464,7 +468,7 @@ def write_poses(
 def write_material(path: Path, mesh: BodyMesh) -> Path:
     """Write the `.mtl` and the `.png` for the `.obj` at this path. Several poses share them.
 
-    Returns the path of the `.mtl`.
+    Returns the path of the `.mtl`. Raises: OSError.
     """
     material, texture = files_beside(path, EXPORTS["obj"])
     write_png(texture, mesh.texture.astype(np.float32) / 255, mark=DRAWN)
@@ -477,7 +481,7 @@ def write_material(path: Path, mesh: BodyMesh) -> Path:
 
 def write_obj(path: Path, mesh: BodyMesh, material: Path, up: Up) -> None:
     """Write a mesh as an `.obj`. material: path of the `.mtl` in the same folder, as
-    `write_material` returns it. up: the axis that points up in the file.
+    `write_material` returns it. up: the axis that points up in the file. Raises: OSError.
     """
     turn = up_matrix(up)
 
