@@ -46,8 +46,8 @@ def taken(array: Any, index: Any) -> Any:
     An array of JAX is indexed by numpy if it is small, or if it is on the host (`on_host`). The
     result is then an array of JAX again.
 
-    Raises: IndexError for an integer out of range. If the index is traced, there is no error, and
-    JAX clamps it.
+    Raises: IndexError for an integer out of range. A traced index of an array of JAX is clamped
+    instead. A traced index of an array of numpy is an error of JAX.
     """
     if isinstance(index, Tracer) or isinstance(array, np.ndarray):
         return array[index]

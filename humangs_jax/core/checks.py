@@ -7,8 +7,8 @@ and values must be finite and in range.
         first at [17]: nan
 
 Classes and shapes are known inside of `jit`, `vmap` and `grad`, too, and checking them computes
-nothing. Values are known only outside of these transformations, and are not checked inside. So the
-pure function behind a public one needs no switch.
+nothing. Values are known only outside of these transformations, and are not checked inside. So no
+setting is needed that turns the checks off.
 """
 
 import dataclasses
@@ -62,13 +62,14 @@ def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """Decorates a function so that each call checks the classes of its arguments, and the shapes of
     the arrays in them.
 
-    A parameter is checked if its annotation names either plain classes and sequences, or arrays.
-    None may be one of the options. Parameters for numbers and callables are not checked. For an
-    array, only the number of axes is checked.
+    A parameter is checked if its annotation names only plain classes and sequences, or only arrays.
+    None may be among them. Parameters for numbers and callables are not checked. For an array, only
+    the number of axes is checked.
 
     Raises:
         TypeError: of one line, for an argument of another class, for a value without a shape where
-            an array is expected, for a name that is no parameter, and for a missing argument.
+            an array is expected, for an argument that the function does not have, and for a missing
+            argument.
         ValueError: for an array with another number of axes, for a pytree that does not fit its
             annotations (`shape_fault`), and for a batch where the function takes one example
             (`one_at_a_time`).

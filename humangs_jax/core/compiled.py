@@ -10,8 +10,9 @@ After an edit of the source, this concerns all functions whose programs stay the
 traces them. A new version of the package begins with an empty cache, and keeps all programs again.
 
 Programs are kept only in processes that call `core.processes.keep_programs`, as the console script
-does, and only if JAX has one device, a CPU. Elsewhere `compiled` works as `jax.jit`. A notebook may
-change a function of the package while it runs, and the source would not show this change.
+does, and only if JAX has one device, a CPU. Elsewhere `compiled` works as `jax.jit`. Notebooks
+should not call `keep_programs`. A notebook may change a function of the package while it runs, and
+the files of the package would not show this change.
 """
 
 import contextlib
@@ -63,8 +64,8 @@ HIT = "/jax/compilation_cache/cache_hits"
 
 
 class Compiled(Generic[T]):
-    """What `compiled` returns: a function that is compiled when it is called with arrays. Inside of
-    a transformation it becomes a part of the transformed program.
+    """A function with the decorator `compiled`. It is compiled when it is called with arrays. In a
+    transformation it becomes a part of the transformed program.
 
     As with `jax.jit`, a type checker accepts all arguments, because arrays may be NumPy's.
     """
@@ -158,8 +159,8 @@ class Compiled(Generic[T]):
 
     def _call(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> "_Call | None":
         """Returns the arguments of a call apart from the static ones, and what its program depends
-        on. None if programs are not kept, if an argument is neither an array nor a number, or under
-        the settings `jax_disable_jit` and `jax_debug_nans`.
+        on. None if programs are not kept, if an argument is neither an array nor a number, or if
+        one of JAX's settings `jax_disable_jit` and `jax_debug_nans` is on.
         """
         folder = _folder()
         # under these settings JAX calls the function itself, to find faults
@@ -328,11 +329,12 @@ def _shape(leaf: Any) -> tuple[Any, ...] | None:
 
 
 def _stable(value: Any) -> str:
-    """Returns a text for a value. The texts of two values, also of two processes, are equal if and
-    only if the values are equal.
+    """Returns a text for a value. Values with the same text are equal, also if they are values of
+    two processes.
 
     Raises: TypeError for values of classes that are not in a package of `KNOWN`, because their
-    source may change, and for arrays of JAX.
+    source may change, and for arrays of JAX. Also for functions and classes that were made inside
+    of a function.
     """
     # values of Python
     if value is None or isinstance(value, bool | int | float | complex | str | bytes):
@@ -392,8 +394,8 @@ def _surroundings() -> str:
 
 
 def _read(file: Path) -> Any:
-    """Returns what a file holds, and marks the file as used. Files that were not used for longest
-    are deleted first.
+    """Returns what a file holds, and marks the file as used, because `keep_programs` first deletes
+    the files that were not used for longest.
 
     Raises: OSError; ValueError if the file is damaged; anything that pickle raises.
     """

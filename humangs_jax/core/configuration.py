@@ -9,10 +9,10 @@ Numbers are annotated with their range. The range is checked whenever a configur
 
 A class variable `renamed_fields` maps the names of fields in earlier files to the names of today.
 
-A field annotated with a subclass of `Part` may hold an object of any class derived from it. The
-class must have the decorator `part`, or the configuration cannot be written. The JSON names the
-class under "kind", as "PatchTransformer". Reading imports nothing: a part of another package is
-known once its module is imported.
+A field annotated with a subclass of `Part` may hold an object of any class derived from that
+subclass. The object's class must have the decorator `part`, or the configuration cannot be written.
+The JSON names the class under "kind", as "PatchTransformer". Reading imports nothing: a part of
+another package is known once its module is imported.
 """
 
 import dataclasses
@@ -97,8 +97,8 @@ Length = Annotated[float, Range(1e-6, 100)]
 Bias = Annotated[float, Range(-100, 100)]
 Vertices = Annotated[int, Range(1, 10_000_000)]
 Edge = Annotated[float, Range(0.005, 10)]
-"""Length above which the edges of a body are split, metres. Shorter edges would make millions of
-Gaussians.
+"""Length above which the edges of a body are split, metres. A length below 0.005 would make
+millions of Gaussians.
 """
 
 
@@ -138,9 +138,9 @@ class _UnknownPresetError(KeyError):
 
 
 class Presets(dict[str, T]):
-    """A dict of presets by name. An unknown name raises a KeyError whose line lists all names.
+    """A dict of presets by name. An unknown name raises a KeyError. Its message lists all names.
 
-    hint: text at the end of that line.
+    hint: text at the end of that message.
     """
 
     def __init__(self, presets: dict[str, T], hint: str = "") -> None:
@@ -388,7 +388,8 @@ def marks_in(annotation: Any, kind: type[T]) -> Iterator[T]:
 def config_to_json(config: Any, indent: int | None = None) -> str:
     """Returns a configuration as JSON, with nested configurations as nested objects.
 
-    Raises: ValueError for a `Part` whose class is not registered.
+    Raises: ValueError for a `Part` whose class is not registered; TypeError for a value that JSON
+    cannot hold, such as a number of class np.float32.
     """
     return json.dumps(_plain(config), indent=indent)
 
@@ -427,7 +428,8 @@ def config_from_json(cls: type[T], text: str) -> T:
 
     Raises: ValueError if the text is not JSON. Also for a field that the configuration does not
     have, for a missing field without a default, for an unknown part, and for a value of a wrong
-    type or out of range; these errors name the path of the field.
+    type or out of range; these errors name the path of the field. Also if fields do not fit each
+    other.
     """
     try:
         values = json.loads(text)
@@ -499,7 +501,7 @@ def _find_part(kind: Any, base: Any, path: str) -> type:
 def _build_dataclass(cls: Any, values: Any, path: str) -> Any:
     """Returns the configuration of class `cls` that an object of JSON describes.
 
-    Raises: ValueError.
+    Raises: ValueError if the value is no object, or if it describes no such configuration.
     """
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected an object, got {values!r}")

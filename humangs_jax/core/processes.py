@@ -29,8 +29,8 @@ from typing import Any, TypeVar
 
 
 def keep_freed_memory() -> bool:
-    """Makes the process keep blocks of up to 1 GiB that it frees. Returns whether the C library
-    took these settings, which glibc does.
+    """Makes the process keep freed blocks of up to 1 GiB for its next arrays. Returns whether the C
+    library took these settings, which glibc does.
 
     Programs call it once, before the first large array; the library never does. The process then
     hardly gets smaller than its peak.
@@ -142,7 +142,8 @@ def in_processes(
     arguments and the results are pickled.
 
     Raises: OSError if a process is killed, or if `prepare` fails; PicklingError and others if the
-    arguments cannot be pickled; anything that `work` raises.
+    arguments cannot be pickled; ValueError if there are no tasks, or if `workers` is below 1;
+    anything that `work` raises.
     """
     import concurrent.futures.process
 
@@ -337,7 +338,7 @@ def enable_compile_cache(folder: str | os.PathLike[str] | None = None) -> Path |
 
 
 _programs: list[Path] = []
-"""The folder of `keep_programs`, if it was called."""
+"""The folder of `keep_programs`. Empty if programs are not kept."""
 
 
 def keep_programs(cache: Path) -> None:
@@ -504,7 +505,7 @@ def compile_ahead(program: Any, *arguments: Any) -> threading.Thread:
     and raised where the function is called.
 
     Args:
-        program: a function that `jax.jit` or `core.compiled.compiled` returned.
+        program: a function that `jax.jit` or `core.compiled.compiled` made.
         *arguments: arguments of the call; arrays may be `jax.ShapeDtypeStruct`.
     """
 
@@ -518,7 +519,7 @@ def compile_ahead(program: Any, *arguments: Any) -> threading.Thread:
 
 
 def _compile(program: Any, arguments: tuple[Any, ...]) -> None:
-    """Compiles a function that `jax.jit` or `core.compiled.compiled` returned."""
+    """Compiles a function that `jax.jit` or `core.compiled.compiled` made."""
     if hasattr(program, "prepare"):
         program.prepare(*arguments)
     else:
@@ -526,7 +527,7 @@ def _compile(program: Any, arguments: tuple[Any, ...]) -> None:
 
 
 Call = tuple[Any, tuple[Any, ...]]
-"""A function that `jax.jit` or `core.compiled.compiled` returned, and the arguments of a call;
+"""A function that `jax.jit` or `core.compiled.compiled` made, and the arguments of a call;
 arrays may be `jax.ShapeDtypeStruct`.
 """
 

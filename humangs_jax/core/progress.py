@@ -90,7 +90,9 @@ class Progress:
     started: float = dataclasses.field(default_factory=time.perf_counter)
     """Time at which the program began, seconds of `time.perf_counter`."""
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """Seconds of the finished outermost stages by name, since `started`."""
+    """Seconds that the finished outermost stages took, by name. The seconds of stages with the same
+    name are added up.
+    """
     names: list[str] = dataclasses.field(default_factory=list)
     """Names of the stages that run, the outermost first."""
     next: list[str] = dataclasses.field(default_factory=list)
@@ -204,7 +206,7 @@ _compiled: set[Hashable] = set()
 
 @contextlib.contextmanager
 def compiling(program: Hashable = None) -> Generator[None]:
-    """Shows `COMPILING` during the block, on open bars or else as a stage.
+    """Shows `COMPILING` during the block: on all open bars, or as a stage if no bar is open.
 
     Arguments: program: the program that is compiled. The text is shown only at its first run in a
     process. None: the text is shown always.

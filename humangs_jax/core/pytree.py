@@ -39,6 +39,8 @@ def pytree_dataclass(cls: type[T]) -> type[T]:
     """Makes a class a frozen dataclass that is registered as a pytree with named leaves.
 
     With `Batchable` as a base class, batches of it can be indexed and iterated over.
+
+    Raises: TypeError if another module of the package has a pytree of this name.
     """
     cls = dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
     if cls.__repr__ is object.__repr__:
@@ -81,7 +83,7 @@ def _make_exportable(cls: type[Any]) -> None:
     Its name in such files consists of the package and the class, so that files stay readable if a
     module moves. Classes that are defined inside functions or in `__main__` are left out.
 
-    Raises: TypeError if another module has a pytree of this name.
+    Raises: TypeError if another module of the package has a pytree of this name.
     """
     name = f"{cls.__module__.partition('.')[0]}.{cls.__qualname__}"
     if "<locals>" in name or cls.__module__ == "__main__":
@@ -202,8 +204,9 @@ class Batchable:
         """Returns one example of a batch (for an integer), or a batch of some examples (for a
         slice, a mask or an array of integers), along the first axis.
 
-        Raises: TypeError if this is no batch; IndexError for an integer out of range, also in an
-        array. A traced index out of range is clamped by JAX.
+        Raises: TypeError if this is no batch, and for an index of another kind, such as a list;
+        IndexError for an integer out of range, also in an array. A traced index out of range is
+        clamped by JAX.
         """
         size = len(self)
         if not isinstance(index, slice | Tracer) and getattr(index, "ndim", 0) == 0:
@@ -387,7 +390,7 @@ def replace(tree: T, **changes: Any) -> T:
         The changed copy.
 
     Raises:
-        TypeError: for a name that is no field.
+        TypeError: for a name that is no field, and for an object that is no dataclass.
 
     Examples:
         >>> grey = hg.replace(gaussians, colors=jnp.full_like(gaussians.colors, 0.5))

@@ -45,7 +45,7 @@ F = TypeVar("F", bound=Format)
 
 
 class Formats(dict[str, F]):
-    """Formats by name, in the order in which they are tried."""
+    """Formats by name. `recognized` tries them in this order, those with `recognizes` first."""
 
     @property
     def suffixes(self) -> tuple[str, ...]:

@@ -40,8 +40,8 @@ def nearest_axis(direction: Float[np.ndarray, "3"]) -> tuple[str, float]:
 
 def standing_axis(root: Float[np.ndarray, "m 3"]) -> str | None:
     """Returns the name of the axis of the world along which a person stands: the y axis of the
-    pelvis points along it on average. Returns None if the pelvis points clearly along no axis, see
-    `CLEARLY_UP`.
+    pelvis points along it on average. Returns None if the pelvis points clearly along none of the
+    axes, see `CLEARLY_UP`.
 
     Arguments: root: axis-angle of the pelvis in each frame, (m, 3), radians.
     """

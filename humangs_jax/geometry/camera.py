@@ -204,7 +204,7 @@ def require_pinhole(what: str, camera: Camera) -> None:
     """Checks that a camera is a pinhole without distortion. what: name of the function that needs
     such a camera.
 
-    Raises: ValueError.
+    Raises: ValueError for another lens, and for a camera with distortion.
     """
     if not camera.is_plain:
         kind = "distortion"
@@ -347,7 +347,8 @@ def orbit(
         A batch of v cameras.
 
     Raises:
-        ValueError: for elevations beyond a right angle.
+        ValueError: for elevations beyond a right angle, and for distances or elevations whose shape
+            does not fit `azimuths`.
 
     Examples:
         >>> target, azimuths = jnp.array([0.0, 0.9, 0.0]), jnp.linspace(0, 2 * jnp.pi, 8)

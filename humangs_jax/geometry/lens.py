@@ -1,4 +1,4 @@
-"""Computes where a lens shows points of the plane z = 1 before a camera, and how far the lens
+"""Computes where a lens shows points of the plane z = 1 in front of a camera, and how far the lens
 reaches.
 
 "pinhole" with OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]] (Brown and Conrady,
@@ -36,7 +36,7 @@ the image moves outwards.
 
 def check_lens(lens: object, count: int | None) -> None:
     """Checks that a lens is known and may have this number of coefficients. count: None for no
-    coefficients. Raises: ValueError.
+    coefficients. Raises: ValueError for an unknown lens, and for a number that it cannot have.
     """
     if lens not in COUNTS:
         raise ValueError(f"lens: expected {', '.join(COUNTS)}, got {lens!r}")

@@ -9,7 +9,7 @@ def face_crosses(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
 ) -> Float[np.ndarray, "f 3"]:
     """Returns the normals of the faces, (f, 3), each with twice the face's area as its length. They
-    point outwards if corners go round counter-clockwise.
+    point outwards if corners go round counter-clockwise, seen from outside.
     """
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a)

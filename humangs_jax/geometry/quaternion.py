@@ -49,8 +49,8 @@ def between(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, 
 def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
     """Returns the rotation matrix of a unit quaternion.
 
-    A quaternion of another length is not normalized first, so its matrix is no rotation (see
-    `normalize`).
+    A quaternion of another length is not normalized first, so its matrix is in general no rotation
+    (see `normalize`).
     """
     w, x, y, z = jnp.moveaxis(q, -1, 0)
     rows = [

@@ -189,7 +189,7 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
     head_width: width of an attention head. It is needed if queries and keys are not normalised,
     because no shape shows it then. Raises: ValueError for a variant that is not supported, if a
     tensor that determines a size is missing, empty or of another number of axes, if no square patch
-    fits, or if `head_width` is missing or wrong.
+    fits, if `head_width` is missing or wrong, or if the configuration refuses a size.
     """
     if UNSUPPORTED in state:
         raise ValueError(

@@ -174,8 +174,8 @@ class PatchTransformer(Encoder):
     def __call__(self, inputs: HumanGSInputs, ctx: ForwardContext) -> Encoding:
         """Returns feature maps and a global token of the photos, see `parts.Encoding`.
 
-        Raises: ValueError if images are not made of whole patches, or if the encoder looks at rays,
-        and images and cameras differ in size.
+        Raises: ValueError if images are not made of whole patches. If the encoder looks at rays,
+        also as `encoder_pixels`.
         """
         dtype, patch_size = ctx.runtime.compute_dtype, self.patch_size
         views = len(inputs.images)
@@ -273,7 +273,8 @@ def encoder_pixels(inputs: HumanGSInputs, ctx: ForwardContext) -> Float[Array, "
     """Returns the encoder's input at every pixel, (v, h, w, 12): rgb, ray (moment, direction),
     canonical position.
 
-    Raises: ValueError if images and cameras differ in size.
+    Raises: ValueError if images and cameras differ in size, or if cameras have distortion or a lens
+    other than a pinhole.
     """
     height, width = inputs.images.shape[1:3]
     if (inputs.cameras.width, inputs.cameras.height) != (width, height):

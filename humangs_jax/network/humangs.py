@@ -86,8 +86,9 @@ def apply_humangs(
     subjects, give the vmap's `axis_name` to share the statistics over the batch. Without it each
     subject has separate statistics, which the caller has to average.
 
-    Raises: ValueError if images and cameras differ in size, the sides of images are no multiples of
-    the patch size, or inputs lack normals that the configuration needs.
+    Raises: TypeError for arguments of other classes. ValueError if images and cameras differ in
+    size, cameras have distortion or a lens other than a pinhole, the sides of images are no
+    multiples of the patch size, or inputs lack normals that the configuration needs.
     """
     statistics, ctx = variables.get("batch_stats", {}), config.forward_context(train, axis_name)
     if not (train and statistics):
@@ -105,7 +106,7 @@ def intermediates(
 ) -> dict[str, Any]:
     """Returns the result of every module of the network by the path of the module, such as
     "encoder.transformer.block_0", in the order in which the modules finish. The path of the whole
-    network is "".
+    network is "". Raises: as `apply_humangs`.
     """
     found = {}
 
@@ -198,7 +199,8 @@ def decode(
     variables: Variables, features: PyTree, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> HumanGSOutputs:
     """Runs the third step of `apply_humangs`: returns the outputs with canonical Gaussians, metres.
-    Their `dropped_tokens` is 0, because this number belongs to the encoding.
+    Their `dropped_tokens` is 0, because this number belongs to the encoding. Raises: as
+    `apply_humangs`.
     """
     own = part_variables(variables, "decoder")
     return cast(

@@ -315,9 +315,9 @@ class TargetDecoder(Part, nn.Module):
         backgrounds: Float[Array, "v 3"],
         config: PyTree,
     ) -> Drawn:
-        """Returns the drawn targets (`SubjectViews`) of one subject, as a `TrainConfig` asks for
-        them. `training.forward.draw_targets` calls it, and draws targets itself where there is no
-        driver.
+        """Draws the targets of one subject as a `TrainConfig` asks for them, and returns the
+        images. photos and targets: `SubjectViews`. `training.forward.draw_targets` calls it, and
+        draws targets itself where there is no driver.
         """
         raise NotImplementedError
 

@@ -77,7 +77,7 @@ class PixelAlignedReader(Reader):
     """
 
     def __post_init__(self):
-        """Raises ValueError for distances that are not ascending."""
+        """Raises ValueError for distances that are negative, not finite or not ascending."""
         super().__post_init__()
         ascending = all(a < b for a, b in itertools.pairwise(self.shells))
         if not (ascending and all(0 <= x < math.inf for x in self.shells)):

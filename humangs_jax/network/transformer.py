@@ -5,9 +5,9 @@
 
 LayerNorms of the blocks have a weight and no bias, the final one has both (eps 1e-5). Norms and
 softmax run in float32 at least, and so does the residual stream; products run in `dtype`. Attention
-over the tokens of all views is softmax(q k^T / sqrt(e)) v per head, with normalised q and k. Tokens
-that are padding stand at the end, and only the first `count` tokens are attended to. There are
-three exact implementations:
+over the tokens of all views is softmax(q k^T / sqrt(e)) v per head. With `qk_norm`, q and k are
+normalised first. Tokens that are padding stand at the end, and only the first `count` tokens are
+attended to. There are three exact implementations:
 
 - "chunked": matrix products over blocks of one head's queries, recomputed in the backward pass, so
   that memory grows with L and not with L^2;
@@ -67,6 +67,9 @@ def chunked_attention(
 ) -> Float[Array, "m h e"]:
     """Returns exact attention, computed head by head and one block of queries after the other.
     Softmax statistics are float32 at least.
+
+    count: number of keys that are attended to, the first ones; None: all. query_chunk: largest
+    number of queries in a block.
     """
     # queries of each head in blocks of equal length
     length, heads, width = q.shape

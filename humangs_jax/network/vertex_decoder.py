@@ -45,8 +45,8 @@ THINNER = 1.2
 start with a third of the thickness, so that silhouettes are sharp.
 """
 OBLIQUE = (0.36, 0.48, 0.8)
-"""A unit vector that is parallel to no axis of a body. Frames change quickly between neighbouring
-vertices where normals point in the opposite direction.
+"""A unit vector that is parallel to no axis of a body. Where normals point opposite to it, frames
+change quickly between neighbouring vertices.
 """
 
 

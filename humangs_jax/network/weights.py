@@ -3,7 +3,7 @@ path in the variables, and the header describes the network.
 
 Names are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format":
 "humangs-weights", "version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}.
-The first files have no checksum. float16 halves the size of the file, and rounds to 11 bits.
+The oldest files have no checksum. float16 halves the size of the file, and rounds to 11 bits.
 Loading gives float32.
 """
 
@@ -60,8 +60,8 @@ def save_weights(
         dtype: type of the stored numbers. float16 halves the file.
 
     Raises:
-        ValueError: which names the key, if a tensor does not fit the configuration, is not finite,
-            or overflows float16.
+        ValueError: which names the tensor, if a tensor is missing or unknown, does not fit the
+            configuration, is not finite, or overflows float16.
         OSError: if the file cannot be written.
 
     Examples:
@@ -105,9 +105,9 @@ def load_weights(path: str | os.PathLike[str] | None = None) -> tuple[Variables,
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: which names file and key, if the file is no weights file of this package, if a
-            tensor is missing, unknown, of the wrong shape or not finite, or if the contents do not
-            fit the checksum.
+        ValueError: which names the file, if it is no weights file of this package, or if its
+            contents do not fit its checksum. Also if a tensor is missing, unknown, of the wrong
+            shape or not finite; this error names the tensor, too.
 
     Examples:
         >>> variables, config = hg.load_weights()
@@ -150,7 +150,7 @@ def variables_from_tensors(
 ) -> Variables:
     """Returns float32 variables made from tensors by path. where: name of the file, for errors.
 
-    Raises: ValueError, which names the key, unless the tensors have exactly the names and shapes
+    Raises: ValueError, which names the tensor, unless the tensors have exactly the names and shapes
     that the configuration needs, and are finite.
     """
     expected = expected_variables(config)

@@ -75,8 +75,9 @@ def plan_buffers(
     `plan_buffers` measures concrete arrays, so call it outside of transformations.
 
     No margin is enough for Gaussians that are optimised for long, because they grow. If pairs no
-    longer fit, `Rendering.overflow` is above 0, and `SplatConfig.warn_overflow` logs it. Then plan
-    again from the current Gaussians; the program compiles again.
+    longer fit, a traced call returns a `Rendering.overflow` above 0, and logs a warning if
+    `SplatConfig.warn_overflow` is set. Then plan again from the current Gaussians; the program
+    compiles again.
 
     Args:
         gaussians: one set.
@@ -88,8 +89,9 @@ def plan_buffers(
         `config` with `max_pairs` and `max_rows`.
 
     Raises:
-        TypeError: inside of `jit`, `vmap` and `grad`.
-        ValueError: for an unknown name of a preset.
+        TypeError: inside of `jit`, `vmap` and `grad`, and for arguments of other classes.
+        ValueError: for a batch of sets, Gaussians whose arrays do not fit each other, and an
+            unknown name of a preset.
 
     Examples:
         >>> config = hg.plan_buffers(gaussians, cameras, margin=2.0)

@@ -128,10 +128,10 @@ def skin_gaussians(
     With "affine", the linear part of the transform is multiplied into `deformations`, and so
     transforms the whole covariance. With "rotation", as published, the linear part is multiplied by
     the Gaussian's rotation matrix, and the product is converted to a quaternion. If the blended
-    transform is no rotation, the norm of this quaternion is not 1. To reproduce this, draw with
-    `normalize_quats=False`.
+    transform is no rotation, the norm of this quaternion may differ from 1. To reproduce this, draw
+    with `normalize_quats=False`.
 
-    Raises: ValueError for another mode, or for `rotation` of Gaussians that have deformations
+    Raises: ValueError for another mode, and for "rotation" if the Gaussians have deformations
     already.
     """
     linear, means = transforms[:, :3, :3], transform.apply(transforms, gaussians.means)
@@ -188,9 +188,9 @@ class UnconstrainedGaussians(Batchable):
 
 @checked_arguments
 def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """Returns parameters from which `constrain` makes these Gaussians. Opacities and colors are
-    first clamped to `OPACITY_MARGIN` and `COLOR_MARGIN` from 0 and 1, and scales to at least
-    `SMALLEST_SCALE`. `pixel_footprint` is lost.
+    """Returns parameters from which `constrain` makes these Gaussians. First, opacities are clamped
+    to [`OPACITY_MARGIN`, 1 - `OPACITY_MARGIN`], colors to [`COLOR_MARGIN`, 1 - `COLOR_MARGIN`], and
+    scales to at least `SMALLEST_SCALE`. `pixel_footprint` is lost.
 
     Args:
         gaussians: without deformations. A low-pass stays in the scales.
@@ -270,7 +270,7 @@ larger than the number of functions.
 
 def check_count(count: int) -> None:
     """Checks that a number of harmonics is 3 (degree 1), 8 (degrees 1 and 2) or 15 (degrees 1 to
-    3). Raises: ValueError.
+    3). Raises: ValueError for another number.
     """
     if count not in COUNTS[1:]:
         raise ValueError(

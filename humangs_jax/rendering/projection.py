@@ -30,8 +30,8 @@ Jacobian of the division by Z. An orthographic camera has J = [[fx, 0, 0], [0, f
 directions of sight are its axis.
 
 Gaussians that are not drawn (centre nearer than `near`, behind, or beyond the reach of the lens,
-footprint beyond `LARGEST_FOOTPRINT`) have finite values, and pass zero gradients when they are
-drawn by `splatting`. K's skew is taken as 0.
+footprint beyond `LARGEST_FOOTPRINT`) have finite values, and get zero gradients in `splatting`. K's
+skew is taken as 0.
 """
 
 import functools

@@ -47,7 +47,7 @@ def render_reference(
     shifts: Float[Array, "g 2"] | None = None,
 ) -> Rendering:
     """Draws the image of `render` by its definition, without tiles or buffers, in the precision of
-    its arguments.
+    its arguments, but at least float32.
 
     Footprints never end: `radius_sigma` and `square` of `config` are ignored, and so are buffers
     and schedule. Values are not checked.
@@ -62,6 +62,11 @@ def render_reference(
 
     Returns:
         A `Rendering`, without visibility, means2d and radii.
+
+    Raises:
+        TypeError: for arguments of other classes.
+        ValueError: for a background that is no color, features that do not have one row for each
+            Gaussian, Gaussians whose arrays do not fit each other, and an unknown name of a preset.
 
     Examples:
         >>> with jax.enable_x64():

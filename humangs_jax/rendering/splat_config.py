@@ -242,9 +242,9 @@ def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
     the preset's name, which weights record.
 
     All fields in which the two presets differ take the values of the preset `rendering`. Other
-    fields stay as the user has set them. If `jacobian_margin`, `normalize_quats` and `square` of
-    the configuration all differ from those of the other preset, the configuration is returned
-    unchanged.
+    fields stay as the user has set them. The configuration is returned unchanged if its
+    `jacobian_margin`, `normalize_quats` and `square` all differ from those of the preset that is
+    not `rendering`.
     """
     wanted, other = SPLAT_PRESETS["inria"], SPLAT_PRESETS["exact"]
     if rendering == "exact":

@@ -115,7 +115,7 @@ def take_chunk(
     """Returns the first k splats of each of b lists. List i is `items[starts[i] : starts[i] +
     counts[i]]`, and belongs to the tile `tiles[i]`.
 
-    There are four results: the numbers of the splats, (b, k), which are g past the end of a list;
+    There are four results: the numbers of the splats, (b, k), with g past the end of a list;
     their rows, (b, k, width); x and y of their centres relative to the tile's centre, (2, b, k),
     pixels; and their raw alphas at the tile's pixels, (b, k, p), which are 0 past the end.
     """

@@ -162,7 +162,9 @@ def render(
         TypeError: for arguments of other classes.
         ValueError: for a batch of cameras or of sets, shapes that do not fit each other, a
             background that is no color, values that are not finite, opacities outside of [0, 1],
-            negative scales, focal lengths that are not positive, and an unknown name of a preset.
+            negative scales, focal lengths that are not positive, numbers of harmonics other than 3,
+            8 and 15, and an unknown name of a preset. Values are not checked inside of
+            transformations.
         BufferOverflowError: outside of transformations, if `config.max_pairs` or `max_rows` is too
             small.
 
@@ -205,7 +207,7 @@ def render_views(
 
     Raises:
         TypeError: as `render`.
-        ValueError: as `render`, and for a single camera or several batch axes.
+        ValueError: for a single camera or several batch axes, and otherwise as `render`.
         BufferOverflowError: as `render`.
 
     Examples:
@@ -230,6 +232,7 @@ def visible_gaussians(
     camera, (g,). `cameras` has one leading axis.
 
     The other Gaussians, such as those inside of an avatar, can be left out for similar cameras.
+    Raises: as `render_views`.
     """
     visibility = render_views(
         gaussians, cameras, dataclasses.replace(splat_config(config), visibility=True)

@@ -1,7 +1,7 @@
 """Finds which splats touch which tile, a square of pixels, and keeps one list per tile in one
 buffer of fixed size.
 
-Splatting takes five steps. All have static shapes, and no gradient passes the first three:
+Splatting takes five steps. All have static shapes, and no gradient passes through the first three:
 
 1. `expand` gives each item one slot for each tile that the item touches. A slot is a (tile, item)
    pair. Splats take two such steps (`emit_pairs`): from splats to rows of tiles, and from rows to

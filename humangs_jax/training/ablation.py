@@ -164,13 +164,15 @@ def ablate(
         intervals.
 
     Raises:
-        ValueError: before the first run, if there is no such metric, `seeds` is below 1, or a
-            variant cannot be trained. A variant cannot be trained if it is named "base", changes
-            the seed, has a path that is no field, describes a network that cannot be made, needs a
-            loss network that is missing, or cannot use a person on disk that the base can use.
-            During the runs, if a folder holds a run of other settings, or if there is nobody to
-            compare on.
-        TrainingInterrupted: after Ctrl-C. What is trained is kept.
+        ValueError: before the first run, if there is no such metric, `seeds` is below 1, nobody in
+            a list of folders can be used, or a variant cannot be trained. A variant cannot be
+            trained if it is named "base", changes the seed, has a path that is no field or a value
+            that the field refuses, describes a network that cannot be made, needs a loss network
+            that is missing, or cannot use a person on disk that the base can use. During the runs,
+            if a folder holds a run of other settings, or if there is nobody to compare on.
+        FileNotFoundError: if `base` is the name of neither a preset nor a file.
+        OSError: if another process trains into a folder, or if a file cannot be written.
+        TrainingInterrupted: after Ctrl-C or SIGTERM. What is trained is kept.
 
     Examples:
         >>> class_token = "model.architecture.encoder.transformer.class_token"
@@ -217,7 +219,7 @@ def ablate(
 def _check_metric(metric: str, networks: LossNetworks) -> None:
     """Checks that validation computes this metric.
 
-    Raises: ArgumentError.
+    Raises: ArgumentError if it does not.
     """
     known = METRICS
     if networks.lpips is not None:

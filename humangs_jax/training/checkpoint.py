@@ -140,8 +140,8 @@ class Checkpoints:
         """Returns the state of a step. If `step` is None, it is the newest state that is not
         damaged.
 
-        like: a state of the same run, for structure, shapes and devices. Newer checkpoints that
-        cannot be used are logged, and set aside unless `read_only`.
+        like: a state of the same run, for structure, shapes and devices. Checkpoints that cannot be
+        used are logged. They are set aside if an older one can be used, unless `read_only`.
         Raises: FileNotFoundError if there is no such checkpoint; FileError (a ValueError) if none
         can be used, because they are damaged or of another model.
         """
@@ -301,7 +301,8 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
     The settings `ADJUSTABLE` may differ from the file. A finished run may get more steps. It then
     continues with the learning rate of the longer run.
 
-    Raises: ValueError, which names a field, if another setting differs.
+    Raises: ValueError, which names a field, if another setting differs; ValueError if the file that
+    is there holds no configuration; OSError if the file cannot be written.
     """
     path = Path(out) / "config.json"
     if path.is_file():
@@ -324,7 +325,8 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
 def load_config(out: str | Path) -> TrainConfig:
     """Returns the configuration of the run in a folder.
 
-    Raises: FileNotFoundError; ValueError, which names file and field.
+    Raises: FileNotFoundError if there is no config.json; ValueError, which names the file, if it
+    holds no configuration of a run.
     """
     path = Path(out) / "config.json"
     if not path.is_file():

@@ -288,7 +288,8 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
     """Returns the configuration of a preset, or of a JSON file such as the config.json of a run.
 
     Raises: FileNotFoundError if there is neither a preset nor a file of that name; ValueError,
-    which names file and field, if the file holds no such configuration.
+    which names the file, if it holds no such configuration. If a field is wrong, the error names
+    the field, too.
     """
     if str(preset_or_path) in PRESETS:
         return PRESETS[str(preset_or_path)]()

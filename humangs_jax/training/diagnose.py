@@ -461,7 +461,7 @@ def diagnose_run(
 
 def first_failed_step(log: Path) -> int | None:
     """Returns the number of the first step that a log calls skipped or not finite, counted from 0.
-    None if there is none.
+    None if there is no such step or no log. Raises: FileError if the log cannot be read.
     """
     if not log.is_file():
         return None

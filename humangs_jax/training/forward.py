@@ -167,8 +167,8 @@ def validation_examples(
 def as_validated(config: TrainConfig) -> TrainConfig:
     """Returns the configuration with the views of validations.
 
-    Inputs are evenly spaced and of one pose. Their number is the middle one of
-    `views.input_counts`, sorted. Targets are as large as the inputs.
+    Inputs stand evenly around the subject and show one pose. Their number is the middle one of the
+    sorted `views.input_counts`. Targets are as large as the inputs.
     """
     counts = sorted(config.views.input_counts)
     views = ViewSampling(

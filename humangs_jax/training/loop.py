@@ -110,7 +110,7 @@ class RunLog:
         """Logs the metrics of the last step done, with times and rates since the previous call.
 
         done: number of steps done. subjects: number of subjects in a step. waiting: how long the
-        loop has waited for data so far. broken: number of capture folders that could not be used.
+        loop has waited for data so far. broken: number of people on disk who could not be used.
         """
         numbers = {name: float(value) for name, value in metrics.items()}
         before, began, waited = self._previous
@@ -380,8 +380,8 @@ def train(
     checkpoint, training continues from the newest one.
 
     After Ctrl-C or SIGTERM the current step is finished, the state is saved, and
-    `TrainingInterrupted` is raised. A second Ctrl-C interrupts at once. Several processes do this
-    after SIGTERM only.
+    `TrainingInterrupted` is raised. If there are several processes, only SIGTERM has this effect. A
+    second Ctrl-C interrupts at once.
 
     Args:
         config: configuration of the run.
@@ -406,10 +406,13 @@ def train(
 
     Raises:
         TrainingInterrupted: after Ctrl-C or SIGTERM.
-        ValueError: if `out` belongs to a run of another configuration, no capture can be used,
-            devices, batch and microbatch do not divide each other, the network of a loss is
-            missing, or the sizes of a later stage do not fit.
-        OSError: if another process trains into `out`.
+        TypeError: for arguments of other classes.
+        ValueError: if `out` belongs to a run of another configuration, if its configuration, log or
+            checkpoints cannot be used, or if a checkpoint cannot be written. Also if no capture can
+            be used, devices, batch and microbatch do not divide each other, the network of a loss
+            is missing, or the sizes of a later stage do not fit.
+        OSError: if another process trains into `out`, or a file other than a checkpoint cannot be
+            written.
 
     Examples:
         >>> people = ["people/0000001", "people/0000002"]
@@ -492,7 +495,7 @@ def _resumed(state: TrainState, mesh: Mesh | None, checkpoints: Checkpoints) -> 
     """Returns where the newest checkpoint stands, or the start of a new run if there is none. The
     state is divided among the devices of the mesh.
 
-    state: of a run that begins.
+    state: the state of a run that begins.
     """
     if mesh is not None:
         state = place(state, state_shardings(state, mesh))

@@ -2,7 +2,8 @@
 
 By default a traced call takes room for the most demanding person. This is five times what the
 targets of the shipped network need, and all of it would be sorted, gathered and kept. Pairs that do
-not fit are counted in every step (`overflow`). The loop then logs it and doubles the room.
+not fit are counted in every step (`overflow`). The loop then logs it, and doubles the room if it
+was measured.
 """
 
 import dataclasses
@@ -35,8 +36,9 @@ MEASURED = 4
 
 
 def usual_room(config: TrainConfig, body: BodyModel) -> int:
-    """Returns the number of pairs that a step has room for if nothing was measured; 0 if the
-    network has a driver. body: the body that carries the Gaussians.
+    """Returns the number of pairs that each target of a step has room for if nothing was measured
+    and `max_pairs` is None. Returns 0 if the network has a driver. body: the body that carries the
+    Gaussians.
     """
     parts = config.model.architecture
     if parts.driver is not None:
@@ -48,8 +50,8 @@ def usual_room(config: TrainConfig, body: BodyModel) -> int:
 def with_measured_room(
     config: TrainConfig, variables: Variables, body: BodyModel, batch: Example
 ) -> TrainConfig:
-    """Returns the configuration of a stage with room for `MARGIN` times what the targets of the
-    first `MEASURED` subjects of a batch need.
+    """Returns the configuration of a stage with room for `MARGIN` times what the most demanding
+    target of the first `MEASURED` subjects of a batch needs.
 
     The configuration is returned unchanged if it sets `max_pairs`, if `usual_room` is below
     `WORTH`, or if the measured room is no smaller than `usual_room`.
@@ -70,7 +72,7 @@ def with_measured_room(
 
 def with_twice_the_room(config: TrainConfig, body: BodyModel) -> TrainConfig:
     """Returns the configuration of a stage with twice the room. If that is `usual_room` or more,
-    `max_pairs` becomes None.
+    `max_pairs` and `max_rows` become None.
     """
     splat = config.splat
     pairs = 2 * (splat.max_pairs or 0)

@@ -163,7 +163,8 @@ def join_processes(
         coordinator: "host:port" of process 0.
         process_count: number of processes.
         process_index: index of this process.
-    Raises: ValueError if some are given and others are not, or if no cluster is recognised.
+    Raises: ValueError if some arguments are None and others are not, if no cluster is recognised,
+    or if `process_index` is not below `process_count`; RuntimeError if JAX has started already.
     """
     given = (coordinator, process_count, process_index)
     if None in given and any(value is not None for value in given):

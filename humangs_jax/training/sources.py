@@ -145,11 +145,12 @@ def training_people(
 ) -> SourceFactory:
     """Returns a function that makes a source of people to train on.
 
-    If `data` is given, these are the people of `people_on_disk`. If `on_the_fly` is above 0, these
-    are so many synthetic people, who are rendered for every step. With both, each kind makes half
-    of the examples.
-    One process makes the synthetic people once, into out/people.npz. Raises: ValueError if there is
-    nobody, or if synthetic people are asked for with another body than the shipped one.
+    data: folder of people on disk, see `people_on_disk`; or None. on_the_fly: number of synthetic
+    people, who are rendered for every step. One process makes these people once, into
+    out/people.npz. With both, each kind makes half of the examples.
+
+    Raises: ValueError if there is nobody, or if synthetic people are asked for with another body
+    than the shipped one. Also as `people_on_disk`.
     """
     parts = []
     if data is not None:

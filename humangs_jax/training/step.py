@@ -225,7 +225,7 @@ def train_step(
     mesh: Mesh | None = None,
 ) -> tuple[TrainState, Metrics]:
     """Returns the state after one more step, and metrics. It calls `update`, compiled. The given
-    state is donated, so it cannot be used afterwards.
+    state is donated, so it cannot be used afterwards. Raises: as `update`.
     """
     return compiled_update()(
         state, batch, body, networks, seed_numbers(config.seed), compiled_for(config), mesh
@@ -257,9 +257,9 @@ def update(
 ) -> tuple[TrainState, Metrics]:
     """Returns the state after one more step, and metrics.
 
-    Metrics are the loss and its terms, psnr, grad_norm and learning_rate. skipped and nonfinite
-    count the steps so far that were skipped or not finite. dropped_tokens and overflow count what
-    did not fit its buffers in this step.
+    Metrics are the loss and its terms, psnr, grad_norm and learning_rate. skipped counts the steps
+    so far that were skipped, nonfinite those whose loss or gradient was not finite. dropped_tokens
+    and overflow count the patches and the (splat, tile) pairs without room in this step.
 
     Arguments: batch: an `Example` with a leading axis of subjects. body: the body that carries the
     Gaussians. networks: networks of the losses that need one. seed: from `seed_numbers`. config:

@@ -414,7 +414,7 @@ def plain_position_map(
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
     """Returns the position map (h, w, 3) and the depth map (h, w) of one view. All lengths are in
-    normalised units.
+    normalised units. Raises: as `rasterize_mesh`.
     """
     return _map(posed_vertices, canonical_vertices, faces, camera, config)
 
@@ -427,7 +427,7 @@ def gouraud_position_map(
     config: RasterConfig = DEFAULT_CONFIG,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
     """Returns the position map (h, w, 3) of the released network, lit by a point light, and the
-    depth map (h, w) of one view. All lengths are in normalised units.
+    depth map (h, w) of one view. All lengths are in normalised units. Raises: as `rasterize_mesh`.
     """
     albedo = (canonical_vertices + 1) / 2
     colors = _light(albedo, posed_vertices, vertex_normals(posed_vertices, faces), camera.center)
