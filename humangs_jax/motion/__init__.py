@@ -2,7 +2,7 @@
 
 `load_motion` reads any format of the table `data.formats.MOTIONS`. A motion in memory
 (`body.motion.Motion`) has axis-angles in radians; lengths are in metres, and y is up. It has
-SMPL-X's 55 joints. Only motions of other bodies, in files of this package, have other joints.
+SMPL-X's 55 joints. Only files of this package can hold motions of other bodies, with other joints.
 `arrays` reads files of arrays by key. `clips` reads skeletons of other programs, and `skeleton`
 converts them to our joints. `face_files` reads faces. `rules` has the tables that all readers and
 the page share.
@@ -47,12 +47,12 @@ OTHERS = {
         " .bvh"
     ),
 }
-"""Hints about files that are no motions, by suffix."""
+"""What the error about a file that cannot be read adds, by the file's suffix."""
 
 
 class MotionError(FileError):
-    """An error about a motion file. Its message is one line with the file, the key, and what was
-    expected.
+    """An error about a motion file. Its message is one line with the file, the problem, and the key
+    if a key is wrong.
     """
 
 
@@ -62,7 +62,7 @@ class Reading(NamedTuple):
     fps: float | None = None
     """Frames per second, in place of the rate in the file. None: the file's rate."""
     person: int | None = None
-    """Number of the person, in a file of several."""
+    """Number of the person, in a file of several people. None: the only person."""
     clip: str | None = None
     """Name or number of the animation of a GLB file; None: the first."""
 
@@ -79,15 +79,19 @@ class Poses(NamedTuple):
     fps: float
     """Frames per second."""
     up: str = "y"
-    """Name of the axis of the world that is up."""
+    """Axis of the file's world that points up, such as "y" or "-z"."""
     fixed: bool = False
-    """Whether `up` is certain. The poses are then not examined, see `rules.up_axis`."""
+    """Whether `up` is certain. If so, the poses are not examined to find the axis, see
+    `rules.up_axis`.
+    """
     also: tuple[str, ...] = ()
     """Further axes that are up in some files of the format, see `rules.up_axis`."""
     frames: np.ndarray | None = None
-    """Numbers of the frames, (m,); gaps between them are filled. None: they are consecutive."""
+    """Numbers of the frames, (m,). `load_motion` fills the gaps between them. None: there are no
+    gaps.
+    """
     note: str = ""
-    """Lines for the user about the file."""
+    """Note for the user about the file, "" if there is none."""
     face: FaceTrack | None = None
     """The face track of the file, None without one."""
 
@@ -107,22 +111,26 @@ def load_motion(
     Args:
         path: None for the shipped walk; else a file or a folder of one of `data.formats.MOTIONS`.
         up: axis that points up in the file's world ("y", "-y", "z" and so on). The motion is
-            turned so that y points up. "auto": the axis that is usual in the format, unless people
-            stand along another axis (`rules.up_axis`). A warning then names that axis.
+            turned so that y points up. "auto": the axis that is usual in the format. If the motion
+            shows that people stand along another axis (`rules.up_axis`), this axis is taken, and a
+            warning names it.
         fps: frames per second, in place of the rate in the file.
-        rest_joints: joints of the body that will move, in T-pose, metres, such as
+        rest_joints: joints of the body that will move, in T-pose, (j, 3), metres, such as
             `avatar.rest_joints`. Skeletons of other programs are converted to this body. A motion
             with another number of joints raises an error. None: skeletons are converted to the
             shipped body, and the number of joints is not checked.
-        person: the number of the person, in a file of several people.
-        clip: the name or number of the animation, in a GLB file of several. None: the first.
+        person: the number of the person, in a file of several people: as in the file, or counted
+            from 0 if the file has no numbers. None: the only person.
+        clip: the name of the animation, or its number from 0, in a GLB file of several. None: the
+            first.
 
     Returns:
         Rotations, translations and frames per second, and expressions if the file has a face.
 
     Raises:
-        MotionError: of one line, which names the file and, if one is wrong, the key.
-        ValueError: for another `up`.
+        MotionError: if the file cannot be read, or if a value in it or an argument is wrong. One
+            line that names the file, and the key if a key is wrong.
+        ValueError: for an unknown `up`.
 
     Examples:
         >>> motion = hg.load_motion("dance.bvh", rest_joints=avatar.rest_joints)
@@ -144,11 +152,15 @@ def load_motion(
 
 
 def _load(path: Path, up: str, options: Reading, rest_joints: np.ndarray | Array | None) -> Motion:
-    """Reads and checks the motion of a file. Raises: MotionError, and what readers raise."""
+    """Reads and checks the motion of a file. Raises: MotionError; InvalidFileError; further errors
+    of the readers.
+    """
     read = _reader(path)
 
     def body():
-        """Returns the joints that will move; the shipped body is read only if it is needed."""
+        """Returns the joints of the body that will move, (j, 3). Without `rest_joints`, reads the
+        shipped body.
+        """
         if rest_joints is None:
             return skeleton.shipped_joints()
         return np.asarray(rest_joints, np.float64)
@@ -238,7 +250,8 @@ def _without_gaps(motion: Motion, frames: np.ndarray, path: Path) -> tuple[Motio
 def _reader(path: Path) -> MotionFormat:
     """Returns the format of a file, by its suffix or, for archives of arrays, by its content.
 
-    Raises: MotionError if there is no such file, or if its format is unknown.
+    Raises: MotionError if there is no such file, or if its format is unknown; OSError, FileError or
+    InvalidFileError if it cannot be read.
     """
     if not path.exists():
         raise MotionError(path, "", "no such file")

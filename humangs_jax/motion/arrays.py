@@ -54,8 +54,9 @@ _MISSING_RATE = (
 def read_arrays(path: Path, options: Reading) -> Poses | skeleton.Clip:
     """Reads one person's poses, or the person's skeleton if the file has points in space.
 
-    Raises: MotionError, which names the wrong key or lists the people to choose from; FileError or
-    InvalidFileError if the file cannot be read.
+    Raises: MotionError or InvalidFileError if a value is wrong; MotionError, which lists the
+    people, if it is not clear which person is meant; FileError, InvalidFileError or OSError if a
+    file cannot be read.
     """
     # the person that is asked for, and the format by its keys
     person = _chosen(path, read_people(path), options.person)
@@ -133,7 +134,8 @@ def _face(file: "_MotionFile", form: ArrayKeys, count: int) -> FaceTrack | None:
 
 
 def _chosen(path: Path, people: list[Person], number: int | None) -> Person:
-    """Returns the person with this number. If no number is given, returns the only person.
+    """Returns the person with this number. If no number is given, returns the only person. The
+    number is the person's name in the file. If no name is a number, it is the index of the person.
 
     Raises: MotionError, which lists the people, if nobody has this number, or if there is no number
     and more than one person.
@@ -224,7 +226,8 @@ def _part(
     place: name of the part in `PLACES`. values: the array under the key. flat: the same array with
     one row for each frame.
 
-    Raises: MotionError if the array does not fit the number of joints of the part.
+    Raises: MotionError if the array does not fit the number of joints of the part, or if its
+    matrices are no rotations.
     """
     most, (count, width) = PLACES[place][1], flat.shape
     of_smpl = place in ("limbs", "body")
@@ -254,7 +257,7 @@ def _all(
     SMPL's poses give the 22 joints of the body. Poses of SMPL-H also give the fingers. values,
     flat: as in `_part`.
 
-    Raises: MotionError if no known layout has that many numbers.
+    Raises: MotionError if no known layout has that many numbers, or if matrices are no rotations.
     """
     count, width = flat.shape
     # layouts of single programs: root, body, hands and jaw; without the root; with coefficients of
@@ -321,7 +324,8 @@ def _placed(
     If the file has cameras, translations and the root's rotations are converted from the axes of
     the camera to the world. The root's rotations in `rotations` are changed in place.
 
-    Raises: MotionError if the positions are missing or wrong.
+    Raises: MotionError if the positions or the cameras are wrong, or if positions are missing
+    without which the format cannot be read. FileError if the file of the cameras cannot be read.
     """
     # a file may have no positions
     count, key = len(rotations), file.first(form.moves)
@@ -369,12 +373,13 @@ def _placed(
 def _cameras(
     file: "_MotionFile", count: int
 ) -> tuple[Float[np.ndarray, "m 3 3"], Float[np.ndarray, "m 3"]] | None:
-    """Returns the rotations (m, 3, 3) and positions (m, 3) of the camera in the world. None if the
-    file has no cameras.
+    """Returns the rotations (m, 3, 3) and positions (m, 3) of the camera in the world. None if
+    there are no cameras, neither in the file nor in a camera.npy beside it.
 
     m is 1 if one camera stands for all frames, else the number of frames.
 
-    Raises: MotionError if the cameras do not fit the frames or are no rotations.
+    Raises: MotionError if the cameras do not fit the frames, or if their matrices are no rotations.
+    FileError if camera.npy cannot be read.
     """
     # one camera, or one of each frame
     if "cam2world" in file.values:
@@ -482,15 +487,17 @@ RIG = {
     40: ("right_elbow", 39),
     42: ("right_wrist", 40),
 }
-"""Joints of the rig that are used, by index in the rig: the name, and the index of the parent."""
+"""The joints of SAM 3D Body's rig that are read. For each index in the rig, the joint's name, and
+the index of its parent, -1 if there is none.
+"""
 RIG_JOINTS = 127
-"""Number of joints of the rig."""
+"""Number of joints of SAM 3D Body's rig."""
 
 
 def _clip_of_points(file: Any, fps: float) -> Clip:
     """Reads a moving skeleton from the points of a `_MotionFile`. fps: frames per second.
 
-    Raises: the file's error, which names the key that is wrong.
+    Raises: MotionError, which names the wrong key.
     """
     points = _of_frames(file, "pred_joint_coords", (RIG_JOINTS, 3))[:, list(RIG)]
     if "pred_cam_t" in file.values:
@@ -523,7 +530,7 @@ def _of_frames(
     The array of a single frame may lack the axis of frames. An axis of length 1 for the person is
     removed. count: number of frames. None: any.
 
-    Raises: the file's error, which names the key, if the shape is another.
+    Raises: MotionError, which names the key, if the array has another shape or is missing.
     """
     values = file.numbers(key, None)
     if values.size == np.prod(shape):

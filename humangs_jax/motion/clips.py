@@ -52,7 +52,8 @@ _MOTION = re.compile(r"(?<!\S)MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)")
 def read_bvh(path: Path, options: object = None) -> Clip:
     """Reads the moving skeleton of a BVH file.
 
-    Raises: OSError; InvalidFileError or FileError, which say what was expected.
+    Raises: FileNotFoundError; FileError if the file cannot be read as text; InvalidFileError if it
+    is no BVH file or is damaged.
     """
     text = read_text(path)
     if text.split(maxsplit=1)[:1] != ["HIERARCHY"]:
@@ -222,7 +223,8 @@ def read_animation(path: Path, options: Reading | None = None) -> Clip | Poses:
     """Returns the moving skeleton of a GLB file, with its face. If the animation moves a face and
     turns no node, returns poses of a standing person with this face.
 
-    Raises: OSError; InvalidFileError, and what damaged numbers raise.
+    Raises: OSError if the file cannot be read; InvalidFileError if it has no usable animation;
+    KeyError, ValueError and other errors if its content is damaged.
     """
     data = read_bytes(path, "mesh_bytes")
     content, binary = parse_glb(data, "text_bytes")
@@ -263,7 +265,8 @@ _SHOWN = 12
 
 
 def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[str, Any], str]:
-    """Returns an animation, and a note if it is the first of several and was not asked for.
+    """Returns an animation, and a note if it is the first of several and was not asked for, else
+    "".
 
     clip: the name of the animation (case does not matter), or its number from 0. None: the first.
 
@@ -287,7 +290,7 @@ def _chosen(animations: list[dict[str, Any]], clip: str | None) -> tuple[dict[st
 
 def _humanoid(content: dict[str, Any]) -> dict[int, str]:
     """Returns the names of humanoid bones, by the number of the node. Only VRM and VRMA files have
-    them, and the nodes may have other names. Empty for other files.
+    such names. The nodes may have other names there. The result is empty for other files.
     """
     extensions = content.get("extensions")
     if not isinstance(extensions, dict):
@@ -314,10 +317,11 @@ def _joints(
     """Returns the nodes that are joints, and the matrices of the joints when the skin was bound.
 
     The joints are those of the skin with most joints. If no skin has joints, all nodes are joints.
-    The matrices (4, 4) are by node. The dict is empty if the skin has no matrices, or if it lists a
-    joint twice.
+    The matrices (4, 4) are in a dict by node. The dict is empty if no skin has joints, if the skin
+    has no matrices, or if the skin lists a joint twice.
 
-    Raises: InvalidFileError for a joint that is no node, or for numbers that are not finite.
+    Raises: InvalidFileError for a joint that is no node, or for numbers that are not finite;
+    LinAlgError for a matrix without an inverse.
     """
     skins = [skin for skin in content.get("skins", []) if skin.get("joints")]
     if not skins:
@@ -337,7 +341,9 @@ def _joints(
 
 
 def _next_joint(parents: Sequence[int], joint: int, joints: Container[int]) -> int:
-    """Returns the nearest node above a joint that is a joint too; -1 if there is none."""
+    """Returns the nearest joint above a joint. Nodes that are no joints are skipped. -1 if there is
+    none.
+    """
     joint = parents[joint]
     while joint != -1 and joint not in joints:
         joint = parents[joint]

@@ -1,7 +1,7 @@
 """Reads expressions from tables of ARKit's shapes, scores of MediaPipe, and animations.
 
 Tables come from Live Link Face, and animations from GLB and VRMA files. Tables and scores have no
-body: the person stands with the arms down, and the head turns if the file has its rotations.
+body: the person stands with the arms down. The head turns if a table has its rotations.
 
 A table (.csv) has a line of names, then a line of numbers for each frame. Columns may be in any
 order; names are compared without case ("EyeBlinkLeft", "eyeBlinkLeft", "eyeBlink_L"). `HeadYaw`,
@@ -60,7 +60,8 @@ _DEEPEST = 5
 def read_table(path: Path, options: Reading) -> Poses:
     """Reads a face from a table.
 
-    Raises: MotionError or InvalidFileError, which name the column or the line.
+    Raises: FileNotFoundError; FileError if the file cannot be read as text; InvalidFileError if its
+    content is wrong. For a value that is no number, the error names the line and the column.
     """
     # the line of names tells which columns are shapes
     rows = csv.reader(io.StringIO(read_text(path)))
@@ -182,13 +183,13 @@ def has_scores(path: Path) -> bool:
     """Returns whether a JSON file has scores of a face. At least one of them has to be a number.
     `read_scores` raises an error if others are no numbers.
 
-    Raises: FileNotFoundError; FileError if it is not JSON.
+    Raises: FileNotFoundError; FileError if the file cannot be read or is not JSON.
     """
     return _frames_of(read_json(path)) is not None
 
 
 def read_scores(path: Path, options: Reading) -> Poses:
-    """Reads a face from scores. Raises: MotionError, which says what is wrong."""
+    """Reads a face from a JSON file of scores. Raises: MotionError."""
     with reading(path, "scores of a face", MotionError):
         content = read_json(path)
         frames = _frames_of(content)
@@ -290,7 +291,8 @@ def animated_face(
     The face is None if the animation has no expressions, or none that is known. times: times of the
     frames, (m,), seconds.
 
-    Raises: InvalidFileError if the animation's numbers are wrong.
+    Raises: InvalidFileError if the animation's numbers are wrong, or if there are too many
+    expressions.
     """
     tracks = _expression_tracks(content, binary, animation) or _weight_tracks(
         content, binary, animation
@@ -372,6 +374,8 @@ def _weight_tracks(content: dict[str, Any], binary: bytes, animation: Mapping[st
     """Reads the weights of a mesh's morph targets in a GLB file, by the targets' names.
 
     The mesh is the one with most names of ARKit's shapes.
+
+    Raises: InvalidFileError if too many meshes have weights, or if the numbers are wrong.
     """
     found: list[Weights] = []
     channels = [each for each in animation["channels"] if each["target"]["path"] == "weights"]
@@ -393,7 +397,9 @@ def _weight_tracks(content: dict[str, Any], binary: bytes, animation: Mapping[st
 
 
 def _target_names(mesh: Mapping[str, Any], count: int) -> list[str]:
-    """Returns the names of a mesh's morph targets, or their numbers if they have no names."""
+    """Returns the names of a mesh's morph targets. If the file does not have `count` names, returns
+    their numbers.
+    """
     places = [mesh, *mesh.get("primitives", [])]
     for place in places:
         names = (place.get("extras") or {}).get("targetNames")
@@ -406,7 +412,10 @@ def face_alone(
     content: dict[str, Any], binary: bytes, animation: Mapping[str, Any], note: str
 ) -> Poses | None:
     """Reads an animation that moves a face and turns no node. Returns None for any other animation,
-    and for tracks that `frame_times` cannot bring to one rate.
+    for tracks without increasing times, and for tracks that `frame_times` cannot bring to one rate.
+    note: text to which the note about the face is added.
+
+    Raises: InvalidFileError if the weights are wrong.
     """
     if any(channel["target"]["path"] == "rotation" for channel in animation["channels"]):
         return None

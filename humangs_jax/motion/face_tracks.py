@@ -64,10 +64,10 @@ _PLAIN = {name.lower(): name for name in ARKIT}
 
 @dataclasses.dataclass(frozen=True)
 class FaceTrack:
-    """Expressions of a file for each of its frames."""
+    """Expressions of a face in each of m frames."""
 
     names: tuple[str, ...]
-    """Names of the e expressions, as the file has them."""
+    """Names of the e expressions."""
     values: Float[np.ndarray, "m e"]
     """Coefficients of the expressions, a row for each frame, (m, e)."""
 

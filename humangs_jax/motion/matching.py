@@ -2,7 +2,7 @@
 
 In the tree, two limbs with similar bones that hang on one joint are the legs, and two other limbs
 further up the trunk are the arms. The chain that hangs between the arms ends in the head. A knee or
-elbow is where the two longest consecutive bones of a limb meet. Names or places tell left from
+elbow is where the two main bones of a limb meet, see `_bends`. Names or places tell left from
 right.
 """
 
@@ -185,7 +185,9 @@ def _limbs(
         reach[i] += max((reach[child] for child in children[i]), default=0.0)
 
     def pair_below(joint: int) -> _Pair | None:
-        """Returns `_bends` of the two longest limbs below a joint that have similar bones."""
+        """Returns `_bends` of two limbs below a joint: of all pairs with similar bones, the pair
+        with the longest bones. None if there is no such pair.
+        """
         paths = [_path(child, children, reach) for child in children[joint]]
         limbs = [limb for limb in (_bends(path, lengths) for path in paths) if limb]
 
@@ -224,8 +226,8 @@ def _bends(path: list[int], lengths: np.ndarray) -> list[int] | None:
     next joint if there is one.
 
     The main bones are consecutive. Among all pairs of consecutive bones they are the pair whose
-    shorter bone is longest. Returns None if the limb has fewer than two bones, or if the first main
-    bone has no length.
+    shorter bone is longest. Returns None if the limb has fewer than two bones, or if one of the
+    main bones has no length.
     """
     bones = lengths[path[1:]]
     if len(bones) < 2:

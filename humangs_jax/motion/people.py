@@ -40,8 +40,8 @@ _FRAMES = ("frame_ids", "frames", "frame", "frame_id")
 _FOLDERS = ("", "smpl", "smplx", "smplfull", "hps", "results")
 """Sub-folders that may hold the files of a motion; "" is the folder itself."""
 _OF_ONE = (".npy", ".smpl", ".pkl", ".pickle", ".pt", ".pth")
-"""In a folder, each file with one of these suffixes has the motion of one person. Each file with
-another suffix has one frame.
+"""In a folder, each file with one of these suffixes has whole motions, usually that of one person.
+Each file with another suffix has one frame.
 """
 _DEEPEST = 6
 """Largest number of levels of lists and maps above the values of a person."""
@@ -53,11 +53,13 @@ class Person(NamedTuple):
     """A person in a file."""
 
     name: str
-    """Name of the person as the file has it."""
+    """Name of the person. If each person has a file, it is the number in the file's name. Otherwise
+    it is the name in the file, an index, or "".
+    """
     values: Mapping[str, Any]
     """The values of the person, by the file's keys."""
     frames: np.ndarray | None = None
-    """Numbers of the frames in which the person was seen. None if the file has none."""
+    """Numbers of the frames in which the person was seen. None if the file does not state them."""
     pickled: tuple[str, ...] = ()
     """Keys whose values are not read because they are pickled."""
 
@@ -71,7 +73,9 @@ def format_of(values: Mapping[Any, Any]) -> ArrayKeys | None:
 def read_people(path: Path) -> list[Person]:
     """Reads the people of a file or a folder.
 
-    Raises: FileError; InvalidFileError if nothing in it has a known format.
+    Raises: InvalidFileError if nothing in it has a known format, if there are too many files or
+    people, or if a person lacks values in some frames. FileError or OSError if a file cannot be
+    read.
     """
     files = _files(path) if path.is_dir() else [path]
     alone = not path.is_dir() and path.suffix.lower() != ".json"
@@ -116,8 +120,8 @@ def _content(file: Path) -> tuple[Any, tuple[str, ...]]:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Returns the files of a motion in a folder, in the order of the numbers in their names. They
-    have one suffix. camera.npy is left out.
+    """Returns the files of a motion in a folder, in the order of the numbers in their names. All of
+    them have the same suffix. camera.npy is left out.
 
     Raises: InvalidFileError if there are none.
     """
@@ -356,7 +360,8 @@ def _stacked(frames: Sequence[tuple[str, list[Person]]]) -> list[Person]:
     """Returns the people of a motion, each with the values of all frames that show the person.
 
     frames: for each frame, its name and its people.
-    Raises: InvalidFileError if a person lacks a value that the person has in the first frame.
+    Raises: InvalidFileError if a person lacks a value in a frame, but has it in the first frame
+    that shows the person.
     """
     people: dict[str, list[tuple[int, Mapping[str, Any]]]] = {}
     for i, (_, found) in enumerate(frames):

@@ -39,7 +39,9 @@ COLUMNS = {
 """For each known number of columns of a pose, the body model that has it."""
 MILLIMETRES = 1000.0
 ORTHONORMAL = 0.05
-"""A matrix in a file counts as a rotation if R R^T differs by less than this from the identity."""
+"""A matrix R in a file counts as a rotation if it does not mirror, and if R R^T differs by less
+than this from the identity.
+"""
 FAR = 25.0
 """If the median distance of a person from the camera is larger than this, metres, the program that
 wrote the file has assumed a focal length (4D-Humans and others).
@@ -248,7 +250,9 @@ LARGEST_BEND = np.radians(60)
 larger, the pelvis's joint does not turn as a pelvis does.
 """
 RATE_ROUNDING = 1e-4
-"""Relative error of a frame rate. Some BVH files give the time of a frame in only four digits."""
+"""Largest relative error of a frame rate in a file. Some BVH files give the time of a frame in only
+four digits.
+"""
 
 SHORT_STEPS = 0.1
 """If at least this share of the steps between keys of a GLB file is shorter than a frame at the
@@ -294,9 +298,10 @@ def frame_times(keys: Sequence[Float[np.ndarray, " _"]]) -> tuple[np.ndarray, fl
     steps between keys is shorter than a frame at that rate, the rate becomes that of the short
     steps, but at most `FRAMES_A_KEY` times as high.
 
-    keys: increasing times of the keys of each track, seconds. Returns None if the frames at the
-    mean rate are more than four times as many as the keys, because tracks have very different
-    lengths.
+    If no track has two keys, or if all keys have the same time, the result is the earliest time and
+    `DEFAULT_FPS`. The result is None if there would be more than four frames, at the mean rate, for
+    each key of the track with most keys. The tracks then have very different lengths. keys:
+    increasing times of the keys of each track, seconds.
     """
     first, last = min(each[0] for each in keys), max(each[-1] for each in keys)
     dense = max(keys, key=len)
@@ -377,9 +382,10 @@ def _floors(
     """Returns the shares of frames in which the lowest joint is on a floor, for the usual axis and
     for another axis.
 
-    The lowest joint has to rest at its usual height. If it rarely rests for both axes, as on a
-    treadmill, it only has to be at this height. A share of the other axis that is below `TREADMILL`
-    then becomes 0. points: as in `up_axis`. axes: the usual and the other axis.
+    The lowest joint has to rest at its usual height. If it rests in less than the share
+    `ON_THE_FLOOR` of the frames for both axes, as on a treadmill, it only has to be at this height.
+    A share of the other axis that is below `TREADMILL` then becomes 0. points: as in `up_axis`.
+    axes: the usual and the other axis.
     """
     moves = np.linalg.norm(points[1::2] - points[::2], axis=-1) * fps
     limit = max(STILL[0], STILL[1] * float(moves.mean()))

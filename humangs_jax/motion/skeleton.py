@@ -63,7 +63,7 @@ class Clip:
     up: str | None = None
     """The axis that is up in the format. None: it is found from the rest pose and the motion."""
     note: str = ""
-    """Lines for the user about the file."""
+    """Note for the user about the file, "" if there is none."""
     face: FaceTrack | None = None
     """The face track of the file, None without one."""
 
@@ -104,8 +104,8 @@ def retargeted(
     Returns: rotations (m, j, 3), axis-angle, radians; translations (m, 3), metres; and a note about
     the axis that is up, or "".
 
-    Raises: InvalidFileError if joints of the clip that are needed cannot be found, or if the body
-    does not have SMPL-X's joints.
+    Raises: InvalidFileError if joints that are needed are not found in the clip, or if the body
+    does not have SMPL-X's 55 joints.
     """
     if joints.shape != (len(JOINT_NAMES), 3):
         raise InvalidFileError(
@@ -146,7 +146,7 @@ _Source = Mapping[str, int]
 
 def _up_of(clip: Clip, source: _Source, scale: float, standing: bool) -> tuple[str, str]:
     """Returns the axis that points up, and a note about it. A BVH file does not name this axis, but
-    a rest pose in which people stand shows it.
+    a rest pose in which people stand shows it. In other rest poses, y is taken as the usual axis.
 
     scale: metres of our body per unit of the clip. standing: whether people stand in the rest pose.
     """
@@ -188,7 +188,7 @@ def _body_turns(
     places: Float[np.ndarray, "m s 3"],
     by_motion: bool,
 ) -> list[Float[np.ndarray, "m 3 3"]]:
-    """Returns the rotations G_j (m, 3, 3) of our joints in the world, see the head of this module.
+    """Returns the rotations G_j (m, 3, 3) of our joints in the world, see the module's docstring.
 
     turns, places: rotations and places of the clip's joints, with y up. by_motion: whether twists
     about bones are found from the motion, because nobody can stand in the rest pose.
@@ -254,8 +254,9 @@ def _pelvis_turns(
         """Returns the angles, (m,), radians, by which candidate rotations have to be turned about
         the line of the hips to follow the trunk.
 
-        The candidate turns the direction from the pelvis to the joint `top` out of the rest pose.
-        The angle leads from there to the direction in the frame.
+        Turned by a candidate rotation, the rest pose has a direction from the pelvis to the joint
+        `top`. The angle is that between this direction and the direction in the frame. Both are
+        first projected onto the plane perpendicular to the line of the hips.
         """
         axis = unit(line)
 

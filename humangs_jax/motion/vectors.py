@@ -104,8 +104,8 @@ def frames_first(values: Mapping[str, Any], rotations: str, moves: str) -> dict[
 
 
 def _matrices_of(six: Float[np.ndarray, "*b 6"]) -> Float[np.ndarray, "*b 3 3"]:
-    """Returns rotation matrices from their first two rows. A matrix is not finite if its rows are 0
-    or parallel.
+    """Returns rotation matrices from their first two rows. A matrix is not finite if one of these
+    rows is 0, or if they are parallel.
     """
     a, b = np.asarray(six[..., :3], np.float64), np.asarray(six[..., 3:], np.float64)
     with np.errstate(all="ignore"):

@@ -52,9 +52,9 @@ OFF_CENTER = 0.25
 away from its middle. The intrinsics may then belong to an image of another size.
 """
 COINCIDENT = 1e-3
-"""Cameras count as standing in one place if the point where their axes meet is very near to them:
-if its median depth is less than this share of the largest distance of a camera from the world's
-origin.
+"""Cameras count as standing in one place if the point where their axes meet is very near to them.
+The point's median depth is then less than this share of the largest distance of a camera from the
+world's origin.
 """
 
 

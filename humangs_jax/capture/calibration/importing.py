@@ -153,9 +153,8 @@ def import_cameras(
             content.
         images: folder with the photos, or with a video of each camera (CAMERA.mp4).
         out: the capture folder.
-        masks: folder with a mask of each photo, or with a video of masks of each camera. They have
-            the names of the photos, or of the videos. None: the masks that the calibration names,
-            if any.
+        masks: folder with a mask of each photo, or with a video of masks of each camera. Masks are
+            named like their photos or videos. None: the masks that the calibration names, if any.
         others: folder of masks of other people and of things in front of the person. The masks have
             the photos' names. A photo in which nothing covers the person needs no mask.
         scale: metres per unit of the source. None: the unit of the format, or metres. If the
@@ -172,8 +171,9 @@ def import_cameras(
 
     Returns: what was imported, and how.
 
-    Raises: ArgumentError for a wrong option. CaptureError for wrong files, one line with file,
-    field, and what was expected. OSError if writing fails.
+    Raises: ArgumentError for a wrong option. CaptureError for wrong files, and if `out` exists and
+    must not be replaced: one line with the file, the field if one is wrong, and the problem.
+    OSError if writing fails.
     """
     source, images, out = Path(source), Path(images), Path(out)
     masks = None if masks is None else Path(masks)
@@ -241,6 +241,9 @@ def import_calibration(
     """Writes a capture folder of photos and a calibration that is in memory. images: folder with
     the photos. The other arguments and the result are as in `import_cameras`. A capture at `out` is
     replaced.
+
+    Raises: CaptureError for wrong files. ValueError if something other than a capture is at `out`,
+    see `replace_folder`. OSError if writing fails.
     """
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
     about_unit = None

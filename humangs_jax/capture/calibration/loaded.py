@@ -87,7 +87,7 @@ def load_cameras(
         calibration found.
 
     Raises:
-        CaptureError: One line that names the file, the field and what was expected.
+        CaptureError: One line that names the file, the field if one is wrong, and the problem.
 
     Examples:
         >>> cameras = hg.load_cameras("garden/sparse/0")

@@ -1,9 +1,10 @@
 """Finds the frames of several videos that show one moment. They are found by time, because rates
 differ and phones drop frames.
 
-All videos have to begin at the same moment, except for a delay of 0.1 to 3 seconds that their times
-show. The video with the lowest frame rate determines the moments. Each other camera gives the frame
-that is nearest in time, or no frame if it has a gap there.
+All videos have to begin at the same moment. Only if the times in a video show that it begins 0.1 to
+3 seconds later, this delay is taken into account. The video with the lowest frame rate determines
+the moments. Each other camera gives the frame that is nearest in time, or no frame if it has a gap
+there.
 """
 
 import itertools
@@ -47,14 +48,14 @@ class Moments(NamedTuple):
     notes: tuple[str, ...]
     """Notes on how frames were paired, one line each."""
     warnings: tuple[str, ...]
-    """Frames that cameras lack, one line each."""
+    """Lines about frames that cameras lack."""
 
 
 def find_moments(times: Mapping[str, Float[np.ndarray, " _n"]]) -> Moments:
     """Returns the moments that several cameras show, and the frame of each camera at each moment.
 
-    Arguments: times: for each camera the times of its n frames, (n,), seconds. NaN where a time is
-    not known.
+    Arguments: times: for each camera the times of its n frames, (n,), seconds, at least one. NaN
+    where a time is not known.
     """
     steps = {camera: _step(each) for camera, each in times.items()}
     known = [step for step in steps.values() if step is not None]
@@ -125,9 +126,9 @@ def _all_moments(
 def nearest(times: Float[np.ndarray, " n"], moments: Float[np.ndarray, " m"]) -> list[int | None]:
     """Returns for each moment the index of the camera's nearest frame.
 
-    It is None if this frame is farther away in time than `NEAR` allows, or if it is nearer to
-    another moment. times: times of the camera's frames, (n,), seconds. moments: times of the
-    moments, (m,), seconds.
+    The index is None if this frame is farther away in time than `NEAR` allows, or if the frame is
+    nearer to another moment. times: times of the camera's frames, (n,), seconds. moments: times of
+    the moments, (m,), seconds.
     """
     step = float(np.median(np.diff(times))) if len(times) > 1 else _USUAL_STEP
     found = np.searchsorted((times[1:] + times[:-1]) / 2, moments)

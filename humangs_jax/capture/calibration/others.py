@@ -1,6 +1,6 @@
-"""Finds the unknown pixels of photos (docs/capture_format.md). There are two kinds. Some pixels
-show other people, or things in front of the person. The import adds the others, where the camera
-has seen nothing.
+"""Finds the unknown pixels of photos (docs/capture_format.md). There are two kinds. Pixels of the
+first kind show other people, or things in front of the person. Pixels of the second kind were added
+to the photo by the import, and no camera has seen them.
 """
 
 from collections.abc import Sequence

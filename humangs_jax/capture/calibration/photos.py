@@ -1,7 +1,7 @@
 """Finds the camera, the frame and the mask of each photo by file names, and finds by EXIF
 orientation which way up the photo is.
 
-Phones store a portrait photo on its side, with an EXIF flag that says so. About half of all other
+Phones store a portrait photo on its side, with an EXIF flag that says so. About half of all
 programs obey the flag. An import turns the pixels upright and writes photos without a flag.
 
 If the camera was calibrated for the pixels as stored (COLMAP), the import turns the camera too. If
@@ -303,6 +303,8 @@ def _frames_of(calibration: Calibration, images: Path) -> list[dict[str, Path]]:
 
     There are three layouts: CAMERA/FRAME.jpg, FRAME/CAMERA.jpg and CAMERA.jpg. All cameras use the
     first of them in which any camera has photos.
+
+    Raises: CaptureError if the name of a camera is a path that leads out of the folder.
     """
     names = [camera.name for camera in calibration.cameras]
     for name in names:  # of a file: "../.." would be any folder
@@ -353,8 +355,8 @@ def _of_cameras(calibration: Calibration, images: Path) -> list[tuple[int, int, 
 # --------------------------------------------------------------------------------------------------
 
 MIRRORED = {2: 1, 4: 3, 5: 6, 7: 8}
-"""For each EXIF flag that mirrors, the flag that only turns. The first flag asks for the turn of
-the second, followed by mirroring left to right.
+"""For each EXIF flag that mirrors, the flag that asks for the same turn without mirroring.
+Mirroring is left to right, after the turn.
 """
 MIRROR = 2
 """The EXIF flag that mirrors left to right and does not turn."""
@@ -472,7 +474,8 @@ def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h
     """Reads the mask of a photo, turned as the photo is shown, (h, w), 0 to 1. masks: folder of
     masks. images: folder of photos. image: the photo.
 
-    Raises: CaptureError if there is no mask, or if it has another size than the photo.
+    Raises: CaptureError if there is no mask, if it has another size than the photo, or if a file
+    cannot be read.
     """
     return mask_as_shown(_masks_of(masks, images)(image), image)
 
@@ -480,7 +483,7 @@ def upright_mask(masks: Path, images: Path, image: Path) -> Float[np.ndarray, "h
 def mask_as_shown(mask: Path, image: Path) -> Float[np.ndarray, "h w"]:
     """Reads a mask, turned as its photo is shown, (h, w), 0 to 1.
 
-    Raises: CaptureError if the mask has another size than the photo.
+    Raises: CaptureError if the mask has another size than the photo, or if a file cannot be read.
     """
     flag, stored = read_checked(orientation, image), photo_size(image)
     shown = stored if flag < 5 else stored[::-1]
@@ -575,7 +578,8 @@ _EMPTY = "the mask is empty, the photo will be left out"
 
 def check_masks(photos: Sequence[Photo]) -> tuple[str, ...]:
     """Checks masks, which are files or alpha channels. Returns a warning for each kind of fault,
-    with the names of the files.
+    with the names of the files. If there are neither masks nor transparent pixels, there is no
+    warning.
 
     Raises: CaptureError if a mask is not valid, if no mask shows anybody, or if there are no mask
     files and only some photos have an alpha channel.
@@ -627,7 +631,10 @@ def _mask_problem(person: Bool[np.ndarray, "h w"]) -> str | None:
 
 
 def has_alpha(photo: Path) -> bool:
-    """Returns whether a photo has an alpha channel, opaque or not."""
+    """Returns whether a photo has an alpha channel, opaque or not.
+
+    Raises: FileNotFoundError; FileError if the file cannot be read.
+    """
     with open_image(photo) as (image, _):
         return "A" in image.getbands() or "transparency" in image.info
 

@@ -69,6 +69,8 @@ def _in_map(file: Path, name: str) -> Where:
 def recognizes_opencv(source: CalibrationFile) -> bool:
     """Returns whether a file has keys that begin with K_, or a map with K, R or T. The file has to
     look like JSON or YAML.
+
+    Raises: CaptureError if such a file cannot be parsed.
     """
     if not (
         source.text.lstrip().startswith(("{", "%YAML", "---"))
@@ -85,7 +87,8 @@ def recognizes_opencv(source: CalibrationFile) -> bool:
 def read_opencv(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """Reads the cameras of one file.
 
-    Raises: CaptureError with the name of the key.
+    Raises: CaptureError if there is no camera, or if a value is missing or wrong. The error names
+    the key of a wrong value.
     """
     values = _values(source)
     nested = {name: value for name, value in values.items() if isinstance(value, Mapping)}
@@ -104,7 +107,8 @@ def _values(source: CalibrationFile) -> dict[str, Any]:
 def read_easymocap(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """Reads the cameras of the folder's two files, intri.yml and extri.yml.
 
-    Raises: CaptureError with the name of file and key.
+    Raises: CaptureError if a file cannot be read, if there is no camera, or if a value is missing
+    or wrong. The error names the file, and the key of a wrong value.
     """
     inner, outer = source.path / "intri.yml", source.path / "extri.yml"
 
@@ -127,6 +131,8 @@ def _flat_cameras(
     The list `names` in the map gives the names. Without this list, each key K_NAME gives a name.
 
     file_of: returns the file that has a key, for errors.
+
+    Raises: CaptureError if there is no camera, or if a value is missing or wrong.
     """
     names = list(values.get("names") or (key[2:] for key in values if key.startswith("K_")))
     if not names:
@@ -237,7 +243,7 @@ _MATRIX = "opencv-matrix"
 def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
     """Parses a FileStorage text and returns its values by key. Matrices are arrays (rows, columns).
 
-    Raises: CaptureError, with the number of the line for a fault of the syntax.
+    Raises: CaptureError if the text cannot be parsed. It names the line of a fault of the syntax.
     """
     with reading(file, "YAML file", CaptureError):
         if text.lstrip().startswith("{"):
@@ -351,7 +357,7 @@ def recognizes_panoptic(source: CalibrationFile) -> bool:
 def read_panoptic(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """Reads the cameras in the file's list "cameras".
 
-    Raises: CaptureError with the name of the key.
+    Raises: CaptureError if a value is missing or wrong. The error names its key.
     """
     # Panoptic's keys -> OpenCV's
     keys = {
@@ -393,7 +399,7 @@ def read_multical(source: CalibrationFile, format: CameraFormat) -> Calibration:
     A pose that is not relative to another camera is relative to the world. If poses are relative to
     a camera that has no pose, the axes of this camera are the world's.
 
-    Raises: CaptureError with the name of the key.
+    Raises: CaptureError if a value or a pose is missing or wrong. The error names its key.
     """
     file, lenses = source.path, source.json["cameras"]
     poses: dict[str, Float[np.ndarray, "4 4"]] = {}
@@ -449,14 +455,20 @@ def _related(key: str, names: Mapping[str, Any]) -> tuple[str, str | None]:
 
 
 def recognizes_toml(source: CalibrationFile) -> bool:
-    """Returns whether a file has the suffix .toml and tables of cameras."""
+    """Returns whether a file has the suffix .toml and tables of cameras.
+
+    Raises: TOMLDecodeError if a file with this suffix is no TOML. InvalidFileError if it is too
+    long or nested too deeply. CaptureError if a camera in `cameras` is no table.
+    """
     return source.path.suffix.lower() == ".toml" and bool(_tables(source))
 
 
 def read_toml(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """Reads the cameras of a file. Cameras with `ignore = true` are left out.
 
-    Raises: CaptureError with the name of the key.
+    Raises: CaptureError if all cameras are left out, or if a value is missing or wrong. The error
+    names the key of a wrong value. InvalidFileError if the file is too long or nested too deeply.
+    TOMLDecodeError if it is no TOML.
     """
     cameras, file = [], source.path
     for key, table in _tables(source).items():
@@ -513,10 +525,10 @@ def recognizes_qualisys(source: CalibrationFile) -> bool:
 def read_qualisys(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """Reads the cameras of the file that have a transform.
 
-    Raises: CaptureError if a number of a camera is missing or wrong, or if no camera has a
-    transform. It names the camera by its place among those with a transform, from 0, and the
-    attribute. InvalidFileError if the XML declares entities or is too long. ParseError if the file
-    is no XML.
+    Raises: CaptureError if no camera has a transform, or if a number of a camera is missing or
+    wrong. For a number, the error names the attribute and the index of the camera, counted from 0
+    among the cameras with a transform. InvalidFileError if the XML declares entities or is too
+    long. ParseError if the file is no XML.
     """
     check_limit("slow_text_bytes", len(source.text), "characters of XML")
     if re.search(r"<!(DOCTYPE|ENTITY)", source.text):

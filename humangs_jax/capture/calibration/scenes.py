@@ -81,7 +81,8 @@ def read_colmap(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """Reads a COLMAP model. There is one camera for each registered image, in the order of the
     images file.
 
-    Raises: CaptureError with the name of the file, and with the line if the model is text.
+    Raises: CaptureError, which names the file, and the line or the entry if one is wrong.
+    ValueError if a line of text lacks words, or if the id of a point is no whole number.
     """
     # a model is text or binary; both are read into the same values
     text = any((source.path / name).is_file() for name in ("images.txt", "cameras.txt"))
@@ -304,7 +305,7 @@ def recognizes_transforms(source: CalibrationFile) -> bool:
 def read_transforms(source: CalibrationFile, format: CameraFormat) -> Calibration:
     """Reads the cameras of `frames`, in their order.
 
-    Raises: CaptureError with the name of the key.
+    Raises: CaptureError if a value is missing or wrong. The error names its key.
     """
     values, file = source.json, source.path
     (frames,) = members(values, file, frames=list)
@@ -376,7 +377,8 @@ def _frame_intrinsics(
     point. If the file has one focal length, it holds for both axes. If the file has no principal
     point, it is the middle of the image.
 
-    Raises: CaptureError if the file has no matrix, no focal length and no angle of view.
+    Raises: CaptureError if a value is wrong, or if the file has no matrix, no focal length and no
+    angle of view.
     """
     for key in _MATRICES:
         if key in values and "fl_x" not in values:
@@ -451,7 +453,7 @@ def read_splatting(source: CalibrationFile, format: CameraFormat) -> Calibration
     """Reads the cameras of the list. `rotation` and `position` place the camera in the world, with
     OpenCV's axes. The principal point is the middle of the image.
 
-    Raises: CaptureError with the name of the key.
+    Raises: CaptureError if a value is missing or wrong. The error names its key.
     """
     cameras, file = [], source.path
     for i, entry in enumerate(source.json):

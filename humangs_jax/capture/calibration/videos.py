@@ -1,8 +1,9 @@
 """Takes photos out of videos with ffmpeg (imageio-ffmpeg). `photos_of_videos` writes a folder of
 frames for each calibrated camera:
 
-    CAMERA.mp4 (.m4v, .mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0,
-                                                 every, 2 every ...
+    CAMERA.mp4 (.m4v, .mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ...
+
+The step between these frames is `every`: with a step of 3 they are frames 0, 3, 6, and so on.
 
 The videos of several cameras have to begin at the same moment. The frames of several videos that
 show one moment are found by time (`moments`), because rates differ and videos lack frames. They get
@@ -45,7 +46,7 @@ def find_videos(folder: Path) -> dict[str, Path]:
     """Returns the videos of a folder by the name of their camera, which is the file name without
     suffix. Subfolders are not searched.
 
-    Raises: CaptureError for two videos of one camera.
+    Raises: CaptureError for two videos of one camera. OSError if the folder cannot be read.
     """
     found: dict[str, Path] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
@@ -74,8 +75,8 @@ class _Shown(NamedTuple):
     rate: float | None = None
     """Mean number of frames per second, or None if unknown."""
     from_zero: bool = False
-    """Whether ffmpeg has to print times as they are in the file, with -copyts. It is False for MPEG
-    transport streams.
+    """Whether ffmpeg is called with -copyts, so that it prints times as they are in the file. It is
+    False for MPEG transport streams.
     """
 
 
@@ -112,8 +113,8 @@ def photos_of_videos(
         most: largest number of photos of a camera. None: all.
     Raises: CaptureError if `every` or `most` is given and there is no video, if `masks` is given
     and a camera has only a video of photos or only one of masks, if two videos have the same
-    camera, or if a video cannot be read. See `named_after` for errors that are raised inside the
-    block.
+    camera, or if a video cannot be read. OSError if the temporary folder cannot be made. See
+    `named_after` for errors that are raised inside the block.
     """
     # videos of photos, and those of masks, where there are any
     asked = every != 1 or most is not None
@@ -355,7 +356,7 @@ thousands.
 """
 PRIMARIES = {"bt2020": 9, "smpte432": 12}
 """Code points of H.273 for ffmpeg's names of color primaries. All other primaries are taken for
-sRGB's. Unknown primaries of a video of high dynamic range are taken for bt2020.
+sRGB's, with one exception: unknown primaries of a video of high dynamic range are taken for bt2020.
 """
 _TRANSFERS = {"smpte2084": 16, "arib-std-b67": 18}
 """Code points of H.273 for ffmpeg's names of transfer curves of high dynamic range. All other
@@ -419,9 +420,10 @@ def _shown_as_mask(path: Path, photos: Path) -> _Shown:
     """Returns how the frames of a video of masks have to be converted. Their values are not
     converted as colors.
 
-    Pixels are made square by the shape that the video of masks states. There is one exception: it
-    states square pixels or no shape, the video of photos states another shape, and the stored
-    frames of both have the same size. Then masks are scaled to the size that the photos get.
+    Pixels are made square by the shape that the video of masks states. There is one exception: the
+    video of masks states square pixels or no shape, the video of photos states another shape, and
+    the stored frames of both have the same size. Masks are then scaled to the size that the photos
+    get.
     """
     own, theirs = _shown(path), _shown(photos)
     as_stored = _Shown()

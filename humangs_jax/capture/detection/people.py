@@ -122,8 +122,8 @@ class Landmarks(NamedTuple):
     """Probability that a landmark is seen and not hidden, (33,)."""
     world: Float[np.ndarray, "33 3"]
     """Landmarks relative to the middle of the hips, (33, 3), metres. Axes are the camera's (x
-    right, y down, z away). They are as if the camera looked straight at the person, and the person
-    had average size.
+    right, y down, z away). The landmarks are as if the camera looked straight at the person, and
+    the person had average size.
     """
     presence: float
     """Probability that the crop shows a person."""
@@ -274,7 +274,7 @@ def refined(
 ) -> Float[np.ndarray, "n 2"]:
     """Returns points, (n, 2), on the scale on which the heatmap reaches from 0 to 1. Each point is
     moved to the centroid of its heatmap in a window around the point. A point stays if its heatmap
-    has no peak in this window, or if it lies outside of the heatmap.
+    has no peak in this window, or if the point lies outside of the heatmap.
     """
     size, half, moved = len(heatmaps), WINDOW // 2, points.copy()
     for i, (column, row) in enumerate(np.trunc(points * size).astype(int)):
@@ -428,8 +428,8 @@ class _SearchConfig:
     is found in the others. Most windows are of this kind.
     """
     large: float = 0.4
-    """The smaller windows are used only if nobody's crop has at least this share of the photo's
-    longer side.
+    """The smaller windows are used only if the sides of all crops are shorter than this share of
+    the photo's longer side.
 
     Windows of half the longer side find people who are at least a sixth as large as the longer
     side, with crops of a fifth of it. So a person who is found only in smaller windows has at most
@@ -510,7 +510,8 @@ def find_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[L
     [0, 1].
 
     People who were found are painted over, and the detector looks at the photo again. This ends
-    when both `MARGINS` have shown nobody more, or after eight paintings.
+    when both `MARGINS` have shown nobody more, or after eight paintings. If nobody is found at
+    first, nothing is painted over.
     """
     longest = max(photo.shape[:2])
     detections = window_detections(networks, photo, SEARCH.shares)
@@ -703,7 +704,7 @@ def _on_mask(
 ) -> float:
     """Returns the share of the landmarks inside the photo that lie on the person's mask. Landmarks
     where the photo is painted over do not count. The result is 0 if no landmark is left, or if more
-    than half of the landmarks are painted over.
+    than half of those inside the photo are painted over.
     """
     points = person.pixels[_inside(person.pixels, width, height)]
     if covered is not None:

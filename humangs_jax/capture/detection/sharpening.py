@@ -59,8 +59,9 @@ def sharpened(
 
 
 def filter_margin(pixel: float) -> int:
-    """Returns the width of a margin, pixels of the photo. `sharpened` reads the photo where the
-    mask is above 0, and in this margin around it. pixel: see `sharpened`.
+    """Returns the width of a margin, pixels of the photo. `sharpened` reads the photo in the
+    bounding box of the pixels where the mask is above 0, and in this margin around the box. pixel:
+    see `sharpened`.
     """
     return int(np.ceil(2 * _RADIUS * pixel))
 

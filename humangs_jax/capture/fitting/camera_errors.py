@@ -74,8 +74,9 @@ class _Decision:
     another error.
     """
     alike: float = 0.9
-    """Another camera is also named as a possible cause if it explains nearly as much: turned in
-    place of the reported camera, it has to reach more than this share of the decrease of the cost.
+    """Another camera is also named as a possible cause if turning it, and not the reported camera,
+    explains nearly as much. The cost then decreases by more than this share of the decrease that
+    the reported rotation brings.
     """
     most_cameras: int = 64
     """Largest number of cameras. If there are more, no errors are looked for."""
@@ -103,7 +104,7 @@ class CameraError:
         return float(np.degrees(np.linalg.norm(self.rotation)))
 
     def __str__(self) -> str:
-        """Returns one line that names the camera and the angle."""
+        """Returns one line with the names of the possible cameras and the angle."""
         return f"camera {' or '.join(self.names)} is off by {self.degrees:.1f} degrees"
 
 
@@ -113,6 +114,7 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
 
     The result is empty for fewer than three or more than `_Decision.most_cameras` cameras, or if
     too few landmarks are seen. It is also empty if a rotation exceeds `_Decision.most_degrees`.
+    Cameras whose rotation is at most `_Decision.least_degrees` are left out.
     """
     camera_of = np.asarray(camera_origin(photos.cameras, photos.frames).camera)
     if not 3 <= camera_of.max() + 1 <= _DECISION.most_cameras:

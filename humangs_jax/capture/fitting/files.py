@@ -48,7 +48,9 @@ KEYS = ("set", "names", "points", "confidences", *_FOUND, "places", "certainty")
 
 
 class UnknownViewError(ValueError):
-    """The capture has views that its fit.npz does not have, because photos were added later."""
+    """The capture has views that its fit.npz does not have, for example because photos were added
+    later.
+    """
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -195,6 +197,9 @@ def write_fitted(
 
     Arguments: record: record of a fit to keypoints. If it is None, the target has no fit.npz
     afterwards, because an old fit.npz belongs to other cameras.
+    Raises: CaptureError if the capture.json of `source` cannot be read or is invalid, or if a photo
+    would be copied to a place outside of `target`. ValueError if another folder cannot be replaced,
+    see `check_replaceable`. OSError if writing fails.
     """
     source, target = capture_folder(source), Path(target)
     description = read_description(source / "capture.json")

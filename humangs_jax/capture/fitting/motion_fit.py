@@ -162,8 +162,8 @@ class _Window:
     height: Float[Array, "2"]
     """Height of the person, metres, and 1 if it is known, (2,). Both are 0 if it is not known."""
     tall: Float[Array, " s1"]
-    """Height of the mean body, and after it how much each shape coefficient of 1 adds to the
-    height, (1 + s,), metres.
+    """Height of the mean body, and then for each shape coefficient the height that a value of 1
+    adds, (1 + s,), metres.
     """
     rate: Float[Array, ""]
     """Frames per second."""
@@ -365,8 +365,8 @@ def _place(
 
 
 def _tallness(body: BodyModel) -> Float[np.ndarray, " s1"]:
-    """Returns the height of the mean body, and after it how much each shape coefficient of 1 adds
-    to the height, (1 + s,), metres.
+    """Returns the height of the mean body, and then for each shape coefficient the height that a
+    value of 1 adds, (1 + s,), metres.
     """
     template = np.asarray(body.template)
     top, bottom = template[:, 1].argmax(), template[:, 1].argmin()

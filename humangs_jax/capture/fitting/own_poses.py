@@ -110,7 +110,7 @@ def fit_own_poses(
     stay, and the shape hardly changes. If the result is not clearly better, each photo has the
     shared pose.
 
-    Arguments: see `find_movement`.
+    Arguments: see `find_movement`. Raises: as `refine_capture`.
     """
     return refine_capture(
         with_own_poses(capture), keypoints=keypoints, config=CONFIG, memory=_memory(seconds)

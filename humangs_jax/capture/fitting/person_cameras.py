@@ -104,11 +104,11 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
 
     Arguments: height: height of the person without shoes, metres. None: the person has the size of
     the detector's 3D landmarks.
-    Raises: ValueError with the name of a photo if no photo shows enough of the person and the named
-    photo shows fewer than `FEWEST` landmarks. Also if the person is too small in a photo that is
-    used, if its focal length or 3D landmarks are unusable, or if no camera is found. ValueError if
-    there are no photos, if arrays have different lengths, or if the height is not between 0.3 and 3
-    metres.
+    Raises: ValueError if there are no photos, if arrays have different lengths, or if the height is
+    not between 0.3 and 3 metres. ValueError with the name of a photo if the person is too small in
+    it, or if its focal length or 3D landmarks are unusable. Also if it shows fewer than `FEWEST`
+    landmarks, and no other photo shows enough of the person. ValueError with the names of the
+    photos if no cameras are found.
     """
     _check(seen, height)
     # photos that show too little are left out where others show more
@@ -236,8 +236,8 @@ def _in_world(
     seen: PersonViews, rig: Rig, height: float | None
 ) -> tuple[tuple[Camera, ...], Float[np.ndarray, "k 3"]]:
     """Returns the cameras, and the landmarks, (k, 3), metres, in a world in which the person stands
-    upright at the origin. A part of the legs that no photo shows is assumed to have its usual
-    length. height: see `cameras_from_person`.
+    upright at the origin. If no photo shows the whole trunk, the thighs or the shins, this part is
+    assumed to have its usual length. height: see `cameras_from_person`.
     """
     points, rotations, places, focal = rig.landmarks, rig.rotations, rig.places, rig.focal
     known, names = only_known(points, seen.names, np.any(known_landmarks(seen), axis=0))

@@ -93,8 +93,8 @@ class ViewReport:
     outliers: float = 0.0
     """Share of the keypoints that are outliers."""
     iou_before: float | None = None
-    """Intersection over union of body and mask at the start. NaN if the view has no mask, None if
-    masks are not part of the fit.
+    """Intersection over union of body and mask at the start. NaN if the mask of the view is missing
+    or empty. None for a fit to keypoints.
     """
     iou_after: float | None = None
     """Intersection over union of body and mask for the result. NaN and None as in `iou_before`."""

@@ -377,8 +377,9 @@ class SilhouetteFit:
     unknown: Bool[np.ndarray, "v h w"] | None
     """Pixels that may or may not show the person, (v, h, w). None: there are no such pixels."""
     hidden: list[Bool[np.ndarray, "h w"] | None]
-    """For each view, the unknown pixels and a rim around them, (h, w). In the rim the mask ends at
-    an object in front of the person. None for a view without unknown pixels.
+    """For each view, the unknown pixels and a rim around them, (h, w). In the rim the mask may end
+    at an object in front of the person, and not at the edge of the person. None for a view without
+    unknown pixels.
     """
     faces: Int[np.ndarray, "f 3"]
     """Faces of the body, (f, 3)."""

@@ -58,8 +58,8 @@ def half_squares(tree: PyTree) -> Float[Array, ""]:
 
 
 def robust(errors: Float[Array, "*n d"], scale: Float[Array, ""] | float) -> Float[Array, "*n d"]:
-    """Returns errors that are scaled down so that their squared lengths are the Geman-McClure loss:
-    e c / sqrt(c^2 + |e|^2), where c is the scale.
+    """Returns e c / sqrt(c^2 + |e|^2) for each error e, where c is the scale. The squared lengths
+    of these vectors are the Geman-McClure loss.
 
     Small errors hardly change, and no result is longer than c. So a keypoint on another person has
     a residual of at most c.

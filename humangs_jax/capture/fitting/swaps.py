@@ -105,8 +105,9 @@ def find_swaps(
     views: Int[np.ndarray, "m c"],
     names: tuple[str, ...],
 ) -> tuple[Swap, ...]:
-    """Returns exchanged cameras in the order in which they were found, and then exchanged sides by
-    view. Sides are found in frames with at least two views, cameras in frames with at least three.
+    """Returns exchanged cameras in the order in which they were found, and then exchanged sides in
+    the order of frames and views. Sides are found in frames with at least two views, cameras in
+    frames with at least three.
 
     Args:
         observations: keypoints, a batch of m frames.
@@ -285,7 +286,8 @@ class _Search:
 
     Attributes: cameras: number of the camera, (m, c), equal for views of one camera that stands
     still, -1 where there is no view. total: agreement of each frame, (m,). views: which views have
-    keypoints, (m, c). sides, (m, c), and pairs, (m, c, c): which exchanges are tried.
+    keypoints, (m, c). several: which of these are in frames with at least three of them, (m, c).
+    sides, (m, c), and pairs, (m, c, c): which exchanges are tried.
     """
 
     def __init__(

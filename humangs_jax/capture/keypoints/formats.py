@@ -11,9 +11,9 @@ the set's name, and the names of the v views. `humangs detect` writes the people
             ...]}, null]}]}
 
 "world" has positions in metres from the middle of the hips, in the camera's axes (x right, y down,
-z away). They are as if the camera looked straight at the person, and the person had average size.
-The i-th entry of "people" is the same person in all images, or null if the person is not in the
-image. A person may also have "hands", see `SeenPerson.hands`.
+z away). The positions are as if the camera looked straight at the person, and the person had
+average size. The i-th entry of "people" is the same person in all images, or null if the person is
+not in the image. A person may also have "hands", see `SeenPerson.hands`.
 """
 
 import dataclasses
@@ -69,7 +69,8 @@ def read_own(source: KeypointFile, format: SourceFormat) -> Detections:
     """Returns the people in one of our files. An npz file has one person. If a person is not in an
     image, the confidences there are 0.
 
-    Raises: CaptureError if the file is not valid.
+    Raises: CaptureError if the file is not valid. InvalidFileError if an npz file has too many
+    views.
     """
     if source.path.suffix.lower() == ".npz":
         return _saved(source.path)
@@ -218,7 +219,7 @@ def read_people(path: Path, content: Any = None) -> tuple[KeypointSet, tuple[Ima
     """Returns the keypoint set and the images of a file of people. content: the JSON value of the
     file. None: the file is read.
 
-    Raises: CaptureError with the name of file and field.
+    Raises: CaptureError, which names the file, and the field if one is missing or wrong.
     """
     content = checked_json(path) if content is None else content
     if not _is_people_file(content):

@@ -78,8 +78,9 @@ class KeypointSet:
     image.
     """
     places: tuple[LandmarkDefinition, ...] = ()
-    """Places of the points that a fit may move. Each starts at its offset from a landmark of
-    `body.landmarks`. The offset is 0 if it is not known where the detector sees the point.
+    """Places on the body of those points whose place a fit may move. Each place starts at its
+    offset from a landmark of `body.landmarks`. The offset is 0 if it is not known where the
+    detector sees the point.
     """
     certainty: tuple[float, ...] = ()
     """Certainty of each point as a fit has found it, (k,): the noise of all points, divided by the

@@ -72,7 +72,7 @@ def read_detections(path: Path) -> Detections:
 
     If `path` is a folder, all JSON files in it and in its subfolders are read together.
     Raises: CaptureError if there is no such file or folder, or if the content is not valid.
-    InvalidFileError if a limit is exceeded.
+    InvalidFileError if a limit is exceeded. OSError if a folder cannot be read.
     """
     if not path.exists():
         raise CaptureError(path, "", "no such file or folder")
@@ -151,10 +151,10 @@ def read_keypoints(
     Returns: keypoints of v views and k points. Views without a usable point have confidence 0 and
     are in `missing`.
 
-    Raises: CaptureError, one line with file and field. It is raised if the file is damaged or has
-    no known format, if its images match no view or have another size, if it shows several people
-    and `person` is None, if no view has the person, or if no point is usable. ArgumentError if
-    `person` is negative.
+    Raises: CaptureError, one line with the file, and the field if one is wrong. It is raised if the
+    file is damaged or has no known format, if its images match no view or have another size, if it
+    shows several people and `person` is None, if no view has the person, or if no point is usable.
+    ArgumentError if `person` is negative.
     """
     path = Path(path)
     if person is not None and person < 0:
@@ -390,7 +390,8 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     Views have names like "front" or "000012". If these would be ambiguous, the names are like
     "images_cam0_000012", with folders joined by _. Images of keypoint files have names like
     "front.jpg", "cam0/000012.png" and "cam0_000000000012" (OpenPose writes the number of a video's
-    frame with twelve digits). Or they are only numbers (COCO's image ids, the frames of a video).
+    frame with twelve digits). Other images are only numbers (COCO's image ids, the frames of a
+    video).
 
     Frames of a video may be counted from 0 and its photos from 1 (ffmpeg), or the reverse. If there
     are as many frames as photos, without gaps, they are matched in order, for each video

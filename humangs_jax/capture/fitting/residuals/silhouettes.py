@@ -1,10 +1,10 @@
 """Silhouettes as evidence: compares the silhouette of a posed body with the silhouette of a mask.
 
 A body's silhouette consists of mesh edges between a face that looks at the camera and one that
-looks away (Sander et al. 2000, "Silhouette clipping"). An edge counts only if the image shows no
-body just outside of it. Points on these edges are differentiable functions of the pose. A mask's
-silhouette is where its coverage crosses one half. Edges and matches are found before the solver
-runs, and stay the same while the solver moves the body.
+looks away (Sander et al. 2000, "Silhouette clipping"), and of edges with only one face. An edge
+counts only if the image shows no body just outside of it. Points on these edges are differentiable
+functions of the pose. A mask's silhouette is where its coverage crosses one half. Edges and matches
+are found before the solver runs, and stay the same while the solver moves the body.
 
 Points are matched as in edge trackers (Harris and Stennett 1990, "RAPiD"). Each point of the body's
 silhouette looks along its normal for the nearest end of the mask. Each point of the mask's
