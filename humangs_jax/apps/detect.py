@@ -301,7 +301,7 @@ def person_in_capture(
     decides. Without a number, the masks decide. Without masks, the only large person is intended.
 
     Raises: see `found_in_photos`, `choose` and `person_of`. Also ValueError for a photo in which
-    people are found, but nobody to whom its keypoints belong.
+    people are found, if its keypoints belong to none of them.
     """
     people, sheet = found_in_capture(folder), folder / SHEET_FILE
     if keypoints is None:

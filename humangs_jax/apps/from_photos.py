@@ -90,8 +90,8 @@ class Step:
     """The finished avatar, in the last step; None before."""
 
     def __str__(self) -> str:
-        """Returns the message, after the name of the file or the word "warning" where there is
-        one.
+        """Returns "warning: TEXT" for a warning, "FILE: TEXT" if a file was written, else the text
+        alone.
         """
         if self.warning:
             return f"warning: {self.text}"

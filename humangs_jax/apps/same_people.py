@@ -246,9 +246,9 @@ def rivals(photos: Sequence[PhotoPeople]) -> list[int]:
 def is_unclear(photos: Sequence[PhotoPeople], photo: int, person: int) -> bool:
     """Returns whether it is unclear who in a photo is the person.
 
-    This is so if the photo's numbers do not show who is who (see `PhotoPeople.known`). It is also
-    so if the person was not found in the photo, and somebody large is in it who is in no photo
-    together with the person.
+    This is so if equal numbers of people need not mean the same person in this photo
+    (`PhotoPeople.known` is False). It is also so if the person was not found in the photo, and
+    somebody large is in it who is in no photo together with the person.
     """
     people = photos[photo].people
     if not photos[photo].known:

@@ -84,8 +84,8 @@ def photos_of_video(video: Path, folder: Path) -> str:
 
     Raises: CaptureError if the video cannot be read or shows nothing; the message names the video.
     CaptureError if the folder exists and was not made from the video as it is now; the message
-    names the folder. FileError if the folder's `MARK` cannot be read. OSError if the folder cannot
-    be written.
+    names the folder. CaptureError, too, if the frames cannot be written. FileError if the folder's
+    `MARK` cannot be read. OSError if the folder above cannot be made, or `MARK` cannot be written.
     """
     with reading(video, "video", CaptureError):
         status = video.stat()

@@ -137,8 +137,10 @@ def _has_face(avatar: Avatar, body: BodyModel) -> bool:
 
 def with_face(avatar: Avatar, body: BodyModel | None = None) -> Avatar:
     """Returns the avatar with a face, see `Avatar.with_face`. An avatar that has a face is returned
-    as it is. Raises: ValueError if the vertices are not those of the body, or if the body has no
-    expressions.
+    as it is.
+
+    Raises: ValueError if the body has no expressions, or if the avatar has fewer vertices than the
+    body or lacks a triangle that expressions move. Positions of vertices are not compared.
     """
     if avatar.face is not None:
         return avatar
@@ -153,7 +155,9 @@ def with_face(avatar: Avatar, body: BodyModel | None = None) -> Avatar:
 
 
 def faced(avatar: Avatar) -> Avatar:
-    """Returns the avatar with a face if its body is known, else the avatar as it is."""
+    """Returns the avatar with a face if `body_of` finds its body. Otherwise, or if it has a face
+    already, returns it as it is.
+    """
     found = None
     if avatar.face is None:
         found = body_of(avatar)

@@ -283,8 +283,8 @@ class Avatar(Batchable):
                 None: the shipped body, or what `gaussian_body` makes of it.
 
         Raises:
-            ValueError: if the avatar's vertices are not those of the body, or if the body has no
-                expressions.
+            ValueError: if the body has no expressions, or if the avatar has fewer vertices than the
+                body or lacks a triangle that expressions move. Positions are not compared.
 
         Examples:
             >>> avatar = hg.Avatar.load("avatar.npz").with_face()

@@ -243,14 +243,15 @@ def compiled(
     *, static: Sequence[str] = (), options: Callable[[], dict[str, Any] | None] | None = None
 ) -> Callable[[Callable[..., T]], Compiled[T]]:
     """Returns a decorator that compiles a function when it is called with arrays. If the process
-    keeps programs (`core.processes.keep_programs`), those of the function stay on disk.
+    keeps programs (`core.processes.keep_programs`), those of the function stay on disk where other
+    processes can use them.
 
     The function must depend on nothing but its arguments and the source of the package.
 
     Args:
         static: names of static parameters. Those that a function does not have are ignored.
         options: a function without arguments that returns the options of XLA. It is called when
-            the function is called with arrays, and not before.
+            the function is first compiled, lowered or asked for its shapes, and not before.
 
     Examples:
         >>> @compiled(static=["config"])

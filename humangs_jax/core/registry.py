@@ -18,7 +18,9 @@ FOLDER = ""
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """One format of files. Tables with further columns use a subclass."""
+    """One format of files: a row of a table `Formats`, whose columns are these fields. A table that
+    needs more fields uses a subclass.
+    """
 
     about: str
     """The programs or data sets that such files come from, in a few words. `--help` and the docs

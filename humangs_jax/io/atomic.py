@@ -203,8 +203,8 @@ _being_written: set[Path] = set()
 
 @contextlib.contextmanager
 def _unfinished(temporary: Path) -> Generator[None]:
-    """Removes a temporary file or folder after the block if it still exists. `remove_unfinished`
-    removes it if the process ends during the block.
+    """Removes a temporary file or folder after the block if it still exists. Whoever ends the
+    process during the block calls `remove_unfinished`, which removes it, too.
     """
     _being_written.add(temporary.absolute())
     try:

@@ -188,12 +188,13 @@ class UnconstrainedGaussians(Batchable):
 
 @checked_arguments
 def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """Returns parameters from which `constrain` makes these Gaussians. First, opacities are clamped
-    to [`OPACITY_MARGIN`, 1 - `OPACITY_MARGIN`], colors to [`COLOR_MARGIN`, 1 - `COLOR_MARGIN`], and
+    """Returns parameters from which `constrain` makes these Gaussians, with opacities clamped to
+    [`OPACITY_MARGIN`, 1 - `OPACITY_MARGIN`], colors to [`COLOR_MARGIN`, 1 - `COLOR_MARGIN`], and
     scales to at least `SMALLEST_SCALE`. `pixel_footprint` is lost.
 
     Args:
-        gaussians: without deformations. A low-pass stays in the scales.
+        gaussians: without deformations. If they have a `pixel_footprint`, their scales contain a
+            low-pass, which is not subtracted.
 
     Returns:
         Parameters without bounds: log scales, logits.

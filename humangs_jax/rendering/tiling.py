@@ -575,8 +575,8 @@ def emit_pairs(
 
 
 def _first(v: Array, tile_size: int, tiles: Size) -> Array:
-    """Returns the first column (or row) of tiles whose last pixel centre is not more than `SLACK`
-    left of v (or above v).
+    """Returns the first column (or row) of tiles whose last pixel centre lies at v - `SLACK` or
+    beyond, clipped to [0, tiles]. v: x (or y), pixels.
     """
     return jnp.clip(jnp.ceil((v - (tile_size - 0.5) - SLACK) / tile_size), 0, tiles).astype(
         jnp.int32
@@ -584,8 +584,8 @@ def _first(v: Array, tile_size: int, tiles: Size) -> Array:
 
 
 def _last(v: Array, tile_size: int, tiles: Size) -> Array:
-    """Returns the last column (or row) of tiles whose first pixel centre is not more than `SLACK`
-    right of v (or below v).
+    """Returns the last column (or row) of tiles whose first pixel centre lies at v + `SLACK` or
+    before, clipped to [-1, tiles - 1]. v: x (or y), pixels.
     """
     return jnp.clip(jnp.floor((v - 0.5 + SLACK) / tile_size), -1, tiles - 1).astype(jnp.int32)
 

@@ -476,7 +476,9 @@ def _bag(outfit: Outfit, garment: Garment) -> None:
 
 
 def _accessory(outfit: Outfit, garment: Garment) -> None:
-    """Puts on any garment that `accessories` builds, over the clothes."""
+    """Puts on glasses, a necklace, a scarf or headwear, as `accessories.build` makes them. They
+    hide nothing.
+    """
     for surface, material in accessories.build(outfit.rng, outfit.anatomy, garment, outfit.trunk):
         outfit.add(surface, material, layered=False)
 

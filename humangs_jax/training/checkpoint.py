@@ -335,11 +335,12 @@ def load_config(out: str | Path) -> TrainConfig:
 
 
 def _placed_as(value: jax.Array, like: jax.Array) -> jax.Array:
-    """Returns a restored array on the devices of `like`. It is copied through numpy, so that its
-    buffers are XLA's own and may be donated.
+    """Returns a restored array on the devices of `like`. An array that is partly on devices of
+    other processes is returned as it is.
 
-    The array is uncommitted if `like` is, so that nothing is compiled again. An array that is
-    partly on devices of other processes is returned without a copy.
+    If `like` is uncommitted, so is the result, and nothing is compiled again. It is a copy, whose
+    buffer is XLA's own and can be donated. A committed result may share its memory with `value` on
+    CPUs. A donation then does not use its buffer again.
     """
     if not value.is_fully_addressable:
         return value

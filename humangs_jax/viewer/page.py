@@ -457,11 +457,11 @@ def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
 
 
 def known_body(avatar: Avatar) -> BodyModel | None:
-    """Returns the shipped body, for sliders of shape. It has its own mesh or that of the shipped
-    weights: the one that the avatar has.
+    """Returns the shipped body, for sliders of shape: with its own mesh, or with the mesh for which
+    the shipped weights make Gaussians, whichever the avatar has.
 
     Returns None if the avatar has another mesh or other joints, if no shape of the body has the
-    avatar's vertices, or if refinement has added Gaussians.
+    avatar's vertices, or if `Avatar.gaussians_per_vertex` is None.
     """
     if avatar.parents != PARENTS:
         return None

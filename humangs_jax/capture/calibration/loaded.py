@@ -35,8 +35,8 @@ class SceneCameras(Mapping[str, Camera]):
     a name is repeated, the second camera gets " (2)" after its name, the third " (3)", and so on.
     """
     points: Float[np.ndarray, "n 3"]
-    """Points that the calibration found, (n, 3), in the unit and the axes of the cameras. n = 0 if
-    there are no points.
+    """Points that the calibration found, (n, 3), in the unit and the axes of the cameras. Only
+    points that an image shows are here. n = 0 if there are none.
     """
     colors: Float[np.ndarray, "n 3"]
     """Colors of the points, (n, 3), RGB in [0, 1]. Grey if the calibration has no colors."""

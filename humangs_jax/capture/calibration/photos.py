@@ -150,6 +150,8 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
 def unused_photos(photos: Sequence[Photo], images: Path, calibration: Calibration) -> list[Unused]:
     """Returns the files in the folder of photos that an import does not use, each with the reason.
     Subfolders with a name in `NO_PHOTOS` are not searched.
+
+    Raises: CaptureError if the folder cannot be read.
     """
     used = {
         file.resolve() for photo in photos for file in (photo.image, photo.mask) if file is not None

@@ -56,8 +56,8 @@ as a key with a true value.
 
 
 Where = Callable[[str], tuple[Path, str]]
-"""Type of a function that takes a camera's key. It returns the file and the name of the field, for
-error messages.
+"""Type of a function that takes the key of a camera's value. It returns the file and the name of
+the field, for error messages.
 """
 
 

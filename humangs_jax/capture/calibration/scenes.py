@@ -164,7 +164,11 @@ def _pose(values: Sequence[float], file: Path, where: str) -> Float[np.ndarray, 
 
 
 def _lines(file: Path) -> Iterator[tuple[str, str]]:
-    """Yields the position of each line, such as "line 3", and the line. Comments are left out."""
+    """Yields the position of each line, such as "line 3", and the line. Lines that begin with # are
+    left out; empty lines are not.
+
+    Raises: CaptureError, as `checked_text`.
+    """
     lines = enumerate(checked_text(file).splitlines(), 1)
     return ((f"line {number}", line) for number, line in lines if not line.startswith("#"))
 
@@ -294,7 +298,7 @@ _FISHEYE_MODEL = "OPENCV_FISHEYE"
 _OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
 """Keys that mark a lens that is not read, in files of instant-ngp."""
 _MATRICES = ("K", "intrinsic_matrix", "intrinsics", "camera_intrinsics")
-"""Keys of a complete matrix K, in a frame or in the file."""
+"""Keys that may hold a complete matrix K, in a frame or in the file."""
 
 
 def recognizes_transforms(source: CalibrationFile) -> bool:

@@ -79,13 +79,13 @@ class Contradiction:
     """A calibration that does not agree with the keypoints of the person."""
 
     found: Agreement
-    """Agreement of cameras and keypoints with the calibration as given."""
+    """Agreement of the keypoints with the cameras of the calibration as given."""
     remedy: str | None
-    """Words for a change of the calibration with which cameras and keypoints agree. None if no such
-    change is known.
+    """A change of the calibration, in words, after which cameras and keypoints agree. None if no
+    such change is known.
     """
     after: Agreement | None
-    """Agreement of cameras and keypoints with the remedy. None if there is no remedy."""
+    """Agreement of the keypoints with the cameras after the remedy. None if there is no remedy."""
 
     def __str__(self) -> str:
         """Returns one line about the disagreement. It states the median distance, or that the
@@ -192,8 +192,8 @@ def _agrees(found: Agreement) -> bool:
 def _remedies(
     K: Float[np.ndarray, "v 3 3"], matrices: Float[np.ndarray, "v 4 4"], height: int
 ) -> dict[str, tuple[Float[np.ndarray, "v 3 3"], Float[np.ndarray, "v 4 4"]]]:
-    """Returns K and cam_from_world after the correction of each usual mistake, by the correction in
-    words. height: height of the images, pixels.
+    """Returns a mapping from each correction of a usual mistake, in words, to the corrected K and
+    cam_from_world. height: height of the images, pixels.
     """
     other = np.diag([1.0, -1.0, 1.0, 1.0])
     upwards = K.copy()
@@ -214,8 +214,9 @@ def agreement(
     frames: Int[np.ndarray, " v"],
     keypoints: Keypoints,
 ) -> Agreement | None:
-    """Returns how well cameras and keypoints agree. None if too few landmarks are seen in several
-    views of a frame. frames: frame of each view, (v,).
+    """Returns how well cameras and keypoints agree. None if fewer than `_Limits.least_landmarks`
+    landmarks, counted over all frames, are seen in several views of their frame. frames: frame of
+    each view, (v,).
     """
     errors, sizes, behind = [], [], []
     plain = mirrored = 0.0

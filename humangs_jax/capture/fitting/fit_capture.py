@@ -329,7 +329,7 @@ class FittedCapture:
     """The result of a fit: the capture with its body, and the record for fit.npz."""
 
     capture: Capture
-    """Photos, cameras and the fitted body. Cameras with a wrong rotation are corrected."""
+    """Photos, cameras and the fitted body. The cameras in `camera_errors` are corrected."""
     record: FitRecord
     """Keypoints that were fitted, and the uncertainty of the result."""
     fit: LandmarkFit

@@ -195,8 +195,8 @@ def fit_motion(
         watch: wraps an iterable with about one item for each fit of a window, for example to show
             a progress bar. It is called with this iterable and the number of windows, and returns
             an iterable over the same items.
-    Raises: ValueError if no frame shows the person, if the keypoints have no 3D landmarks, or if
-    their set lacks hips or feet.
+    Raises: ValueError if no frame shows the person, if the keypoints have no 3D landmarks, if their
+    set lacks hips or feet, or if the body has none of the set's landmarks.
     """
     body = without_expression(body)
     kind = keypoints.set

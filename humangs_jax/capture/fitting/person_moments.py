@@ -197,7 +197,7 @@ class Explanation:
     """Result of `explain`: cameras of one moment, if there are such cameras."""
 
     trial: Trial | None
-    """Cameras of `views`. None: no cameras explain several photos of one moment."""
+    """Cameras of `views`. None: each photo counts as a moment, see `explain`."""
     views: tuple[int, ...]
     """Indices of the photos that the trial explains: all photos, or all except one. Without a trial
     they are all photos.

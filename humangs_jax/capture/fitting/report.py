@@ -27,8 +27,8 @@ class _Worth:
     """Limits that decide whether something in a fit gets a line in the report."""
 
     outliers: float = 0.3
-    """A view gives a warning if more than this share of its keypoints are outliers. A fit tolerates
-    more outliers, but a detector with so many errors probably saw something else.
+    """A view gives a warning if more than this share of its keypoints are outliers. The fit itself
+    tolerates more. But the detector has then probably seen somebody or something else.
     """
     off: float = 4.0
     """A view gives a warning if its median error exceeds the expected noise by more than this
@@ -224,7 +224,9 @@ report has the group's name in place of their names.
 
 
 def limit_violations(joint_names: tuple[str, ...], poses: BodyPose) -> tuple[Violation, ...]:
-    """Returns the joints that exceed their limits in a batch of poses, ordered by frame."""
+    """Returns the joints that exceed their limits in a batch of poses by more than
+    `_Worth.beyond_limit`, ordered by frame.
+    """
     prior, rotations = pose_prior(joint_names), np.asarray(poses.rotations)
     beyond = np.rad2deg(np.maximum(prior.lower - rotations, rotations - prior.upper))
     found = np.argwhere(beyond > WORTH_A_LINE.beyond_limit)
@@ -271,8 +273,8 @@ def keypoint_warnings(
     violations: Sequence[Violation],
     swaps: Sequence[Swap],
 ) -> tuple[str, ...]:
-    """Returns lines about signs of a mistake: exchanges, views whose keypoints do not fit the body,
-    and joints far beyond their limits.
+    """Returns lines about signs of a mistake: exchanges, views without keypoints, views whose
+    keypoints do not fit the body, and joints far beyond their limits.
 
     expected: expected noise of the keypoints of each frame, (m,), pixels.
     """

@@ -410,7 +410,10 @@ class SilhouetteFit:
         config: CaptureRefineConfig,
         memory: Float[np.ndarray, " n"] | None = None,
     ) -> "SilhouetteFit":
-        """Returns the constants of a refinement of a capture. memory: see `refine_capture`."""
+        """Returns the constants of a refinement of a capture. memory: see `refine_capture`.
+
+        Raises: ValueError if there are keypoints, and the body has none of their landmarks.
+        """
         # the photos are reduced to the size at which silhouettes are compared
         small = max(capture.images.shape[1:3]) <= config.longest_side
         looked_at = capture if small else capture.resized(config.longest_side)
@@ -452,8 +455,8 @@ class SilhouetteFit:
         )
 
     def run(self) -> tuple[FitState, float]:
-        """Returns the state after all matchings, and the largest change of a number of the state in
-        the last matching, in units of its standard deviation.
+        """Returns the state after all iterations, and the largest change of a number of the state
+        in the last iteration, in units of the number's standard deviation.
         """
         config, state, move = self.config, start_state(self.origin, self.config), 0.0
         first, last = config.reach
@@ -701,7 +704,8 @@ def refine_capture(
             None: poses are independent.
 
     Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint. ValueError if
-    the keypoints have another number of views than the capture.
+    the keypoints have another number of views than the capture, or if the body has none of their
+    landmarks.
     """
     if keypoints is not None and len(keypoints.points) != capture.view_count:
         raise ValueError(

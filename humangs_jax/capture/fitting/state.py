@@ -450,7 +450,8 @@ def cameras_of(
     """Returns K, (v, 3, 3), and cam_from_world, (v, 4, 4), of every view in a state. If the state
     has no cameras, they are the origin's.
 
-    A camera is rotated about its centre, in its axes, and its centre is shifted.
+    A camera is rotated about its centre, in its axes. Its centre is shifted, and its focal lengths
+    are multiplied by a factor.
     Raises: ValueError if the origin has no cameras.
     """
     start, moved, std = origin.views, state.cameras, origin.std

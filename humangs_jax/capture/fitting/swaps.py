@@ -329,10 +329,11 @@ class _Search:
         return (np.asarray(own).sum(-1) - self.total)[frames]
 
     def is_clear(self, trial: _Trial, of: Bool[np.ndarray, " k"]) -> bool:
-        """Returns whether an exchange of the keypoints `of` gains enough.
+        """Returns whether an exchange gains enough. The gain is compared with the largest possible
+        agreement of the exchanged views: the sum of the confidences of their keypoints. Only
+        landmarks that at least two views see count.
 
-        The gain is compared with the largest possible agreement of the exchanged views: the sum of
-        the confidences of their keypoints, of landmarks that at least two views see.
+        of: which keypoints the exchange concerns, (k,).
         """
         seen = (self.confidences > 0) & of
         shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
@@ -384,8 +385,8 @@ class _Search:
         return [trial for trial in (*together, *alone) if self.is_clear(trial, every)]
 
     def _pair(self, frame: int, a: int, b: int) -> tuple[int, ...]:
-        """Returns the numbers of two cameras of a frame, sorted. a and b: their columns in the
-        frame.
+        """Returns the numbers of two cameras at a moment, sorted. a and b: their columns in
+        `self.cameras`, whose rows are the frames.
         """
         return tuple(sorted(self.cameras[frame, [a, b]].tolist()))
 

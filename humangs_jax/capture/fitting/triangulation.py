@@ -90,8 +90,8 @@ def triangulate_robustly(
 
 
 def agreement(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
-    """Returns how well views agree with points, (c, k). It is the confidence for an error of 0,
-    decreases with the error, and is 0 beyond the margin.
+    """Returns how well views agree with points, (c, k). The agreement is the confidence for an
+    error of 0, decreases with the error, and is 0 for errors beyond `_MARGIN`.
     """
     errors = reprojection_errors(observations, points)
     return observations.confidences * jnp.maximum(

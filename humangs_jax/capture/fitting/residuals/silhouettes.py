@@ -276,8 +276,8 @@ def match(
     count: int,
     hidden: Bool[np.ndarray, "h w"] | None = None,
 ) -> Matches:
-    """Matches the silhouettes of a body and of a mask. Returns 2 `count` rows: at most so many
-    equations, and rows of weight 0 that fill the arrays.
+    """Matches the silhouettes of a body and of a mask. Returns 2 `count` rows. Each is an equation
+    of a matched point, or has weight 0 if there are fewer points.
 
     Args:
         body: silhouette of the body.
