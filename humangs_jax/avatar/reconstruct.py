@@ -36,6 +36,7 @@ from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.arrays import from_host
 from humangs_jax.core.checks import FINITE, check_values, checked_arguments
 from humangs_jax.core.compiled import compiled
+from humangs_jax.core.configuration import ArgumentError
 from humangs_jax.core.loops import over
 from humangs_jax.core.processes import Call, compile_ahead
 from humangs_jax.core.progress import compiling
@@ -218,12 +219,15 @@ def reconstruct_batch(
         ValueError or OSError, or if a capture cannot be used, the item has this error instead.
 
     Raises:
+        ValueError: for a `batch` below 1, when the first item is asked for.
         TypeError: if an item of `captures` is neither a capture nor a function that returns one.
 
     Examples:
         >>> made = hg.reconstruct_batch(*hg.load_weights(), captures)
         >>> failed = [each for each in made if each.error]
     """
+    if batch < 1:
+        raise ArgumentError("batch", f"{batch}: expected at least 1")
     for start in range(0, len(captures), batch):
         # what is wrong with one capture is kept in its place
         done = []

@@ -553,7 +553,7 @@ def decimate_with_kept(
     if vertex_count < smallest:
         raise ValueError(
             f"vertex_count {vertex_count}: body '{body.name}' can be reduced to {smallest} vertices"
-            " at most"
+            " at least"
         )
     stays = order < vertex_count
     kept = np.flatnonzero(stays)

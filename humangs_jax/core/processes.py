@@ -91,14 +91,14 @@ def undisturbed() -> Generator[None]:
     if threading.current_thread() is not threading.main_thread():  # only that one gets it
         yield
         return
-    waiting: list[tuple] = []
-    previous = signal.signal(signal.SIGINT, lambda *arguments: waiting.append(arguments))
+    waiting: list[int] = []
+    previous = signal.signal(signal.SIGINT, lambda number, _: waiting.append(number))
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, previous)
-        if waiting and callable(previous):
-            previous(*waiting[0])
+        if waiting:
+            signal.raise_signal(signal.SIGINT)
 
 
 @contextlib.contextmanager

@@ -251,6 +251,8 @@ def read_calibration(
     Raises: CaptureError, one line that names the file and what was expected.
     """
     calibration = _read(path, photo_size)
+    if not calibration.cameras:
+        raise CaptureError(calibration.file, "", "has no camera: expected at least one")
     refusals = (camera.refusal for camera in calibration.cameras if camera.refusal is not None)
     refusal = None if any_lens else next(refusals, None)
     if refusal is not None:

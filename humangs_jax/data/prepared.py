@@ -177,7 +177,9 @@ def prepare_capture(
     # the best of them, if not all are to be used
     most = None if isinstance(views, str) else views
     if views is not None and (most is None or most < prepared.capture.view_count):
-        prepared = prepared.select(best_views(prepared.capture, most))
+        best = best_views(prepared.capture, most)
+        if len(best) < prepared.capture.view_count:
+            prepared = prepared.select(best)
 
     # equal exposure, then the world with y up, if person and cameras stand along another axis
     if is_new:

@@ -276,7 +276,7 @@ def check_replaceable(
     if folder.is_symlink():
         raise ValueError(f"{folder}: is a symbolic link: expected the folder itself")
     place = folder.resolve()
-    above = next(parent for parent in place.parents if parent.exists())
+    above = next((parent for parent in place.parents if parent.exists()), place)
     for wrong, problem in (
         (folder.is_file(), "is a file: expected a folder name"),
         (

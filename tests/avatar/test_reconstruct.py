@@ -437,6 +437,11 @@ def test_no_photos_and_more_than_the_limit_are_an_error(body, network, views, me
         reconstruct(*network, capture(body, SIZE, SIZE).select(views))
 
 
+def test_a_batch_of_nobody_is_refused(network):
+    with pytest.raises(ValueError, match="batch 0: expected at least 1"):
+        list(reconstruct_batch(*network, [], batch=0))
+
+
 @pytest.mark.slow
 def test_a_body_that_is_not_finite_is_an_error(body, network):
     photos = capture(

@@ -95,7 +95,7 @@ def test_the_whole_size_changes_nothing_and_others_are_refused(body):
     for count in (0, 13381):
         with pytest.raises(ValueError, match="13380 vertices"):
             decimate(body, count)
-    with pytest.raises(ValueError, match="can be reduced to"):
+    with pytest.raises(ValueError, match=r"can be reduced to \d+ vertices at least"):
         decimate(body, 2)
 
 

@@ -39,6 +39,14 @@ def test_cameras_of_panoptic_are_read_as_written(tmp_path):
         np.testing.assert_allclose(got, values, atol=EXACT)
 
 
+def test_a_file_without_cameras_is_refused(tmp_path):
+    for content in (written.panoptic(), {"cameras": {}, "camera_poses": {}}):
+        content["cameras"] = type(content["cameras"])()
+        (tmp_path / "calibration_1.json").write_text(json.dumps(content))
+        with pytest.raises(CaptureError, match=r"calibration_1\.json: has no camera"):
+            read_calibration(tmp_path / "calibration_1.json", lambda name: (1, 1))
+
+
 def edited(folder, name, old, new):
     """Copies another tool's file with one text replaced."""
     copy = Path(shutil.copy(FILES / name, folder))

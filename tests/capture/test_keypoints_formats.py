@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -296,6 +297,9 @@ def test_our_own_file_round_trips_exactly(tmp_path, keypoint_set):
     np.testing.assert_array_equal(back.confidences, confidences)
     assert (back.set, back.missing, len(back.warnings)) == (keypoint_set, ("back",), 1)
     assert [file.name for file in tmp_path.iterdir()] == ["k.npz"]  # nothing aside is left
+    other = read(shutil.copy(tmp_path / "k.npz", tmp_path / "K.NPZ"))
+    np.testing.assert_array_equal(other.points, points)
+    assert len(other.warnings) == 1
     swapped = read(tmp_path / "k.npz", ("left", "front"))
     np.testing.assert_array_equal(swapped.points, points[[2, 0]])
 

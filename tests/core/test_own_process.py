@@ -96,6 +96,19 @@ def test_an_interrupt_waits_for_the_end_of_the_block():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_an_interrupt_that_ends_the_process_waits_too():
+    """Programs of other languages start Python without its handler."""
+    code = (
+        "import signal; from humangs_jax.core.processes import undisturbed\n"
+        "signal.signal(signal.SIGINT, signal.SIG_DFL)\n"
+        "with undisturbed():\n"
+        "    signal.raise_signal(signal.SIGINT); print('all of it', flush=True)\n"
+        "print('more')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (-signal.SIGINT, "all of it\n")
+
+
 def test_a_process_that_is_started_deaf_survives_an_interrupt():
     code = "import os, signal; os.kill(os.getpid(), signal.SIGINT); print('alive')"
     ends = {}

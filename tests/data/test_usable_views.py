@@ -17,6 +17,7 @@ from hypothesis.extra.numpy import arrays
 from humangs_jax.apps.settings import Settings
 from humangs_jax.body.resolution import decimate, vertex_areas
 from humangs_jax.core.pytree import replace
+from humangs_jax.data import prepared
 from humangs_jax.data import view_choice as module
 from humangs_jax.data.body_and_masks import views_without_person
 from humangs_jax.data.capture_checks import CaptureError
@@ -335,3 +336,10 @@ def test_without_masks_nothing_is_changed(demo):
 def test_a_number_of_views_that_is_another_word_is_refused(demo):
     with pytest.raises(ValueError, match="'autos': expected a number from 1"):
         prepare_capture(demo, views="autos")
+
+
+def test_photos_that_are_all_kept_are_not_called_chosen(demo, monkeypatch):
+    monkeypatch.setattr(prepared, "best_views", lambda capture, count: [0, 1, 2, 3])
+    assert not prepare_capture(demo, views="auto").chosen
+    monkeypatch.setattr(prepared, "best_views", lambda capture, count: [0, 2])
+    assert prepare_capture(demo, views="auto").chosen

@@ -411,6 +411,7 @@ def test_links_files_and_the_working_folder_are_refused_before_the_work(tmp_path
         (tmp_path / "real" / "a.txt", "is a file"),
         (Path("."), "working folder"),
         (Path(".."), "working folder"),
+        (Path("/"), "working folder"),
         (tmp_path / "real", "working folder"),
     ):
         with pytest.raises(ValueError, match=problem):

@@ -74,6 +74,13 @@ def test_avatars_of_other_bodies_have_no_face_in_the_page():
     assert '"face"' not in page_html(small_avatar()).split('id="header">')[1].split("</script>")[0]
 
 
+def test_a_face_that_is_not_finite_is_refused_by_name(person):
+    avatar = person[1]
+    broken = replace(avatar.face, lips=avatar.face.lips.at[0, 0].set(np.nan))
+    with pytest.raises(ValueError, match=r"face\.lips"):
+        pack(replace(avatar, face=broken))
+
+
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 @pytest.mark.parametrize(
     "shapes",

@@ -110,7 +110,7 @@ def read_detections(path: Path) -> Detections:
     # OpenPose's files do not tell the order of their points of the body; our npz files do
     unsorted = {OPENPOSE_67.name: 25, OPENPOSE_60.name: 18}
     count = unsorted.get(detections.set.name if detections.set else "")
-    if count is None or files[0].suffix == ".npz":
+    if count is None or files[0].suffix.lower() == ".npz":
         return detections
     return in_order(detections, count)
 
