@@ -188,6 +188,9 @@ BAD_USAGE = {
     "evaluate someone --predictions someone/images --lpips-alex a b c": (
         "--lpips-alex: expected a backbone"
     ),
+    "evaluate someone --predictions someone/images --lpips-alex a b": (
+        "--lpips-alex: --protocol humangs has no such score: expected LPIPS of vgg"
+    ),
     "view me.npz --port 99999": "--port 99999",
     "view me.npz --clip 2": "--clip: expected --motion with it",
     "export me.npz --out x.ply --motion-fps 30": "--motion-fps: expected --motion with it",

@@ -431,10 +431,11 @@ class Evaluate:
         files = {name: getattr(self, name) for name in ("json", "html", "csv", "markdown", "latex")}
         with stage("starting"):
             from humangs_jax.evaluation.run import PAGE_IMAGES, evaluate
+            from humangs_jax.evaluation.scores import PROTOCOLS
             from humangs_jax.losses.loss_networks import load_lpips
 
         # LPIPS of each backbone whose files are given
-        networks = []
+        networks, scored_by = [], PROTOCOLS[self.protocol].lpips
         for net in ("vgg", "alex", "squeeze"):
             found = getattr(self.lpips, f"lpips_{net}")
             if found:
@@ -442,6 +443,11 @@ class Evaluate:
                     raise UsageError(
                         f"--lpips-{net}: expected a backbone and at most one file of heads, got"
                         f" {len(found)}"
+                    )
+                if net not in scored_by:
+                    raise UsageError(
+                        f"--lpips-{net}: --protocol {self.protocol} has no such score: expected"
+                        f" LPIPS of {' or '.join(scored_by)}"
                     )
                 networks.append(load_lpips(net, *found))
         # scores of an interrupted run of the same command are used again
